@@ -1,0 +1,1 @@
+"""Shipped experiments, scenarios and small data, found through importlib.resources."""

@@ -1,0 +1,304 @@
+"""Every message of a log, declared once.
+
+A schema is a flat protobuf message whose fields are fixed-width and `optional`; a vector is packed
+doubles of one length per stream. So all messages of a stream share one byte layout (see `layout`) and
+any protobuf reader still reads the file. Field numbers follow the order of declaration: new fields go
+to the end. The first field of every message is the sensor's own clock reading.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
+
+Kind = Literal["time_ns", "identifier", "real", "vector"]
+
+_PROTOBUF = descriptor_pb2.FieldDescriptorProto
+PROTOBUF_TYPES = {
+    "time_ns": _PROTOBUF.TYPE_SFIXED64,
+    "identifier": _PROTOBUF.TYPE_FIXED32,
+    "real": _PROTOBUF.TYPE_DOUBLE,
+    "vector": _PROTOBUF.TYPE_DOUBLE,
+}
+NUMPY_TYPES: dict[Kind, np.dtype] = {
+    "time_ns": np.dtype("<i8"),
+    "identifier": np.dtype("<u4"),
+    "real": np.dtype("<f8"),
+    "vector": np.dtype("<f8"),
+}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a message; `may_be_nan` says that NaN stands for a value that is missing."""
+
+    name: str
+    kind: Kind
+    may_be_nan: bool = False
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type of one element of this field's column."""
+        return NUMPY_TYPES[self.kind]
+
+
+@dataclass(frozen=True)
+class Schema:
+    """A message type: its protobuf name without the package, what it says, and its fields."""
+
+    name: str
+    purpose: str
+    fields: tuple[Field, ...]
+    package: str = "fuselog"
+
+    def __iter__(self) -> Iterator[Field]:
+        return iter(self.fields)
+
+    @property
+    def full_name(self) -> str:
+        """The protobuf name, such as `fuselog.Bearing`."""
+        return f"{self.package}.{self.name}"
+
+    @cached_property
+    def descriptor_set(self) -> bytes:
+        """The serialised FileDescriptorSet that describes this message inside a file."""
+        file = descriptor_pb2.FileDescriptorProto(
+            name=f"{self.package}/{self.name}.proto", package=self.package, syntax="proto3"
+        )
+        declared = file.message_type.add(name=self.name)
+        for number, field in enumerate(self.fields, start=1):
+            entry = declared.field.add(name=field.name, number=number, type=PROTOBUF_TYPES[field.kind])
+            if field.kind == "vector":
+                entry.label = _PROTOBUF.LABEL_REPEATED
+            else:
+                entry.label = _PROTOBUF.LABEL_OPTIONAL
+                entry.proto3_optional = True
+                entry.oneof_index = len(declared.oneof_decl)
+                declared.oneof_decl.add(name=f"_{field.name}")
+        return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+
+    @cached_property
+    def message_class(self) -> type[message.Message]:
+        """The protobuf class of this message, as any other program would build it from a file."""
+        return message_class(self.descriptor_set, self.full_name)
+
+
+def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message]:
+    """Build the class `full_name` from a serialised FileDescriptorSet.
+
+    Raises KeyError, TypeError or a protobuf DecodeError where the set is damaged or lacks the name.
+    """
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptor_set).file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(full_name))
+
+
+def schema_from_descriptor(descriptor_set: bytes, full_name: str) -> Schema:
+    """The numeric fields of a message of any origin; fields of other kinds are left out.
+
+    Where the name is one of ours, what may be NaN is what we declare; else everything may.
+    Raises what `message_class` raises.
+    """
+    ours = {field.name: field for field in SCHEMAS[full_name]} if full_name in SCHEMAS else {}
+    fields: list[Field] = []
+    for entry in message_class(descriptor_set, full_name).DESCRIPTOR.fields:
+        kind = _KINDS.get((entry.type, entry.is_repeated))
+        if kind is not None:
+            may_be_nan = ours[entry.name].may_be_nan if entry.name in ours else True
+            fields.append(Field(entry.name, kind, may_be_nan))
+    package, _, name = full_name.rpartition(".")
+    return Schema(name, "", tuple(fields), package)
+
+
+_KINDS: dict[tuple[int, bool], Kind] = {
+    (_PROTOBUF.TYPE_DOUBLE, False): "real",
+    (_PROTOBUF.TYPE_FLOAT, False): "real",
+    (_PROTOBUF.TYPE_SFIXED64, False): "time_ns",
+    (_PROTOBUF.TYPE_INT64, False): "time_ns",
+    (_PROTOBUF.TYPE_FIXED32, False): "identifier",
+    (_PROTOBUF.TYPE_UINT32, False): "identifier",
+    (_PROTOBUF.TYPE_BOOL, False): "identifier",
+    (_PROTOBUF.TYPE_DOUBLE, True): "vector",
+    (_PROTOBUF.TYPE_FLOAT, True): "vector",
+}
+
+
+def _declare(name: str, purpose: str, *fields: Field) -> Schema:
+    return Schema(name, purpose, (Field("sensor_time_ns", "time_ns"), *fields))
+
+
+def _identifier(name: str) -> Field:
+    return Field(name, "identifier")
+
+
+def _real(name: str, *, may_be_nan: bool = False) -> Field:
+    return Field(name, "real", may_be_nan)
+
+
+def _vector(name: str, *, may_be_nan: bool = False) -> Field:
+    return Field(name, "vector", may_be_nan)
+
+
+# What sensors say.
+
+BEARING = _declare(
+    "Bearing",
+    "The angle to one target in the sensor's frame, anticlockwise from its x axis.",
+    _identifier("target_id"),
+    _real("bearing_rad"),
+)
+RELATIVE_BEARING = _declare(
+    "RelativeBearing",
+    "The angle from the second target to the first as the sensor sees them: bearing 1 - bearing 2.",
+    _identifier("first_id"),
+    _identifier("second_id"),
+    _real("angle_rad"),
+)
+RANGE = _declare("Range", "The distance to one target.", _identifier("target_id"), _real("range_m"))
+RANGE_BEARING = _declare(
+    "RangeBearing",
+    "Distance and angle to one target in the sensor's frame.",
+    _identifier("target_id"),
+    _real("range_m"),
+    _real("bearing_rad"),
+)
+LINE_OF_SIGHT = _declare(
+    "LineOfSight",
+    "Azimuth and elevation of one target in the sensor's frame.",
+    _identifier("target_id"),
+    _real("azimuth_rad"),
+    _real("elevation_rad"),
+)
+SHOT_DETECTION = _declare(
+    "ShotDetection",
+    "One shot heard by one sensor; the shockwave is missing where it cannot be heard.",
+    _identifier("shot_id"),
+    _real("muzzle_blast_azimuth_rad"),
+    _real("shockwave_azimuth_rad", may_be_nan=True),
+    _real("time_difference_s", may_be_nan=True),
+)
+POSITION_FIX = _declare(
+    "PositionFix",
+    "A position in the log's Cartesian frame with its covariance, row-major.",
+    _vector("position_m"),
+    _vector("covariance_m2", may_be_nan=True),
+)
+GEODETIC_FIX = _declare(
+    "GeodeticFix",
+    "A position on the WGS 84 ellipsoid.",
+    _real("latitude_deg"),
+    _real("longitude_deg"),
+    _real("altitude_m", may_be_nan=True),
+)
+DETECTION = _declare(
+    "Detection",
+    "One element of an unordered scan, in the sensor's frame.",
+    _identifier("scan_id"),
+    _vector("position_m"),
+)
+SCAN = _declare(
+    "Scan",
+    "One sweep of a sensor and how many detections it has; none is information too.",
+    _identifier("scan_id"),
+    _identifier("detections"),
+)
+ORIENTATION = _declare(
+    "Orientation",
+    "A rotation from the body frame to the log's frame: unit quaternion w, x, y, z.",
+    _vector("quaternion"),
+)
+AXIS = _declare("Axis", "An undirected axis: a unit vector equal to its negative.", _vector("axis"))
+INERTIAL_SAMPLE = _declare(
+    "InertialSample",
+    "Specific force, turn rate and, where there is a magnetometer, the magnetic field; body frame.",
+    _vector("specific_force_mps2"),
+    _vector("turn_rate_radps"),
+    _vector("magnetic_field_ut", may_be_nan=True),
+)
+ODOMETRY = _declare(
+    "Odometry",
+    "Forward velocity and turn rate that hold from this message to the next.",
+    _real("forward_mps"),
+    _real("turn_radps"),
+)
+SCORE_VECTOR = _declare(
+    "ScoreVector",
+    "Similarity scores of one probe against one gallery entry, one score per matcher.",
+    _identifier("probe_id"),
+    _identifier("gallery_id"),
+    _vector("scores", may_be_nan=True),
+)
+VECTOR_MEASUREMENT = _declare("VectorMeasurement", "A measurement of any other kind.", _vector("value"))
+
+# What the world is.
+
+LANDMARK = _declare(
+    "Landmark", "A fixed point of the map.", _identifier("landmark_id"), _vector("position_m")
+)
+TRUTH_STATE = _declare(
+    "TruthState",
+    "The reference state; the channel's metadata names the components.",
+    _vector("state", may_be_nan=True),
+)
+OUTAGE = _declare(
+    "Outage",
+    "A span in which a sensor was dead.",
+    Field("end_time_ns", "time_ns"),
+)
+LINK_EVENT = _declare(
+    "LinkEvent",
+    "One message of a network link; arrival is the time it was lost or arrived.",
+    _identifier("sender_id"),
+    _identifier("receiver_id"),
+    Field("arrival_time_ns", "time_ns"),
+    _identifier("lost"),
+)
+
+# What estimators say; covariances are full, row-major, in the tangent space.
+
+GAUSSIAN_ESTIMATE = _declare(
+    "GaussianEstimate", "Mean and covariance of a state.", _vector("mean"), _vector("covariance")
+)
+ESTIMATE_SIZE = _declare(
+    "EstimateSize",
+    "How many elements the set or density estimate of this time has; none is an estimate too.",
+    _identifier("elements"),
+)
+SET_ESTIMATE = _declare(
+    "SetEstimate",
+    "One element of a set: a vertex of ring `ring_id`, in order.",
+    _identifier("ring_id"),
+    _vector("vertex"),
+)
+DENSITY_ESTIMATE = _declare(
+    "DensityEstimate",
+    "One component of a mixture, or one weighted sample where the covariance is zero.",
+    _real("weight"),
+    _vector("mean"),
+    _vector("covariance"),
+)
+INNOVATION = _declare(
+    "Innovation",
+    "How one measurement fitted the prediction, and whether the gate let it in.",
+    _identifier("target_id"),
+    _identifier("accepted"),
+    _vector("innovation"),
+    _vector("covariance"),
+    _real("normalised_innovation_squared"),
+)
+SOLUTION = _declare(
+    "Solution",
+    "How one batch solution ended.",
+    _identifier("iterations"),
+    _identifier("converged"),
+    _identifier("rank"),
+    _real("cost"),
+)
+
+SCHEMAS: dict[str, Schema] = {
+    schema.full_name: schema for schema in list(globals().values()) if isinstance(schema, Schema)
+}

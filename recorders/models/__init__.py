@@ -1,0 +1,1 @@
+"""Motion and measurement models: written once, for simulators and estimators alike."""

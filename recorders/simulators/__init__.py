@@ -1,0 +1,1 @@
+"""Simulators of sensor streams, one file per scenario family."""

@@ -1,0 +1,1 @@
+"""Reading logs into estimators, the estimators, metrics and bounds, and the timeline."""
