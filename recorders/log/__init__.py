@@ -1,6 +1,7 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
-from recorders.log.reader import Log, open_log, read_blocks, read_streams
+from recorders.log.opening import Log, open_log
+from recorders.log.reader import read_blocks, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
 from recorders.log.streams import Stream, make_stream
