@@ -8,6 +8,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -18,9 +19,11 @@ THREADS = min(4, os.cpu_count() or 1)
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """Like `map`, in the same order, but a few items ahead; no more, so that memory stays bounded."""
+    rest = iter(items)
+    yield from map(work, islice(rest, 1))  # a log of one chunk needs no threads
     with ThreadPoolExecutor(THREADS) as pool:
         running: deque[Future[Result]] = deque()
-        for item in items:
+        for item in rest:
             running.append(pool.submit(work, item))
             if len(running) > THREADS:
                 yield running.popleft().result()

@@ -52,6 +52,7 @@ _RECORDS: dict[int, Any] = {
     Opcode.CHUNK_INDEX: records.ChunkIndex,
     Opcode.STATISTICS: records.Statistics,
     Opcode.METADATA: records.Metadata,
+    Opcode.METADATA_INDEX: records.MetadataIndex,
     Opcode.DATA_END: records.DataEnd,
 }
 

@@ -115,7 +115,7 @@ def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _opened(file: BinaryIO, use_index: bool) -> Container:
-    found, index = Container(), _Index({}, Counter())
+    found, summary, index = Container(), [], _Index({}, Counter())
     size = file.seek(0, io.SEEK_END)
     damage_at_end = ""
     try:
@@ -132,13 +132,22 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
             found.damages.append(str(damage))
     if place.opcode != Opcode.DATA_END:
         damage_at_end = f"it was cut off: its last {size - place.end} bytes hold no whole record"
-    elif unseen := index.chunks.keys() - {region.offset for region in found.regions}:
-        damage_at_end = f"its index tells of a chunk at byte {min(unseen)}, where there is none"
     if damage_at_end:
         found.damages.append(damage_at_end)
+    found.damages += _missing(found, summary, index)
     if index.chunks:
         found.message_counts = index.message_counts
     return found
+
+
+def _missing(found: Container, summary: Sequence[Any], index: _Index) -> Iterator[str]:
+    """What the summary tells of and the data section has not."""
+    seen = {region.offset for region in found.regions}
+    for offset in index.chunks.keys() - seen:
+        yield f"there is no chunk at byte {offset}, where its index tells of one"
+    for entry in summary:
+        if isinstance(entry, records.MetadataIndex) and entry.name not in found.metadata:
+            yield f"its metadata record '{entry.name}' is missing"
 
 
 def _summary(file: BinaryIO, size: int) -> list[Any]:
@@ -163,16 +172,21 @@ def _summary(file: BinaryIO, size: int) -> list[Any]:
 
 def _index(summary: Sequence[Any]) -> _Index:
     """What a summary says; nothing where a part of it is missing, so that every chunk is opened."""
-    chunks = {
-        entry.chunk_start_offset: entry for entry in summary if isinstance(entry, records.ChunkIndex)
-    }
-    channels = {entry.id for entry in summary if isinstance(entry, records.Channel)}
-    for entry in summary:
-        if isinstance(entry, records.Statistics):
-            counts = Counter(entry.channel_message_counts)
-            stated = (entry.chunk_count, entry.channel_count, entry.message_count)
-            if stated == (len(chunks), len(channels), counts.total()) and counts.keys() <= channels:
-                return _Index(chunks, counts)
+    by_kind: dict[type, list[Any]] = {}
+    for record in summary:
+        by_kind.setdefault(type(record), []).append(record)
+    chunks = {entry.chunk_start_offset: entry for entry in by_kind.get(records.ChunkIndex, [])}
+    channels = by_kind.get(records.Channel, [])
+    schema_ids = {0, *(schema.id for schema in by_kind.get(records.Schema, []))}
+    for statistics in by_kind.get(records.Statistics, []):
+        counts = Counter(statistics.channel_message_counts)
+        stated = (statistics.chunk_count, statistics.channel_count, statistics.message_count)
+        if (
+            stated == (len(chunks), len(channels), counts.total())
+            and counts.keys() <= {channel.id for channel in channels}
+            and schema_ids.issuperset(channel.schema_id for channel in channels)
+        ):
+            return _Index(chunks, counts)
     return _Index({}, Counter())
 
 

@@ -57,7 +57,7 @@ class Layout:
         return records
 
     def parse(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.void] | None:
-        """The message records (n,) at `offsets` of a chunk; None where one is laid out in another way."""
+        """The message records (n,) at `offsets` of a chunk; None where one is laid out differently."""
         if not agree(data, offsets, self.pattern):
             return None
         return windows(data, self.dtype.itemsize)[offsets].view(self.dtype)

@@ -96,5 +96,5 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
 
 def _listed(damages: Sequence[str]) -> str:
     """The first few, in one sentence."""
-    more = f", and {len(damages) - 3} more" if len(damages) > 3 else ""
+    more = f", and {len(damages) - 3} more damages" if len(damages) > 3 else ""
     return f"{', '.join(damages[:3])}{more}"

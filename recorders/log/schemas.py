@@ -8,7 +8,7 @@ to the end. The first field of every message is the sensor's own clock reading.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -86,6 +86,7 @@ class Schema:
         return message_class(self.descriptor_set, self.full_name)
 
 
+@lru_cache(maxsize=256)
 def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message]:
     """Build the class `full_name` from a serialised FileDescriptorSet.
 

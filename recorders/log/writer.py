@@ -7,8 +7,8 @@ own; the wide ones (messages and their indexes) come from `packing`.
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -66,7 +66,7 @@ class LogWriter:
             raise BadInput(f"compression '{compression}' is none of {', '.join(COMPRESSIONS)}")
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + ".part")
-        self._run = run
+        self._run = None if run is None else run.to_record()
         self._compression = compression
         self._chunk_bytes = chunk_bytes
         self._channels: dict[str, _Channel] = {}
@@ -76,20 +76,19 @@ class LogWriter:
         self._publish_spans: dict[str, str] = {}
         self._offset = 0
         self._checksum = 0
+        self._failure: BadInput | None = None
         self._file: BinaryIO
 
     def __enter__(self) -> Self:
-        if self.path.is_dir():
-            raise BadInput(f"{self.path}: is a folder; give the name of a log in it")
-        try:
+        with self._telling():
+            if self.path.is_dir():
+                raise BadInput(f"{self.path}: is a folder; give the name of a log in it")
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._part.open("wb")
-        except OSError as error:
-            raise self._unwritable(error) from error
         self._append(MAGIC)
         self._append_record(records.Header(profile="", library=LIBRARY))
         if self._run is not None:
-            self._append_metadata(RECORD_NAME, self._run.to_record())
+            self._append_metadata(RECORD_NAME, self._run)
         return self
 
     def __exit__(
@@ -138,6 +137,7 @@ class LogWriter:
             chunks = list(chunks_of(parts, self._chunk_bytes))
             for chunk, packed in zip(chunks, ahead(self._packed, chunks), strict=True):
                 self._append_chunk(chunk, *packed)
+            self._flush()
 
     def _packed(self, chunk: Chunk) -> tuple[bytes, bytes]:
         return chunk_record(chunk.data, chunk.log_time, self._compression)
@@ -231,10 +231,12 @@ class LogWriter:
     def _append(self, data: bytes) -> None:
         self._checksum = zlib.crc32(data, self._checksum)
         self._offset += len(data)
-        try:
+        with self._telling():
             self._file.write(data)
-        except OSError as error:
-            raise self._unwritable(error) from error
+
+    def _flush(self) -> None:
+        with self._telling():
+            self._file.flush()
 
     def _finish(self) -> None:
         """Write what follows the last chunk, and give the file its name."""
@@ -242,16 +244,22 @@ class LogWriter:
         self._append_record(records.DataEnd(data_section_crc=self._checksum))
         self._append(self._summary_section())
         self._append(MAGIC)
-        try:
+        with self._telling():
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
             self._part.replace(self.path)
-        except OSError as error:
-            raise self._unwritable(error) from error
 
-    def _unwritable(self, error: OSError) -> BadInput:
-        return BadInput(f"{self.path}: cannot be written ({error.strerror})")
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Tell errors of the disk as BadInput; once there was one, the log can no more be finished."""
+        if self._failure is not None:
+            raise self._failure
+        try:
+            yield
+        except OSError as error:
+            self._failure = BadInput(f"{self.path}: cannot be written ({error.strerror})")
+            raise self._failure from error
 
     def _summary_section(self) -> bytes:
         """The summary, the offsets of its groups, and the footer."""
