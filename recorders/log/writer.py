@@ -3,8 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -60,13 +59,8 @@ class LogWriter:
             self._container.add_metadata(RECORD_NAME, self._run)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._container.__exit__(kind, error, traceback)
+    def __exit__(self, *raised: Any) -> None:
+        self._container.__exit__(*raised)
 
     def write(self, streams: Iterable[Stream]) -> None:
         """Write a block of streams, merged in log-time order; ties keep the order given.
