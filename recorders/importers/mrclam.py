@@ -24,14 +24,15 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 class MrclamParameters(Parameters):
     """What the data do not say: sensor data sheets and how well the start is known.
 
-    Range errors of these cameras are correlated over time (lag 1: 0.5-0.7) and the densities have to
-    cover wheel slip: the values are for all sets and robots alike.
+    The same for all sets and robots. The odometry's densities are those of its error over 1 to 20 s,
+    rounded up. The errors of successive ranges and bearings are alike (lag 1: 0.5-0.7) at up to ten a
+    second, which a filter takes for independent: their sigmas are a few times the scatter.
     """
 
-    forward_noise_density: PositiveFloat = 0.02
+    forward_noise_density: PositiveFloat = 0.05
     turn_noise_density: PositiveFloat = 0.05
-    sigma_range_m: PositiveFloat = 0.2
-    sigma_bearing_rad: PositiveFloat = 0.02
+    sigma_range_m: PositiveFloat = 0.8
+    sigma_bearing_rad: PositiveFloat = 0.05
     prior_sigma_m: PositiveFloat = 0.05
     prior_sigma_rad: PositiveFloat = 0.05
 
