@@ -6,12 +6,15 @@ whole streams and is done. The same call serves one run and many, so an ensemble
 the runs replayed one by one, bit for bit.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic
 
+import numpy as np
+
 from recorders.errors import BadInput
 from recorders.log.reader import Order, Topic
+from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import load
 from replay.blocks import Block, Ragged, gather, merge_events
@@ -57,31 +60,39 @@ class Estimator(Generic[ParametersType]):
     """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
-    for everything it can estimate there (each robot, say); none where the log does not fit.
+    for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
     """
 
     summary: str
     needs: str
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
+    variant: str | None = None
 
 
-def bind(
-    kind: str, sources: Sequence[Source], settings: Mapping[str, Any], label: str | None = None
-) -> list[Bound]:
-    """Bind the estimator registered as `kind` to an ensemble.
+def bind(name: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+    """Bind the estimator `name`, or `name:variant`, to an ensemble.
+
+    `settings` are its parameters; an entry `kind` gives the registered name where `name` is only a
+    label, so that one estimator can be replayed with several settings at once.
 
     Raises BadInput where the name or a parameter is unknown, the estimator does not fit the log, or the
     runs of the ensemble do not hold the same topics.
     """
-    estimator = load("estimators", kind)
-    label = label or kind
-    parameters: Parameters = build(estimator.parameters, settings, f"estimator {label}")
+    values = dict(settings)
+    kind, _, variant = str(values.pop("kind", name)).partition(":")
+    estimator: Estimator[Any] = load("estimators", kind)
+    if variant:
+        if estimator.variant is None:
+            raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
+        values[estimator.variant] = variant
+    parameters: Parameters = build(estimator.parameters, values, f"estimator {name}")
     first = sources[0]
-    bound: list[Bound] = estimator.bind(label, first.topics, parameters)
+    bound = estimator.bind(name, first.topics, parameters)
     if not bound:
         raise BadInput(
-            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
+            f"{first.name}: estimator {name} does not fit this log: it needs {estimator.needs}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
     for source in sources[1:]:
@@ -158,3 +169,21 @@ def _ensemble_blocks(
             topic: gather([(block or {}).get(topic, empty[topic]) for block in blocks])
             for topic in topics
         }
+
+
+def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
+    """Join a replay's blocks into whole output streams by topic, each run's rows together."""
+    parts: dict[str, list[Ragged]] = {}
+    for block in outputs:
+        for ragged in block:
+            parts.setdefault(ragged.stream.topic, []).append(ragged)
+    return {topic: _join(found) for topic, found in parts.items()}
+
+
+def _join(parts: list[Ragged]) -> Ragged:
+    if len(parts) == 1:
+        return parts[0]
+    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    stream = concatenate([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)

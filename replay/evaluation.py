@@ -37,7 +37,8 @@ class Errors:
         elapsed_s: (n,) time since the run's epoch.
         error: (n, d) estimate - truth, angles wrapped.
         covariance: (n, d, d) the estimator's own.
-        nees: (n,) normalised estimation error squared; NaN where the covariance is not positive definite.
+        nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
+            definite.
         without_truth: how many estimates had no truth within the gap limit.
     """
 
@@ -79,7 +80,7 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """e' P^-1 e for errors (n, d) and covariances (n, d, d); NaN where P is not positive definite."""
+    """The form e' P^-1 e for errors (n, d) and covariances (n, d, d); NaN where P is not positive definite."""
     result = np.full(len(error), np.nan)
     if error.shape[1] == 0 or len(error) == 0:
         return result
@@ -92,8 +93,8 @@ def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
     """Where the mean of `runs` chi-square values lies with this probability if all is well."""
     tail = 0.5 * (1 - probability)
-    low, high = chi2.ppf([tail, 1 - tail], degrees * runs) / runs
-    return float(low), float(high)
+    interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
+    return float(interval[0]), float(interval[1])
 
 
 def truth_at(
@@ -228,7 +229,10 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table = pd.DataFrame(
         {"estimator": errors.estimator, "case": errors.case, "step": steps, "runs": runs}
     )
-    mean = _MeanBy(index, runs)
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(index, values, len(runs)) / runs
+
     table["elapsed_s"] = mean(errors.elapsed_s)
     if errors.position:
         table["position_rmse_m"] = np.sqrt(mean(np.sum(errors.error[:, errors.position] ** 2, 1)))
@@ -240,14 +244,6 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
     table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
     return table
-
-
-class _MeanBy(NamedTuple):
-    index: NDArray[np.intp]
-    counts: NDArray[np.intp]
-
-    def __call__(self, values: Floats) -> Floats:
-        return np.bincount(self.index, values, len(self.counts)) / self.counts
 
 
 def accuracy(errors: Errors) -> dict[str, float]:

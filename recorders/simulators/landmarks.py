@@ -145,7 +145,7 @@ def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generato
     moves = drive(origin, true_velocity.T, step_s)
     x = radius_m * np.cos(start) + np.append(0.0, np.cumsum(moves[0]))
     y = radius_m * np.sin(start) + np.append(0.0, np.cumsum(moves[1]))
-    poses = np.stack([x, y, heading], axis=1)
+    poses: NDArray[np.float64] = np.stack([x, y, heading], axis=1)
     return Drive(times_s, poses, true_velocity, odometry)
 
 

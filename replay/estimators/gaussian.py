@@ -2,8 +2,9 @@
 
 There are two ways to pass a Gaussian through a function: linearisation (extended Kalman filter) and
 sampling (linear regression Kalman filters, the UKF first). A filter is a pair of functions, made by
-`linearised` or `sampled` from a family's models and compiled with that family's loop. All of it is scalar loops over small arrays; `mean` (n,)
-and `covariance` (n, n) are changed in place, and stay symmetric by construction.
+`linearised` or `sampled` from a family's models and compiled with that family's loop. All of it is
+scalar loops over small arrays; `mean` (n,) and `covariance` (n, n) are changed in place, and stay
+symmetric by construction.
 """
 
 from collections.abc import Callable
