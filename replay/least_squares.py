@@ -75,16 +75,13 @@ SENTENCES = {
 
 
 class Bound(NamedTuple):
-    """The CRLB of each run.
+    """The CRLB of each run: covariance (runs, n, n) and rank (runs,).
 
-    covariance: (runs, n, n); a parameter that takes part in an unobservable direction has infinite
-    variance and zero covariances. rank: (runs,). directions: (runs, n, n), columns of unit length in the
-    parameters' own units, least observable first: the first n - rank are not observable at all.
+    A parameter that takes part in an unobservable direction has infinite variance and no covariances.
     """
 
     covariance: Array
     rank: NDArray[np.int64]
-    directions: Array
 
 
 class Solution(NamedTuple):
@@ -119,16 +116,16 @@ class _Whitened(NamedTuple):
 
     @property
     def usable(self) -> Flags:
-        whole = np.concatenate([self.residual[:, :, None], self.jacobian], axis=2)
-        return np.asarray(np.isfinite(whole).all(axis=(1, 2)))
+        return np.isfinite(self.cost) & np.asarray(np.isfinite(self.jacobian).all(axis=(1, 2)))
 
 
 def solve(model: Model, start: Array, *, tolerance: float = 1e-6, max_iterations: int = 50) -> Solution:
     """Search the weighted least-squares estimate of every run from `start` (runs, n).
 
-    `model(parameters, rows)` linearizes the runs `rows`. A run has converged when its next full step is
-    shorter than `tolerance` standard deviations in the metric of its own information. A row of `start`
-    that is not finite is a run without a starting point. Raises BadInput for a wrong shape only.
+    `model(parameters, rows)` linearizes the runs `rows`, which may be none. A run has converged when its
+    next full step is shorter than `tolerance` standard deviations in the metric of its own information;
+    that step is still taken. A row of `start` that is not finite is a run without a starting point.
+    Raises BadInput for a wrong shape only.
     """
     if start.ndim != 2 or 0 in start.shape:
         raise BadInput(f"least squares: start has shape {start.shape}; give (runs, parameters)")
@@ -142,7 +139,8 @@ def solve(model: Model, start: Array, *, tolerance: float = 1e-6, max_iterations
         )
 
     count = -(-len(start) // BLOCK_RUNS)
-    blocks = [solve_block(block) for block in np.array_split(np.arange(len(start)), count)]
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        blocks = [solve_block(block) for block in np.array_split(np.arange(len(start)), count)]
     return Solution(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
@@ -152,20 +150,20 @@ def _solve_block(model: Model, start: Array, tolerance: float, max_iterations: i
     status = np.where(np.isfinite(start).all(axis=1), Status.NOT_FINITE, Status.NO_START)
 
     rows = np.flatnonzero(status == Status.NOT_FINITE)
-    if not rows.size:
-        return _judge(model, parameters, iterations, status)
     here = _whiten(model(parameters[rows], rows))
     rows, here = rows[here.usable], here.take(here.usable)
     for iteration in range(1, max_iterations + 1):
         if not rows.size:
             break
         step, length = _gauss_newton(here)
-        parameters[rows], here, moved = _line_search(model, parameters[rows], rows, step, here)
-        done = length < tolerance
         iterations[rows] = iteration
-        status[rows] = np.where(moved, Status.ITERATION_LIMIT, Status.STALLED)
+        done = length < tolerance
+        parameters[rows[done]] += step[done]
         status[rows[done]] = Status.CONVERGED
-        rows, here = rows[moved & ~done], here.take(moved & ~done)
+        rows, here, step = rows[~done], here.take(~done), step[~done]
+        parameters[rows], here, moved = _line_search(model, parameters[rows], rows, step, here)
+        status[rows] = np.where(moved, Status.ITERATION_LIMIT, Status.STALLED)
+        rows, here = rows[moved], here.take(moved)
     return _judge(model, parameters, iterations, status)
 
 
@@ -185,22 +183,25 @@ def _line_search(
     model: Model, parameters: Array, rows: Rows, step: Array, here: _Whitened
 ) -> tuple[Array, _Whitened, Flags]:
     """Halve the steps of those runs whose cost would rise while the weights stay as they are here."""
-    reached, there = parameters.copy(), _Whitened(*(column.copy() for column in here))
     limit = here.cost + COST_ROUNDING * (1.0 + here.cost)
-    waiting, factor = np.arange(len(rows)), 1.0
-    while waiting.size and factor >= SMALLEST_STEP:
-        trial = parameters[waiting] + factor * step[waiting]
-        seen = model(trial, rows[waiting])
+
+    def attempt(some: Rows, factor: float) -> tuple[Array, _Whitened, Flags]:
+        trial = parameters[some] + factor * step[some]
+        seen = model(trial, rows[some])
         found = _whiten(seen)
-        cost = _half_square(_apply(here.whitener[waiting], seen.residual[:, :, None])[:, :, 0])
-        good = (cost <= limit[waiting]) & found.usable
-        reached[waiting[good]] = trial[good]
+        cost = _half_square(_apply(here.whitener[some], seen.residual[:, :, None])[:, :, 0])
+        return trial, found, ~((cost <= limit[some]) & found.usable)
+
+    factor = 1.0
+    reached, there, rising = attempt(np.arange(len(rows)), factor)
+    while rising.any() and factor > SMALLEST_STEP:
+        factor /= 2.0
+        some = np.flatnonzero(rising)
+        reached[some], found, rising[some] = attempt(some, factor)
         for column, new in zip(there, found, strict=True):
-            column[waiting[good]] = new[good]
-        waiting, factor = waiting[~good], factor / 2.0
-    moved = np.ones(len(rows), np.bool_)
-    moved[waiting] = False
-    return reached, there, moved
+            column[some] = new
+    reached[rising] = parameters[rising]
+    return reached, there, ~rising
 
 
 def _judge(
@@ -211,10 +212,9 @@ def _judge(
     covariance, cost = np.full((runs, n, n), np.nan), np.full(runs, np.nan)
     rank = np.zeros(runs, np.int64)
     rows = np.flatnonzero((status != Status.NO_START) & (status != Status.NOT_FINITE))
-    if rows.size:
-        at = model(parameters[rows], rows)
-        covariance[rows], rank[rows], _ = cramer_rao_bound(at)
-        cost[rows] = _whiten(at).cost
+    at = model(parameters[rows], rows)
+    covariance[rows], rank[rows] = cramer_rao_bound(at)
+    cost[rows] = _whiten(at).cost
     status[(status == Status.CONVERGED) & (rank < n)] = Status.UNOBSERVABLE
     return Solution(parameters, covariance, rank, iterations, cost, status)
 
@@ -240,44 +240,89 @@ def information_root(at: Linearization) -> Array:
         entries = whitener[:, :, None] ** 2 * at.covariance_jacobian
     else:
         left = np.einsum("rbik,rbkln->rbiln", whitener, at.covariance_jacobian)
-        entries = np.einsum("rbjl,rbiln->rbijn", whitener, left).reshape(len(root), -1, root.shape[2])
+        blocks = np.einsum("rbjl,rbiln->rbijn", whitener, left)
+        entries = blocks.reshape(len(root), whitener[:1].size, root.shape[2])
     return np.concatenate([root, np.sqrt(0.5) * entries], axis=1)
 
 
 def cramer_rao_bound(at: Linearization) -> Bound:
-    """The inverse of the Fisher information, from the singular values of its scaled root.
+    """The inverse of the Fisher information, from its root, so that no digits are lost to squares.
 
-    A run whose model is not finite has rank 0.
+    Where the triangular factor proves full rank it is inverted, which is fast; singular values decide
+    the rest. A run whose model is not finite has rank 0.
     """
+    root, scale = _scaled_root(at)
+    inverse, safe = _inverse_factor(root)
+    unsafe = np.flatnonzero(~safe)
+    values, right = _singular_values(root[unsafe])
+    seen = values > RANK_TOLERANCE * values[:, :1]
+    lost = np.asarray(((np.abs(right) > PARTICIPATION) & ~seen[:, None, :]).any(axis=2))
+    weights = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    inverse[unsafe] = np.where(lost[:, :, None], 0.0, right * weights[:, None, :])
+
+    spread = scale[:, :, None] * inverse
+    covariance = spread @ np.swapaxes(spread, 1, 2)
+    rank = np.full(len(root), root.shape[2])
+    rank[unsafe] = seen.sum(axis=1)
+    run, parameter = np.nonzero(lost)
+    covariance[unsafe[run], parameter, parameter] = np.inf
+    return Bound(covariance, rank)
+
+
+def unobservable_directions(at: Linearization) -> list[Array]:
+    """For each run the directions that no measurement sees, unit columns (n, n - rank), own units."""
+    root, scale = _scaled_root(at)
+    values, right = _singular_values(root)
+    directions = scale[:, :, None] * right
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    unseen = values <= RANK_TOLERANCE * values[:, :1]
+    return [columns[:, gap] for columns, gap in zip(directions, unseen, strict=True)]
+
+
+def _scaled_root(at: Linearization) -> tuple[Array, Array]:
+    """The information root with columns of unit length, and the scale that made them so."""
     root = information_root(at)
-    runs, rows, n = root.shape
     root = np.where(np.isfinite(root).all(axis=(1, 2), keepdims=True), root, 0.0)
     scale = _column_scale(root)
-    _, singular, transposed = np.linalg.svd(root * scale[:, None, :], full_matrices=rows < n)
+    return root * scale[:, None, :], scale
+
+
+def _inverse_factor(root: Array) -> tuple[Array, Flags]:
+    """Matrices whose squares are the inverse information, and where the rank is full for sure.
+
+    With F the inverse of the triangular factor, no singular value is below 1 / |F| nor above sqrt(n).
+    """
+    runs, rows, n = root.shape
+    if rows < n:
+        return np.zeros((runs, n, n)), np.zeros(runs, np.bool_)
+    factor = np.linalg.qr(root, mode="r")
+    diagonal = np.abs(np.diagonal(factor, axis1=1, axis2=2))
+    singular = np.min(diagonal, axis=1) <= RANK_TOLERANCE
+    inverse = np.linalg.inv(np.where(singular[:, None, None], np.eye(n), factor))
+    norm = np.linalg.norm(inverse, axis=(1, 2))
+    return inverse, ~singular & (norm * np.sqrt(n) < 1.0 / RANK_TOLERANCE)
+
+
+def _singular_values(root: Array) -> tuple[Array, Array]:
+    """All n singular values, largest first, and their right vectors as columns."""
+    runs, rows, n = root.shape
+    _, singular, right = np.linalg.svd(root, full_matrices=rows < n)
     values = np.zeros((runs, n))
     values[:, : singular.shape[1]] = singular
-    seen = values > RANK_TOLERANCE * values[:, :1]
-    right = np.swapaxes(transposed, 1, 2)
-    basis = scale[:, :, None] * right
-
-    spread = basis * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)[:, None, :]
-    lost = ((np.abs(right) > PARTICIPATION) & ~seen[:, None, :]).any(axis=2)
-    covariance = np.where(lost[:, :, None] | lost[:, None, :], 0.0, spread @ np.swapaxes(spread, 1, 2))
-    diagonal = np.arange(n)
-    covariance[:, diagonal, diagonal] += np.where(lost, np.inf, 0.0)
-    directions = basis[:, :, ::-1] / np.linalg.norm(basis[:, :, ::-1], axis=1, keepdims=True)
-    return Bound(covariance, seen.sum(axis=1), directions)
+    return values, np.swapaxes(right, 1, 2)
 
 
 def describe_direction(names: Sequence[str], direction: Array) -> str:
-    """Name a direction (n,): its parameters with their shares of the largest, largest first."""
+    """Name a direction (n,): the shares of its parameters against the largest, in their order."""
     share = direction / direction[np.argmax(np.abs(direction))]
-    order = [j for j in np.argsort(-np.abs(share), kind="stable") if abs(share[j]) > PARTICIPATION]
-    return ", ".join(f"{names[j]} {share[j]:+.3g}" for j in order)
+    parts = [(name, part) for name, part in zip(names, share, strict=True) if abs(part) > PARTICIPATION]
+    return ", ".join(f"{name} {part:+.3g}" for name, part in parts)
 
 
 def mask_missing(at: Linearization, present: Flags) -> Linearization:
     """Take out the measurements that are not `present` (runs, m): they then carry no information."""
+    if present.all():
+        return at
     kept, slope = present, at.covariance_jacobian
     unit: Array = np.ones(present.shape[1])
     if at.covariance.ndim == 4:
@@ -314,7 +359,8 @@ def _apply(whitener: Array, columns: Array) -> Array:
     """Whiten columns (runs, m, any)."""
     if whitener.ndim == 2:
         return whitener[:, :, None] * columns
-    return (whitener @ columns.reshape(*whitener.shape[:3], -1)).reshape(columns.shape)
+    blocks = columns.reshape(*whitener.shape[:3], columns.shape[2])
+    return (whitener @ blocks).reshape(columns.shape)
 
 
 def _half_square(residual: Array) -> Array:

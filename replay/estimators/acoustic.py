@@ -140,9 +140,9 @@ def linearize(setting: Setting, heard: Detections, parameters: Array) -> Lineari
             view = _append_fixes(view, heard.position_m - position, setting.noise.position_m)
         else:
             view = _absorb_fixes(view, setting.noise.position_m)
-    runs, n = parameters.shape
-    residual = view.residual.reshape(runs, -1)
-    jacobian = view.jacobian.reshape(runs, -1, n)
+    runs, sensors, k, n = view.jacobian.shape
+    residual = view.residual.reshape(runs, sensors * k)
+    jacobian = view.jacobian.reshape(runs, sensors * k, n)
     return mask_missing(
         Linearization(residual, jacobian, view.covariance, view.slope), np.isfinite(residual)
     )
@@ -187,11 +187,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
     delay = model.time_difference(distance, separation, medium)
     by_range, by_separation = model.time_difference_gradient(distance, separation, medium)
     return _blocks(
-        [
-            wrap(heard.muzzle_blast_rad - azimuth),
-            miss,
-            heard.time_difference_s - delay,
-        ],
+        [wrap(heard.muzzle_blast_rad - azimuth), miss, heard.time_difference_s - delay],
         [BY_AZIMUTH, BY_TRAJECTORY, (by_separation, by_range, -by_separation)],
         np.diag(
             np.square([noise.muzzle_blast_rad, noise.shockwave_rad, noise.time_difference_s])
@@ -247,7 +243,8 @@ def _check(setting: Setting, heard: Detections) -> None:
         expected = (*shape, 2) if name == "position_m" else shape
         if len(shape) != 2 or column.shape != expected:
             raise BadInput(
-                f"detections: {name} has shape {column.shape}; give (runs, sensors), positions 2 more"
+                f"detections: {name} has shape {column.shape} beside {shape} of the muzzle blasts; "
+                "give (runs, sensors), and (runs, sensors, 2) positions"
             )
     if min(setting.noise) <= 0.0:
         raise BadInput(f"acoustic noise {setting.noise} must be positive; give standard deviations")

@@ -21,6 +21,7 @@ from replay.least_squares import (
     describe_direction,
     mask_missing,
     solve,
+    unobservable_directions,
 )
 
 Array = NDArray[np.float64]
@@ -104,21 +105,23 @@ def starting_point(scene: Scene, measured: Array) -> Array:
 def linearize(scene: Scene, measured: Array, parameters: Array) -> Linearization:
     """Lines of sight (runs, targets, sensors, 2), NaN where not seen, at `parameters` (runs, n)."""
     runs, targets, sensors, _ = measured.shape
+    m = 2 * targets * sensors
     geometry = _geometry(scene, parameters)
     with np.errstate(divide="ignore", invalid="ignore"):
-        residual = wrap(measured - np.stack(line_of_sight(*geometry), axis=-1)).reshape(runs, -1)
+        predicted = np.stack(line_of_sight(*geometry), axis=-1)
         gradients = line_of_sight_gradients(*geometry)
+    residual = wrap(measured - predicted).reshape(runs, m)
     own = np.stack([np.stack(gradient, axis=-1) for gradient in gradients], axis=-2)
     by_target = own[..., None, :3] * np.eye(targets)[:, None, None, :, None]
     by_bias = own[..., None, 3:] * np.eye(sensors)[:, None, :, None]
     jacobian = np.concatenate(
         [
-            by_target.reshape(runs, -1, 3 * targets),
-            by_bias.reshape(runs, -1, 3 * sensors)[:, :, scene.wanted],
+            by_target.reshape(runs, m, 3 * targets),
+            by_bias.reshape(runs, m, 3 * sensors)[:, :, scene.wanted],
         ],
         axis=2,
     )
-    variance = np.broadcast_to(scene.sigma_rad**2, measured.shape).reshape(runs, -1)
+    variance = np.broadcast_to(scene.sigma_rad**2, measured.shape).reshape(runs, m)
     return mask_missing(Linearization(residual, jacobian, variance), np.isfinite(residual))
 
 
@@ -128,9 +131,9 @@ def observability(scene: Scene, measured: Array, parameters: Array) -> Observabi
     `measured` only says which lines of sight there are: NaN where none.
     """
     names = parameter_names(scene, len(measured))
-    bound = cramer_rao_bound(linearize(scene, measured[None], parameters[None]))
-    rank, n, angles = int(bound.rank[0]), len(parameters), int(np.isfinite(measured).sum())
-    unseen = bound.directions[0, :, : n - rank]
+    [unseen] = unobservable_directions(linearize(scene, measured[None], parameters[None]))
+    n, angles = len(parameters), int(np.isfinite(measured).sum())
+    rank = n - unseen.shape[1]
     axis = _turning_axis(scene, parameters, unseen[:, 0]) if n - rank == 1 else None
     sentence = f"rank {rank} of {n} parameters from {angles} angles"
     if axis is not None:
@@ -140,6 +143,8 @@ def observability(scene: Scene, measured: Array, parameters: Array) -> Observabi
             f"({axis[0]:.3f}, {axis[1]:.3f}, {axis[2]:.3f}); know one bias with a large share in it: "
             + describe_direction(names[first:], unseen[first:, 0])
         )
+    elif angles < n:
+        sentence += ": too few angles; another target adds 3 parameters and 2 angles for each sensor"
     elif rank < n:
         directions = (describe_direction(names, direction) for direction in unseen.T)
         sentence += f": nothing changes with {'; or with '.join(directions)}"
@@ -151,7 +156,7 @@ def _turning_axis(scene: Scene, parameters: Array, unseen: Array) -> Array | Non
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
-    change = unseen[-attitude[..., 0].size :].reshape(-1, 3)
+    change = unseen[-scene.position_m.size :].reshape(-1, 3)
     turn = np.stack(turning_vector(attitude[:, 0, 0], change.T), axis=1)
     mean = turn.mean(axis=0)
     length = np.linalg.norm(mean)
@@ -180,11 +185,9 @@ def sigma_with_one_bias_known(scene: Scene, measured: Array, parameters: Array) 
 
 def _check(scene: Scene, measured: Array) -> None:
     sensors = len(scene.position_m)
-    for name, shape in zip(
-        Scene._fields, [(sensors, 3), (sensors, 3), (sensors, 2), (sensors, 3)], strict=True
-    ):
-        if getattr(scene, name).shape != shape:
-            raise BadInput(f"optical scene: {name} has shape {getattr(scene, name).shape}; give {shape}")
+    for (name, column), width in zip(scene._asdict().items(), (3, 3, 2, 3), strict=True):
+        if column.shape != (sensors, width):
+            raise BadInput(f"optical scene: {name} has shape {column.shape}; give {(sensors, width)}")
     if measured.ndim != 4 or measured.shape[2:] != (sensors, 2):
         raise BadInput(
             f"lines of sight have shape {measured.shape}; give (runs, targets, {sensors} sensors, 2)"
@@ -195,9 +198,14 @@ def _check(scene: Scene, measured: Array) -> None:
 
 def _geometry(scene: Scene, parameters: Array) -> tuple[Array, Array, Array]:
     """Targets, sensors and biased attitudes, components first, to broadcast over targets, sensors."""
-    places = parameters[:, : parameters.shape[1] - scene.wanted.sum()]
-    target = places.reshape(len(parameters), -1, 3).transpose(2, 0, 1)[..., None]
-    bias = np.tile(scene.known_bias_rad.ravel(), (len(parameters), 1))
-    bias[:, scene.wanted] = parameters[:, places.shape[1] :]
-    attitude = scene.nominal_attitude_rad + bias.reshape(len(parameters), -1, 3)
-    return target, scene.position_m.T[:, None, None], attitude.transpose(2, 0, 1)[:, :, None]
+    runs, sensors = len(parameters), len(scene.position_m)
+    targets = (parameters.shape[1] - scene.wanted.sum()) // 3
+    target = parameters[:, : 3 * targets].reshape(runs, targets, 3)
+    bias = np.tile(scene.known_bias_rad.ravel(), (runs, 1))
+    bias[:, scene.wanted] = parameters[:, 3 * targets :]
+    attitude = scene.nominal_attitude_rad + bias.reshape(runs, sensors, 3)
+    return (
+        target.transpose(2, 0, 1)[..., None],
+        scene.position_m.T[:, None, None],
+        attitude.transpose(2, 0, 1)[:, :, None],
+    )
