@@ -3,8 +3,8 @@
 A model says, for parameters (runs, n), how far each measurement is from its prediction, how predictions
 change with the parameters, and how noisy the measurements are. From that one answer come the step of
 the search, the Fisher information, the Cramer-Rao lower bound (CRLB), the rank and the directions that
-no measurement sees. Gauss-Newton as in Bar-Shalom, Li and Kirubarajan (2001), section 3.4, with scaled
-columns and a halving line search; the weights follow the latest estimate.
+no measurement sees. The search is Gauss-Newton, the ILS of Bar-Shalom, Li and Kirubarajan (2001), with
+scaled columns and a halving line search; the weights follow the latest estimate.
 """
 
 from collections.abc import Callable, Sequence

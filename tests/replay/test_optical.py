@@ -276,9 +276,9 @@ def test_the_stated_field_of_view_does_not_hold() -> None:
 
 
 def test_bad_runs_are_told_and_the_rest_goes_on() -> None:
-    """Parallel rays, too few angles and wild angles in one ensemble with a good run, bit for bit."""
+    """Parallel rays and a missing line of sight, among good runs that stay the same bit for bit."""
     scene, truth = three_sensors(2, *STATED)
-    measured = simulate(scene, truth, 4, seed=5)
+    measured = simulate(scene, truth, 300, seed=5)
     measured[1] = measured[1, :1, :1]
     measured[2, 0, 0] = np.nan
     solution = optical.estimate(scene, measured)
@@ -288,9 +288,11 @@ def test_bad_runs_are_told_and_the_rest_goes_on() -> None:
         Status.UNOBSERVABLE,
     ]
     assert solution.rank[2] == 16
-    alone = optical.estimate(scene, measured[3:])
-    assert solution.parameters[3].tobytes() == alone.parameters[0].tobytes()
-    assert solution.covariance[3].tobytes() == alone.covariance[0].tobytes()
+    assert solution.converged[3:].all()
+    alone = optical.estimate(scene, measured[299:])
+    assert all(
+        column[299].tobytes() == own[0].tobytes() for column, own in zip(solution, alone, strict=True)
+    )
 
 
 def test_target_on_a_sensor_is_not_finite() -> None:
