@@ -1,4 +1,4 @@
-"""Do errors agree with the covariance that was promised: NEES, its bounds, ellipses, dilution.
+"""Errors against the covariance that was promised: NEES, ellipses, dilution of precision.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """
@@ -37,13 +37,6 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 def component_error_squared(error: Array, covariance: Array) -> Array:
     """Each component's own normalized squared error, (..., n)."""
     return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)
-
-
-def average_bounds(dimension: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Two-sided interval of the average of `runs` chi-square numbers of this dimension."""
-    tail = 0.5 * (1.0 - probability)
-    low, high = stats.chi2.ppf([tail, 1.0 - tail], dimension * runs) / runs
-    return float(low), float(high)
 
 
 def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:

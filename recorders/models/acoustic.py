@@ -2,18 +2,15 @@
 
 Osborne, Bar-Shalom, George and Kaplan, "Statistical Efficiency of Target Localization from Angle and
 Shockwave Measurements", JAIF 2014. Angles are anticlockwise from the x axis, in rad. Component-first:
-a vector is a tuple of components or an array whose first axis is the component; a component is a number
-or an array, and components broadcast.
+`Components` are a tuple of components or an array whose first axis is the component; components are
+numbers or arrays and broadcast.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from recorders.models.angles import wrap
-
-Component = Any
-Vector = Any
+from recorders.models.planar import Component, Components, wrap_angle
 
 
 class Medium(NamedTuple):
@@ -37,7 +34,7 @@ class Noise(NamedTuple):
     position_m: float
 
 
-def azimuth_range(shooter: Vector, sensor: Vector) -> tuple[Component, Component]:
+def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, Component]:
     """Direction of arrival of the muzzle blast, eq (6) with atan2, and the distance in m."""
     x, y = shooter[0] - sensor[0], shooter[1] - sensor[1]
     return np.arctan2(y, x), np.hypot(x, y)
@@ -49,7 +46,7 @@ def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) ->
     It does within 90 deg less the Mach angle of the line, the line itself left out (figure 2). Eq (7)
     says the same, but for angles that need wrapping.
     """
-    off_line = wrap(azimuth - np.pi - trajectory)
+    off_line = wrap_angle(azimuth - np.pi - trajectory)
     return np.where(np.abs(off_line) < 0.5 * np.pi - medium.mach_angle_rad, np.sign(off_line), 0.0)
 
 
@@ -60,12 +57,12 @@ def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) ->
 
 def measured_side(azimuth: Component, shockwave: Component) -> Component:
     """The side of the line of fire that follows from the two directions of arrival alone."""
-    return -np.sign(wrap(azimuth - shockwave))
+    return -np.sign(wrap_angle(azimuth - shockwave))
 
 
 def trajectory_from_shockwave(shockwave: Component, side: Component, medium: Medium) -> Component:
     """The bullet's direction, eq (7) turned around."""
-    return wrap(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
+    return wrap_angle(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
 
 
 def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:
@@ -87,13 +84,13 @@ def range_from_time_difference(delay: Component, separation: Component, medium: 
 
 
 def hear(
-    shooter: Vector, trajectory: Component, sensor: Vector, medium: Medium
+    shooter: Components, trajectory: Component, sensor: Components, medium: Medium
 ) -> tuple[Component, Component, Component]:
     """Both directions of arrival and the time difference; NaN for a shockwave that is not heard."""
     azimuth, distance = azimuth_range(shooter, sensor)
     side = shockwave_side(azimuth, trajectory, medium)
     shockwave = np.where(side == 0.0, np.nan, shockwave_azimuth(trajectory, side, medium))
-    return azimuth, wrap(shockwave), time_difference(distance, azimuth - shockwave, medium)
+    return azimuth, wrap_angle(shockwave), time_difference(distance, azimuth - shockwave, medium)
 
 
 def local_estimate_covariances(

@@ -1,25 +1,23 @@
 """Line of sight of an optical sensor whose attitude may be biased.
 
 Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements
-with Targets of Opportunity", JAIF 2014. Component-first: a vector is a tuple of components or an array
-whose first axis is the component; a component is a number or an array, and components broadcast.
+with Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an
+array whose first axis is the component; components are numbers or arrays and broadcast.
 """
-
-from typing import Any
 
 import numpy as np
 
-Component = Any
-Vector = Any
+from recorders.models.planar import Component, Components
+
 Triple = tuple[Component, Component, Component]
 
 
-def azimuth_elevation(x: Vector) -> tuple[Component, Component]:
+def azimuth_elevation(x: Components) -> tuple[Component, Component]:
     """Angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3) with atan2."""
     return np.arctan2(x[0], x[2]), np.arctan2(x[1], np.hypot(x[0], x[2]))
 
 
-def azimuth_elevation_gradients(x: Vector) -> tuple[Triple, Triple]:
+def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
     """Gradients in rad/m of azimuth and elevation by `x`; eqs (71)-(76), (74) with its root mended."""
     ground = np.hypot(x[0], x[2])
     squared = ground**2 + x[1] ** 2
@@ -28,7 +26,7 @@ def azimuth_elevation_gradients(x: Vector) -> tuple[Triple, Triple]:
     return azimuth, (x[0] * slope, ground / squared, x[2] * slope)
 
 
-def rotate(attitude: Vector, x: Vector) -> Triple:
+def rotate(attitude: Components, x: Components) -> Triple:
     """Turn `x` into the frame of a sensor with attitude (yaw, pitch, roll) in rad.
 
     That is Rz(yaw) Ry(pitch) Rx(roll) x with active rotations, as the paper's appendix and tables have
@@ -38,13 +36,15 @@ def rotate(attitude: Vector, x: Vector) -> Triple:
     return _about_z(yaw, _about_y(pitch, _about_x(roll, x)))
 
 
-def line_of_sight(target: Vector, sensor: Vector, attitude: Vector) -> tuple[Component, Component]:
+def line_of_sight(
+    target: Components, sensor: Components, attitude: Components
+) -> tuple[Component, Component]:
     """Azimuth and elevation in rad of a target in m, eqs (2)-(4); `attitude` includes the bias."""
     return azimuth_elevation(rotate(attitude, _subtract(target, sensor)))
 
 
 def line_of_sight_gradients(
-    target: Vector, sensor: Vector, attitude: Vector
+    target: Components, sensor: Components, attitude: Components
 ) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
     """Gradients of azimuth and elevation by target x, y, z (rad/m) and yaw, pitch, roll (rad/rad).
 
@@ -70,7 +70,7 @@ def line_of_sight_gradients(
     return pull_back(azimuth), pull_back(elevation)
 
 
-def direction(azimuth: Component, elevation: Component, attitude: Vector) -> Triple:
+def direction(azimuth: Component, elevation: Component, attitude: Components) -> Triple:
     """Unit vector, in the common frame, along which a sensor of this attitude sees these angles."""
     yaw, pitch, roll = attitude
     level = np.cos(elevation)
@@ -78,7 +78,7 @@ def direction(azimuth: Component, elevation: Component, attitude: Vector) -> Tri
     return _about_x(-roll, _about_y(-pitch, _about_z(-yaw, seen)))
 
 
-def turning_vector(attitude: Vector, change: Vector) -> Triple:
+def turning_vector(attitude: Components, change: Components) -> Triple:
     """The small rotation vector of the scene, in the common frame, that a change of attitude hides.
 
     When the scene turns by it about the sensor while the attitude changes by `change` (yaw, pitch,
@@ -92,20 +92,20 @@ def turning_vector(attitude: Vector, change: Vector) -> Triple:
     return -by_yaw[0] - by_pitch[0] - rolled, -by_yaw[1] - by_pitch[1], -by_yaw[2] - by_pitch[2]
 
 
-def _subtract(x: Vector, y: Vector) -> Triple:
+def _subtract(x: Components, y: Components) -> Triple:
     return x[0] - y[0], x[1] - y[1], x[2] - y[2]
 
 
-def _about_x(angle: Component, x: Vector) -> Triple:
+def _about_x(angle: Component, x: Components) -> Triple:
     cosine, sine = np.cos(angle), np.sin(angle)
     return x[0], cosine * x[1] - sine * x[2], sine * x[1] + cosine * x[2]
 
 
-def _about_y(angle: Component, x: Vector) -> Triple:
+def _about_y(angle: Component, x: Components) -> Triple:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * x[0] + sine * x[2], x[1], cosine * x[2] - sine * x[0]
 
 
-def _about_z(angle: Component, x: Vector) -> Triple:
+def _about_z(angle: Component, x: Components) -> Triple:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * x[0] - sine * x[1], sine * x[0] + cosine * x[1], x[2]

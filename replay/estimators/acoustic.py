@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.models import acoustic as model
 from recorders.models.acoustic import Medium, Noise
-from recorders.models.angles import wrap
+from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
 from replay.least_squares import Bound, Linearization, Solution, cramer_rao_bound, mask_missing, solve
 
@@ -170,7 +170,7 @@ class _Blocks(NamedTuple):
 
 
 def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    residual = wrap(heard.muzzle_blast_rad - geometry.azimuth_rad)
+    residual = wrap_angle(heard.muzzle_blast_rad - geometry.azimuth_rad)
     return _blocks([residual], [BY_AZIMUTH], [[setting.noise.muzzle_blast_rad**2]])
 
 
@@ -179,7 +179,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     misses = [
-        wrap(heard.shockwave_rad - model.shockwave_azimuth(trajectory, side, medium))
+        wrap_angle(heard.shockwave_rad - model.shockwave_azimuth(trajectory, side, medium))
         for side in (1.0, -1.0)
     ]
     miss = np.where(np.abs(misses[0]) <= np.abs(misses[1]), *misses)
@@ -187,7 +187,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
     delay = model.time_difference(distance, separation, medium)
     by_range, by_separation = model.time_difference_gradient(distance, separation, medium)
     return _blocks(
-        [wrap(heard.muzzle_blast_rad - azimuth), miss, heard.time_difference_s - delay],
+        [wrap_angle(heard.muzzle_blast_rad - azimuth), miss, heard.time_difference_s - delay],
         [BY_AZIMUTH, BY_TRAJECTORY, (by_separation, by_range, -by_separation)],
         np.diag(
             np.square([noise.muzzle_blast_rad, noise.shockwave_rad, noise.time_difference_s])
@@ -219,9 +219,9 @@ def _local_estimates(setting: Setting, heard: Detections, geometry: _Geometry) -
         azimuth_slope = trajectory_slope = CONSTANT
     return _blocks(
         [
-            wrap(heard.muzzle_blast_rad - azimuth),
+            wrap_angle(heard.muzzle_blast_rad - azimuth),
             measured_range - distance,
-            wrap(measured_trajectory - trajectory),
+            wrap_angle(measured_trajectory - trajectory),
         ],
         [BY_AZIMUTH, BY_RANGE, BY_TRAJECTORY],
         [

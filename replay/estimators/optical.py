@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.models.angles import wrap
 from recorders.models.optical import direction, line_of_sight, line_of_sight_gradients, turning_vector
+from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
 from replay.least_squares import (
     Linearization,
@@ -110,7 +110,7 @@ def linearize(scene: Scene, measured: Array, parameters: Array) -> Linearization
     with np.errstate(divide="ignore", invalid="ignore"):
         predicted = np.stack(line_of_sight(*geometry), axis=-1)
         gradients = line_of_sight_gradients(*geometry)
-    residual = wrap(measured - predicted).reshape(runs, m)
+    residual = wrap_angle(measured - predicted).reshape(runs, m)
     own = np.stack([np.stack(gradient, axis=-1) for gradient in gradients], axis=-2)
     by_target = own[..., None, :3] * np.eye(targets)[:, None, None, :, None]
     by_bias = own[..., None, 3:] * np.eye(sensors)[:, None, :, None]

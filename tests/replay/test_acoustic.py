@@ -12,10 +12,11 @@ from scipy import stats
 from recorders.errors import BadInput
 from recorders.models import acoustic as model
 from recorders.models.acoustic import Medium, Noise
-from recorders.models.angles import wrap
-from replay.consistency import average_bounds, ellipse_area, normalized_error_squared
+from recorders.models.planar import wrap_angle
+from replay.consistency import ellipse_area, normalized_error_squared
 from replay.estimators import acoustic
 from replay.estimators.acoustic import Detections, Mode, Setting
+from replay.evaluation import chi_square_interval
 from replay.least_squares import Solution, Status, fisher_information
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"
@@ -58,8 +59,8 @@ def simulate(scenario: int, multiplier: float, runs: int, seed: int) -> Detectio
         return column + deviation * rng.normal(size=(runs, *column.shape[1:]))
 
     return Detections(
-        wrap(add(heard.muzzle_blast_rad, sigma.muzzle_blast_rad)),
-        wrap(add(heard.shockwave_rad, sigma.shockwave_rad)),
+        wrap_angle(add(heard.muzzle_blast_rad, sigma.muzzle_blast_rad)),
+        wrap_angle(add(heard.shockwave_rad, sigma.shockwave_rad)),
         add(heard.time_difference_s, sigma.time_difference_s),
         add(heard.position_m, sigma.position_m),
     )
@@ -248,7 +249,7 @@ def test_area_ratio_is_one_where_no_shockwave_is_heard() -> None:
 @pytest.mark.parametrize("multiplier", [0.1, 1.0, 1.5])
 def test_native_measurements_are_efficient(scenario: int, multiplier: float) -> None:
     """At every noise. One run in some thousands of scenario 3 at 1.5 ends at a false optimum."""
-    low, high = average_bounds(2, 100)
+    low, high = chi_square_interval(2, 100)
     assert (round(low, 3), round(high, 3)) == (1.627, 2.411)
     found = study(scenario, Mode.NATIVE_MEASUREMENTS, multiplier)
     assert found.solution.converged.all()
@@ -274,7 +275,7 @@ def test_nees_of_the_other_modes(mode: Mode, scenario: int, multiplier: float, e
 @pytest.mark.parametrize("scenario", [1, 2])
 @pytest.mark.parametrize("multiplier", [0.1, 1.0, 1.5])
 def test_bearings_only_is_efficient_in_good_geometry(scenario: int, multiplier: float) -> None:
-    low, high = average_bounds(2, 100)
+    low, high = chi_square_interval(2, 100)
     assert low < study(scenario, Mode.BEARINGS_ONLY, multiplier).nees.mean() < high
 
 
@@ -285,7 +286,7 @@ def test_bearings_only_misses_its_bound_in_bad_geometry() -> None:
     assert squared.mean() == pytest.approx(21.6**2, abs=combined_error(squared))
     assert deviation(3, Mode.BEARINGS_ONLY, 1.5) == pytest.approx(27.6, abs=0.05)
     noisy = study(3, Mode.BEARINGS_ONLY, 1.5)
-    assert noisy.nees[noisy.solution.converged].mean() > average_bounds(2, 100)[1]
+    assert noisy.nees[noisy.solution.converged].mean() > chi_square_interval(2, 100)[1]
 
 
 def test_local_estimates_beat_their_approximate_bound_in_scenario_3() -> None:

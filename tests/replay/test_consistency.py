@@ -1,11 +1,10 @@
-"""NEES, its bounds and ellipses, against numbers worked out by hand."""
+"""NEES, ellipses and dilution against numbers worked out by hand."""
 
 import numpy as np
 import pytest
 
 from recorders.errors import BadInput
 from replay.consistency import (
-    average_bounds,
     component_error_squared,
     dilution_of_precision,
     ellipse_area,
@@ -33,13 +32,6 @@ def test_infinite_variance_counts_nothing_and_nan_stays_nan() -> None:
 def test_singular_covariance_is_refused() -> None:
     with pytest.raises(BadInput, match="singular"):
         normalized_error_squared(np.ones(2), np.ones((2, 2)))
-
-
-@pytest.mark.parametrize(
-    ("dimension", "low", "high"), [(18, 16.843, 19.195), (23, 21.690, 24.348), (1, 0.742, 1.296)]
-)
-def test_bounds_of_the_average(dimension: int, low: float, high: float) -> None:
-    assert average_bounds(dimension, 100) == pytest.approx((low, high), abs=6e-4)
 
 
 def test_ellipse_area() -> None:

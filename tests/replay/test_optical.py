@@ -8,10 +8,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
-from recorders.models.angles import wrap
-from replay.consistency import average_bounds, normalized_error_squared
+from recorders.models.planar import wrap_angle
+from replay.consistency import normalized_error_squared
 from replay.estimators import optical
 from replay.estimators.optical import Scene
+from replay.evaluation import chi_square_interval
 from replay.least_squares import Status, cramer_rao_bound, solve
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"
@@ -71,7 +72,7 @@ def by_target(values: np.ndarray, targets: int) -> np.ndarray:
 def simulate(scene: Scene, truth: np.ndarray, runs: int, seed: int) -> np.ndarray:
     clean = optical.predict(scene, truth)
     noise = np.random.default_rng(seed).normal(size=(runs, *clean.shape[1:]))
-    return wrap(clean + scene.sigma_rad * noise)
+    return wrap_angle(clean + scene.sigma_rad * noise)
 
 
 def rank(scene: Scene, truth: np.ndarray) -> int:
@@ -168,7 +169,7 @@ def test_three_sensors_are_efficient(parameters: tuple, scenario: int, expected:
     assert nees.mean() == pytest.approx(expected, abs=3.0 * nees.std() * np.sqrt(1 / 1000 + 1 / 2000))
     at_estimate = normalized_error_squared(error, solution.covariance)
     assert at_estimate.mean() == pytest.approx(nees.mean(), rel=0.005)
-    low, high = average_bounds(18, 100)
+    low, high = chi_square_interval(18, 100)
     if scenario == 1 and parameters is STATED:
         assert nees.mean() > high
         elevation = optical.predict(scene, truth)[0, 1, 1, 1]
@@ -186,10 +187,18 @@ def test_two_sensors_are_efficient_with_one_roll_known(scenario: int) -> None:
     assert solution.iterations.max() <= 6
     error = solution.parameters - truth
     at_truth = cramer_rao_bound(optical.linearize(scene, optical.predict(scene, truth), truth))
-    low, high = average_bounds(23, 1000)
+    low, high = chi_square_interval(23, 1000)
     assert low < normalized_error_squared(error, at_truth.covariance).mean() < high
     rmse = np.sqrt((error**2).mean(axis=0)) / np.sqrt(np.diagonal(at_truth.covariance[0]))
     assert np.abs(rmse - 1.0).max() < 0.11  # 5 sigma of a deviation from 1000 runs
+
+
+@pytest.mark.parametrize(
+    ("dimension", "low", "high"), [(18, 16.843, 19.195), (23, 21.690, 24.348), (1, 0.742, 1.296)]
+)
+def test_intervals_of_100_runs(dimension: int, low: float, high: float) -> None:
+    """The paper's probability regions for 18, 23 and single components."""
+    assert chi_square_interval(dimension, 100) == pytest.approx((low, high), abs=6e-4)
 
 
 def test_two_sensor_bounds_of_scenario_2() -> None:

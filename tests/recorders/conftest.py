@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 
 STEP = 1e-30
 
@@ -35,3 +36,9 @@ def derivative(function: Callable[[Any], Any], x: np.ndarray) -> np.ndarray:
         shifted[component] += 1j * STEP
         columns.append([np.imag(np.asarray(out)) / STEP for out in function(shifted.view(ComplexStep))])
     return np.stack([np.stack(np.broadcast_arrays(*column)) for column in columns], axis=1)
+
+
+@pytest.fixture
+def complex_step() -> Callable[[Callable[[Any], Any], np.ndarray], np.ndarray]:
+    """The function `derivative`: test modules cannot import from one another."""
+    return derivative
