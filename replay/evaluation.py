@@ -80,7 +80,7 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e for errors (n, d) and covariances (n, d, d); NaN where P is not positive definite."""
+    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
     result = np.full(len(error), np.nan)
     if error.shape[1] == 0 or len(error) == 0:
         return result

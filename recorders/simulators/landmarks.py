@@ -134,7 +134,9 @@ def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generato
     density = [parameters.forward_noise_density, parameters.turn_noise_density]
     noise = rng.normal(size=(steps, 2)) * density / np.sqrt(step_s)
     scale = np.array([1 + parameters.forward_scale_error, 1.0])
-    true_velocity = odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    true_velocity: NDArray[np.float64] = (
+        odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    )
     start = rng.uniform(0, 2 * np.pi)
     turned = np.cumsum(true_velocity[:, 1] * step_s)
     heading: NDArray[np.float64] = start + np.pi / 2 + np.append(0.0, turned)
