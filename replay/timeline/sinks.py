@@ -66,9 +66,11 @@ def _finish(recording: rr.RecordingStream, connect: str | None) -> None:
     """Hand over everything that is still queued, and close."""
     try:
         recording.flush(timeout_sec=_FLUSH_S)
-    except RuntimeError as error:
+        recording.disconnect()
+        if connect is not None:  # a flush does not notice everything
+            _require_receiver(connect)
+    except (RuntimeError, BadInput) as error:
         raise BadInput(f"--connect {connect}: the receiver went away; start it again") from error
-    recording.disconnect()
 
 
 def _require_writable(part: Path) -> None:
