@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, LogWriter, RunMetadata, Stream, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import BLOCK_MESSAGES, bind, collect, replay
@@ -73,7 +72,7 @@ def replay_ensemble(
     estimators: Mapping[str, Mapping[str, Any]],
     *,
     gap_limit_s: float,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
@@ -111,7 +110,7 @@ def replay_to_logs(
     estimators: Mapping[str, Mapping[str, Any]],
     paths: Sequence[Path],
     *,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
 ) -> None:

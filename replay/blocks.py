@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.log.reader import Order
+from recorders.log import Clock, Stream
 from recorders.log.streams import concatenate
 
 
@@ -65,7 +64,7 @@ def gather(parts: Sequence[Stream]) -> Ragged:
     return Ragged(concatenate(filled), offsets)
 
 
-def merge_events(streams: Mapping[str, Ragged], order: Order) -> Events:
+def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
     offsets = sum((ragged.offsets for ragged in streams.values()), np.zeros(1, np.int64))
     runs = len(offsets) - 1

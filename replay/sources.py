@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, Stream, read_blocks, read_empty, read_streams
-from recorders.log.reader import Order, Topic
+from recorders.log import Clock, Log, RunMetadata, Stream, Topic, read_blocks, read_empty, read_streams
 from recorders.recording import Recording
 
 
@@ -34,7 +33,7 @@ class Source(Protocol):
         """The topic without its messages."""
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
@@ -71,7 +70,7 @@ class LogSource:
         return read_empty(self.log, topic)
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Blocks of the source's span."""
         return read_blocks(
@@ -116,14 +115,14 @@ class MemorySource:
     def blocks(
         self,
         topics: Sequence[str],
-        order: Order,
+        order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
         """One block: everything is in memory already."""
         block = {topic: self._in_order(topic, order) for topic in topics}
         yield {topic: stream for topic, stream in block.items() if len(stream)}
 
-    def _in_order(self, topic: str, order: Order) -> Stream:
+    def _in_order(self, topic: str, order: Clock) -> Stream:
         stream = self.streams[topic]
         clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
         if np.all(clock[1:] >= clock[:-1]):
