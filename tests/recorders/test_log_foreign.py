@@ -10,7 +10,6 @@ import pytest
 from google.protobuf import descriptor_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import assert_same, some_streams
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.stream_reader import StreamReader
@@ -20,6 +19,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log, read_streams, schemas
 from recorders.log.schemas import message_class
+from tests.recorders.log_samples import assert_same, some_streams
 
 FIELD = descriptor_pb2.FieldDescriptorProto
 DOUBLE, FLOAT, SFIXED64, FIXED32 = (
