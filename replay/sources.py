@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, Stream, read_blocks, read_empty, read_streams
+from recorders.log import Log, RunMetadata, Stream, read_blocks, read_streams
 from recorders.log.reader import Order, Topic
 from recorders.recording import Recording
 
@@ -22,6 +22,10 @@ class Source(Protocol):
     @property
     def run(self) -> RunMetadata | None:
         """What the run was."""
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -58,6 +62,11 @@ class LogSource:
         return self.log.run
 
     @property
+    def epoch_ns(self) -> int:
+        """The run's time zero; the log's beginning where it does not say."""
+        return self.log.run.epoch_ns if self.log.run else log_span_ns(self.log)[0]
+
+    @property
     def topics(self) -> Mapping[str, Topic]:
         """The log's topics."""
         return self.log.topics
@@ -68,7 +77,7 @@ class LogSource:
 
     def empty(self, topic: str) -> Stream:
         """The topic without its messages."""
-        return read_empty(self.log, topic)
+        return read_streams(self.log, [topic], end_ns=0)[topic]
 
     def blocks(
         self, topics: Sequence[str], order: Order, block_messages: int
@@ -89,8 +98,13 @@ class MemorySource:
     """A recording in memory: replayed as if it had been written and read back."""
 
     streams: Mapping[str, Stream]
-    run: RunMetadata | None
+    run: RunMetadata
     name: str
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+        return self.run.epoch_ns
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -119,9 +133,10 @@ class MemorySource:
         order: Order,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """One block: everything is in memory already."""
-        block = {topic: self._in_order(topic, order) for topic in topics}
-        yield {topic: stream for topic, stream in block.items() if len(stream)}
+        """One block, unless there is nothing: everything is in memory already."""
+        block = {topic: self._in_order(topic, order) for topic in topics if len(self.streams[topic])}
+        if block:
+            yield block
 
     def _in_order(self, topic: str, order: Order) -> Stream:
         stream = self.streams[topic]
@@ -129,6 +144,13 @@ class MemorySource:
         if np.all(clock[1:] >= clock[:-1]):
             return stream
         return stream.take(np.lexsort((stream.position, clock)))
+
+
+def log_span_ns(log: Log) -> tuple[int, int]:
+    """The first and the last log time of a log; zeros where it has no messages."""
+    regions = log.container.regions
+    first = min((region.start_log_time_ns for region in regions), default=0)
+    return first, max((region.end_log_time_ns for region in regions), default=0)
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
