@@ -26,6 +26,7 @@ from recorders.recording import import_run
 from replay.evaluation import Errors, chi_square_interval, error_table, step_table
 from replay.metrics import find_metrics, measure
 from replay.sources import MemorySource, memory_source
+from replay.timeline.show import show
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -38,6 +39,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         progress=setting.progress,
     )
     write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
     outcome = summarise(replayed, experiment.metrics)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
