@@ -22,7 +22,8 @@ from rerun.experimental import ViewerClient
 from recorders.errors import BadInput
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-RERUN = (sys.executable, "-m", "rerun_cli")
+# `python -m rerun_cli` loses the exit code
+RERUN = (sys.executable, "-c", "import sys, rerun_cli.__main__ as cli; sys.exit(cli.main())")
 _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0

@@ -354,6 +354,18 @@ def test_a_receiver_that_goes_away_is_told_and_nothing_half_written(tmp_path: Pa
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_a_full_disk_is_told_and_nothing_half_written(ensemble: Replayed, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        with pytest.raises(BadInput, match="the timeline could not be written"):
+            show(ensemble.sources[0], ensemble.outputs, ensemble.errors, save=tmp_path / "a.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_cannot_be_shown_is_refused(ensemble: Replayed, tmp_path: Path) -> None:
     source, outputs, errors = ensemble.sources[0], ensemble.outputs, ensemble.errors
     with pytest.raises(BadInput, match=r"give --save FILE.rrd, --connect URL, or both"):
@@ -376,6 +388,9 @@ def test_without_a_screen_the_picture_is_offered(rrd: Path, monkeypatch: pytest.
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(BadInput, match=r"no screen .*--screenshot"):
+        view(rrd)
+    monkeypatch.setenv("DISPLAY", ":54321")
+    with pytest.raises(BadInput, match=r"the viewer ended with an error: .*X server"):
         view(rrd)
 
 
