@@ -49,7 +49,12 @@ def read_streams(
         log, topics, order=order, start_ns=start_ns, end_ns=end_ns, block_messages=sys.maxsize
     )
     (whole,) = list(blocks) or [{}]
-    return {topic: whole.get(topic) or Decoder(log, topic).empty() for topic in topics}
+    return {topic: whole.get(topic) or read_empty(log, topic) for topic in topics}
+
+
+def read_empty(log: Log, topic: str) -> Stream:
+    """A topic without its messages: its schema and metadata."""
+    return Decoder(log, topic).empty()
 
 
 def read_blocks(

@@ -4,7 +4,6 @@ from collections import Counter
 from io import BytesIO
 
 import pytest
-from log_samples import assert_same, some_streams
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
@@ -12,6 +11,7 @@ from mcap.stream_reader import breakup_chunk
 
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, open_log, read_streams
+from tests.recorders.log_samples import assert_same, some_streams
 
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
 STREAMS = some_streams(6, count=6)[:2]

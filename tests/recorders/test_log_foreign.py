@@ -10,7 +10,6 @@ import pytest
 from google.protobuf import descriptor_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import assert_same, some_streams
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.stream_reader import StreamReader
@@ -21,6 +20,7 @@ from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log, read_blocks, read_streams, schemas
 from recorders.log.schemas import message_class
 from recorders.log.streams import concatenate
+from tests.recorders.log_samples import assert_same, some_streams
 
 FIELD = descriptor_pb2.FieldDescriptorProto
 DOUBLE, FLOAT, SFIXED64, FIXED32 = (

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from log_samples import rows_in_file, some_streams
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -19,6 +18,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rerun.chunk import McapReader
 
 from recorders.log import LogWriter, RunMetadata, write_log
+from tests.recorders.log_samples import rows_in_file, some_streams
 
 
 @pytest.fixture(params=["zstd", "lz4", "none"])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_samples import LARGEST_TIME, assert_same, rows_read, some_streams, streams
 
 from recorders.errors import BadInput
 from recorders.log import (
@@ -20,6 +19,7 @@ from recorders.log import (
     write_log,
 )
 from recorders.log.schemas import SCHEMAS
+from tests.recorders.log_samples import LARGEST_TIME, assert_same, rows_read, some_streams, streams
 
 COMPRESSIONS = ["zstd", "lz4", "none"]
 FEW_STAMPS = st.integers(0, 30)

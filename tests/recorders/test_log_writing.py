@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_samples import assert_same, rows_in_file, some_streams
 
 from recorders.errors import BadInput
 from recorders.log import (
@@ -24,6 +23,7 @@ from recorders.log import (
     write_log,
 )
 from recorders.log.streams import concatenate
+from tests.recorders.log_samples import assert_same, rows_in_file, some_streams
 
 COUNTS = {"scan_id": [1, 2], "detections": [3, 4]}
 

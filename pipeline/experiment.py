@@ -1,0 +1,194 @@
+"""Experiments: scenario (or real data) x estimators x metrics, one TOML file each."""
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+
+from pipeline.ensemble import Progress, no_progress
+from pipeline.results import Outcome, Result, result_folder, write_outcome
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters, build, describe, merge
+from recorders.recording import Recorder
+from recorders.registry import available, load
+from replay.engine import configure
+from replay.metrics import find_metrics
+
+SHIPPED = resources.files("fuselog_data")
+
+
+class Record(Parameters):
+    """What to simulate: a scenario by name or TOML file, and what differs from its defaults."""
+
+    scenario: str
+    parameters: dict[str, Any] = {}
+
+
+class Import(Parameters):
+    """What to import; the data's place comes from --data."""
+
+    source: str
+    parameters: dict[str, Any] = {}
+
+
+class Experiment(Parameters):
+    """One experiment as its TOML file says it.
+
+    `estimators` maps a label to parameters; a parameter `kind` names the estimator where the label is
+    not its name. `metrics` are all registered ones where none is named. `options` are the study's own.
+    """
+
+    title: str
+    study: str = "localization"
+    seed: Annotated[int, Field(ge=0)] = 0
+    runs: PositiveInt = 1
+    record: Record | None = None
+    import_: Import | None = Field(None, alias="import")
+    estimators: dict[str, dict[str, Any]] = {}
+    metrics: list[str] = []
+    gap_limit_s: NonNegativeFloat = 0.2
+    options: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        if self.import_ and self.record:
+            raise ValueError("give either [record] or [import], not both")
+        if self.import_ and (self.runs, self.seed) != (1, 0):
+            raise ValueError("imported data are one run without a seed; leave out runs and seed")
+        return self
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where and how an experiment runs; `options` are of the study's own type."""
+
+    folder: Path
+    data: Path | None = None
+    logs: int = 20
+    options: Any = None
+    progress: Progress = no_progress
+
+
+@dataclass(frozen=True)
+class Study:
+    """A registered study does an experiment's work.
+
+    `run` writes its logs and timeline into the setting's folder, and returns what it found.
+    """
+
+    summary: str
+    run: Callable[[Experiment, Setting], Outcome]
+    options: type[Parameters] = Parameters
+
+
+def shipped(kind: str) -> dict[str, Path]:
+    """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
+    with resources.as_file(SHIPPED / kind) as folder:
+        return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file's values; raises BadInput where it is missing or malformed."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise BadInput(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInput(f"{path}: is not readable as TOML ({error})") from None
+
+
+def load_experiment(
+    name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
+) -> tuple[str, Experiment]:
+    """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
+
+    A setting goes to the entry of the experiment or to the estimator that its first word names, else to
+    the scenario's or importer's parameters: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`.
+    """
+    known = shipped("experiments")
+    if not name.endswith(".toml") and name not in known:
+        raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = known.get(name, Path(name))
+    values = read_toml(path)
+    where = f"experiment {name}"
+    stated = build(Experiment, values, where)
+    return path.stem, build(Experiment, {**merge(values, _assigned(stated, settings)), **over}, where)
+
+
+def _assigned(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings where they belong in an experiment; raises BadInput where one belongs nowhere."""
+    entries = {each.alias or name for name, each in Experiment.model_fields.items()}
+    part, recorder, names = "import", "", set()
+    if experiment.import_:
+        recorder = experiment.import_.source
+    elif experiment.record:
+        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
+    if recorder:
+        described = describe(load("recorders", recorder, Recorder).parameters)
+        names = {each.name.partition(".")[0] for each in described}
+    assigned: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in entries:
+            place: dict[str, Any] = {key: value}
+        elif key in experiment.estimators:
+            place = {"estimators": {key: value}}
+        elif key in names:
+            place = {part: {"parameters": {key: value}}}
+        else:
+            known = sorted(names | entries | experiment.estimators.keys())
+            raise BadInput(
+                f"--set {key}: no such entry of the experiment, parameter of what it records, "
+                f"or estimator; {choices(key, known)}"
+            )
+        assigned = merge(assigned, place)
+    return assigned
+
+
+def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
+    """A scenario by its registered name, its shipped file or a TOML file: recorder, parameters, label.
+
+    A scenario file has `recorder` and a table `parameters`.
+    """
+    files, recorders = shipped("scenarios"), available("recorders")
+    if name in recorders:
+        return name, {}, name
+    if not name.endswith(".toml") and name not in files:
+        known = [*recorders, *files]
+        raise BadInput(f"no scenario '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = files.get(name, Path(name))
+    values = read_toml(path)
+    recorder, parameters = values.get("recorder"), values.get("parameters", {})
+    if not isinstance(recorder, str) or not isinstance(parameters, dict):
+        raise BadInput(f'{path}: a scenario file has recorder = "NAME" and a [parameters] table')
+    return recorder, parameters, path.stem
+
+
+def run_experiment(
+    name: str,
+    experiment: Experiment,
+    folder: Path,
+    *,
+    data: Path | None = None,
+    logs: int = 20,
+    progress: Progress = no_progress,
+) -> Result:
+    """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
+    if experiment.import_ and data is None:
+        raise BadInput(f"experiment {name} needs real data: give its folder with --data")
+    if data is not None and not experiment.import_:
+        raise BadInput(f"experiment {name} imports nothing; leave out --data")
+    study: Study = load("studies", experiment.study, Study)
+    options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    for label, values in experiment.estimators.items():
+        configure(label, values)
+    find_metrics(experiment.metrics)
+    with result_folder(folder) as part:
+        outcome = study.run(experiment, Setting(part, data, logs, options, progress))
+        settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
+        if data is not None:
+            settings["data"] = str(data)
+        return write_outcome(part, name, settings, outcome)

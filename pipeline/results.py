@@ -1,0 +1,203 @@
+"""What an experiment yields, and its folder: tables, figures, claims, result.json.
+
+A result folder is built beside its place and moved there when it is whole.
+"""
+
+import fcntl
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from recorders.errors import BadInput
+from recorders.parameters import Parameters, build
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+RESULT_FILE = "result.json"
+Verdict = Literal["confirmed", "refuted", "not reproducible"]
+MetricValue = float | list[float] | list[float | None] | None
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A statement of a paper: what it prints, what we measured, our verdict and its reason."""
+
+    claim: str
+    paper: str
+    ours: str
+    verdict: Verdict
+    why: str = ""
+
+
+@dataclass
+class Outcome:
+    """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
+
+    `input_sha256` is a hash of the data that went in.
+    """
+
+    metrics: dict[str, MetricValue] = field(default_factory=dict)
+    claims: list[Claim] = field(default_factory=list)
+    tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
+    figures: dict[str, "Figure"] = field(default_factory=dict)
+    input_sha256: str = ""
+
+
+class Result(Parameters):
+    """What result.json says."""
+
+    experiment: str
+    fuselog: str
+    settings: dict[str, Any]
+    input_sha256: str
+    metrics: dict[str, MetricValue]
+    claims: list[Claim]
+
+
+def split_metric(key: str) -> tuple[str, str, str]:
+    """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`."""
+    estimator, _, rest = key.partition(".")
+    quantity, _, case = rest.partition(".")
+    return estimator, quantity, case
+
+
+@dataclass(frozen=True)
+class MetricTable:
+    """The metrics of one case: a row per quantity, a column per estimator."""
+
+    case: str
+    estimators: list[str]
+    rows: list[tuple[str, list[MetricValue]]]
+
+
+def metric_tables(metrics: Mapping[str, MetricValue]) -> list[MetricTable]:
+    """The metrics by case."""
+    estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
+    cases: dict[str, dict[str, dict[str, MetricValue]]] = {}
+    for key, value in metrics.items():
+        estimator, quantity, case = split_metric(key)
+        cases.setdefault(case, {}).setdefault(quantity, {})[estimator] = value
+    return [
+        MetricTable(
+            case,
+            estimators,
+            [
+                (quantity, [values.get(estimator) for estimator in estimators])
+                for quantity, values in quantities.items()
+            ],
+        )
+        for case, quantities in sorted(cases.items())
+    ]
+
+
+@contextmanager
+def result_folder(folder: Path) -> Iterator[Path]:
+    """A folder to fill, beside its place; it replaces an earlier result there when all went well.
+
+    Raises BadInput where something else than a result of ours is in the place, where another process
+    is filling it, or where it cannot be written.
+    """
+    place = folder.resolve()
+    if place.exists() and not (place / RESULT_FILE).is_file():
+        raise BadInput(f"{folder}: exists and is no fuselog result; give another folder with --out")
+    part, old = (place.with_name(place.name + ending) for ending in (".part", ".old"))
+    try:
+        with _held(part):
+            yield part
+            shutil.rmtree(old, ignore_errors=True)
+            if place.exists():
+                place.rename(old)
+            part.rename(place)
+            shutil.rmtree(old, ignore_errors=True)
+    except BlockingIOError:
+        raise BadInput(f"{folder}: another fuselog is writing it; wait, or give another --out") from None
+    except OSError as error:
+        raise BadInput(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """An empty folder that this process alone may fill; it is removed where that goes wrong.
+
+    The lock goes with the process, however that ends, and what it left is cleared here.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            yield
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+    finally:
+        os.close(handle)
+
+
+def write_outcome(
+    folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
+) -> Result:
+    """Write tables (Parquet and CSV), figures (SVG) and result.json; returns what result.json says."""
+    # here, since lists and --help need none of it
+    import matplotlib as mpl
+    import pyarrow
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    for name, table in outcome.tables.items():
+        (folder / "tables").mkdir(exist_ok=True)
+        columns = pyarrow.Table.from_pandas(table, preserve_index=False)
+        pyarrow.parquet.write_table(columns, folder / "tables" / f"{name}.parquet")
+        pyarrow.csv.write_csv(columns, folder / "tables" / f"{name}.csv")
+    for name, figure in outcome.figures.items():
+        (folder / "figures").mkdir(exist_ok=True)
+        with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+            figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
+    result = Result(
+        experiment=experiment,
+        fuselog=version("fuselog"),
+        settings=dict(settings),
+        input_sha256=outcome.input_sha256,
+        metrics=plain(outcome.metrics),
+        claims=outcome.claims,
+    )
+    text = json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False)
+    (folder / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
+    return result
+
+
+def read_result(folder: Path) -> Result:
+    """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
+    path = folder / RESULT_FILE
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
+    if not isinstance(values, dict):
+        raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+    return build(Result, values, str(path))
+
+
+def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:
+    """Metrics as JSON has them: NaN and infinity become null."""
+    return {
+        key: [_number(entry) for entry in value] if isinstance(value, list) else _number(value)
+        for key, value in metrics.items()
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None

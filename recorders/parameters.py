@@ -1,0 +1,134 @@
+"""Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from textwrap import shorten
+from typing import Any, NamedTuple, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from recorders.errors import BadInput, choices
+
+
+class Parameters(BaseModel):
+    """Base of all parameter types: immutable, no unknown names, no NaN and no infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+ParametersType = TypeVar("ParametersType", bound=Parameters)
+
+
+def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> ParametersType:
+    """Check `values` against a parameter type; raises BadInput that names `where` and the parameter."""
+    try:
+        return kind.model_validate(merge(_nested_defaults(kind), values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = [str(part) for part in first["loc"]]
+        name = ".".join(path)
+        if first["type"] == "extra_forbidden":
+            *above, last = path
+            known = _names_at(kind, above)
+            raise BadInput(f"{where}: no parameter '{name}'; {choices(last, known)}") from None
+        if first["type"] == "missing":
+            raise BadInput(f"{where}: parameter '{name}' is missing") from None
+        message = first["msg"].removeprefix("Value error, ").replace("Input", "it")
+        if not name:
+            raise BadInput(f"{where}: {message}") from None
+        given = shorten(repr(first["input"]), 60)
+        raise BadInput(f"{where}: parameter '{name}' is {given}; {message}") from None
+
+
+def _nested_defaults(kind: type[Parameters]) -> dict[str, Any]:
+    """Defaults that are tables of their own, so that a setting of one entry keeps the others."""
+    defaults = {name: entry.default for name, entry in kind.model_fields.items()}
+    return {
+        name: value.model_dump() for name, value in defaults.items() if isinstance(value, Parameters)
+    }
+
+
+def _names_at(kind: type[BaseModel], path: Sequence[str]) -> list[str]:
+    """The names of the parameters in the table at `path`."""
+    names = [each.name for each in describe(kind)]
+    prefix = "".join(f"{part}." for part in path)
+    below = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+    return list(dict.fromkeys(name.partition(".")[0] for name in below))
+
+
+class Described(NamedTuple):
+    """One parameter as a person reads it: its full name, its default, and what it accepts."""
+
+    name: str
+    default: Any
+    accepts: str
+
+
+def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
+    """All parameters of a type, those of nested tables by full names; `values` stand for defaults."""
+    schema = kind.model_json_schema()
+    return list(_described(schema, schema.get("$defs", {}), "", values or {}))
+
+
+def _described(
+    table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
+) -> Iterator[Described]:
+    """Walk a JSON schema; `given` are defaults that the table above states for this one."""
+    for name, entry in table.get("properties", {}).items():
+        default = entry.get("default")
+        options = [
+            definitions[each["$ref"].rpartition("/")[2]] if "$ref" in each else each
+            for each in entry.get("anyOf", [entry])
+        ]
+        below = next((each for each in options if "properties" in each), None)
+        if below is None:
+            value = given.get(name, default)
+            yield Described(prefix + name, value, " or ".join(map(_accepts, options)))
+        else:
+            values = merge(default or {}, given.get(name) or {})
+            yield from _described(below, definitions, f"{prefix}{name}.", values)
+
+
+def _accepts(schema: Mapping[str, Any]) -> str:
+    """What a schema of one value accepts: its type and bounds, or its choices."""
+    if "enum" in schema:
+        return ", ".join(map(str, schema["enum"]))
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    return " ".join([schema.get("type", "anything").replace("null", "none"), *bounds])
+
+
+def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
+
+    A right side that is no TOML value is taken as text. Raises BadInput where there is no `=`.
+    """
+    values: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        parts = key.strip().split(".")
+        if not equals or not all(parts):
+            raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        target = values
+        for part in parts[:-1]:
+            target = target.setdefault(part, {})
+            if not isinstance(target, dict):
+                raise BadInput(f"--set {setting}: '{part}' was already given a value of its own")
+        target[parts[-1]] = value
+    return values
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values of `over`, nested tables merged."""
+    merged = dict(base)
+    for key, value in over.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            merged[key] = merge(old, value)
+        else:
+            merged[key] = value
+    return merged

@@ -1,0 +1,223 @@
+"""The replay: one time-ordered pass over the runs of an ensemble, several estimators at once.
+
+An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
+the blocks of its topics one after another and carries a state from block to block; a batch one gets
+whole streams and is done. The same call serves one run and many, so an ensemble's results are those of
+the runs replayed one by one, bit for bit.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any, Generic
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream, Topic
+from recorders.log.streams import concatenate
+from recorders.parameters import Parameters, ParametersType, build
+from recorders.registry import foreign_code, load
+from replay.blocks import Block, Ragged, gather, merge_events
+from replay.sources import Source
+
+BLOCK_MESSAGES = 1 << 18
+
+
+@dataclass(frozen=True)
+class Recursive:
+    """An estimator that goes through its topics in time.
+
+    Attributes:
+        name: what its output topics begin with, `/estimates/` + name.
+        streams: the topics that `run` is handed, in the order its `Events.topic` counts them.
+        whole: the topics that `start` needs whole, such as a map or a prior.
+        start: whole topics -> the state before the first block.
+        run: state and block -> the state after it, and the output streams. States are values: `run`
+            never changes the one it is handed.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    start: Callable[[dict[str, Ragged]], Any]
+    run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """An estimator that needs everything at once: `solve` turns its topics into output streams.
+
+    `streams` are the measurements, within the span that is replayed; `whole` as for `Recursive`.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    solve: Callable[[dict[str, Ragged]], list[Ragged]]
+
+
+Bound = Recursive | Batch
+
+
+@dataclass(frozen=True)
+class Estimator(Generic[ParametersType]):
+    """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
+
+    `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
+    for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    """
+
+    summary: str
+    needs: str
+    parameters: type[ParametersType]
+    bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
+    variant: str | None = None
+
+
+def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
+    """The registered estimator of `name`, and the parameter that a `name:variant` sets.
+
+    Raises BadInput where there is none, or it has no variants.
+    """
+    kind, _, variant = name.partition(":")
+    estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    if not variant:
+        return estimator, {}
+    if estimator.variant is None:
+        raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
+    return estimator, {estimator.variant: variant}
+
+
+def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
+    """The estimator of a label, and its parameters.
+
+    `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
+    estimator can be replayed with several settings at once. The other settings are its parameters.
+
+    Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+    """
+    if not re.fullmatch(r"[\w:-]+", label):
+        raise BadInput(f"estimator '{label}': a label is made of letters, digits, '-', '_' and ':'")
+    values = dict(settings)
+    estimator, variant = find_estimator(str(values.pop("kind", label)))
+    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+
+
+def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+    """Bind an estimator to an ensemble; see `configure`.
+
+    Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
+    of them must be stated alike.
+    """
+    estimator, parameters = configure(label, settings)
+    first = sources[0]
+    with foreign_code(f"estimator {label}"):
+        bound = estimator.bind(label, first.topics, parameters)
+    if not bound:
+        raise BadInput(
+            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
+            f"the log has {', '.join(first.topics) or 'no topics'}"
+        )
+    for source in sources[1:]:
+        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
+            here, there = first.topics[topic], source.topics.get(topic)
+            if there is None or _stated(there) != _stated(here):
+                raise BadInput(
+                    f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
+                    "ensemble hold the same topics, replay this one on its own"
+                )
+    return bound
+
+
+def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
+    """What an estimator is told of a topic when it is bound."""
+    return topic.schema_name, topic.metadata
+
+
+def replay(
+    sources: Sequence[Source],
+    estimators: Sequence[Bound],
+    *,
+    order: Clock = "publish_time",
+    block_messages: int = BLOCK_MESSAGES,
+) -> Iterator[list[Ragged]]:
+    """Replay an ensemble; yields the output streams of all estimators, block by block.
+
+    Args:
+        sources: the runs, holding the same topics; their schedules may differ.
+        estimators: bound estimators with different names.
+        order: the clock to go by, publish time or (as it arrived) log time.
+        block_messages: about how many messages of a run are in memory at once.
+
+    Raises BadInput where an estimator raises, or no run has a message for it.
+    """
+    whole = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    given = [{topic: whole[topic] for topic in bound.whole} for bound in estimators]
+    states: list[Any] = [None] * len(estimators)
+    for index, bound in enumerate(estimators):
+        if isinstance(bound, Recursive):
+            with foreign_code(f"estimator {bound.name}"):
+                states[index] = bound.start(given[index])
+            continue
+        for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
+            with foreign_code(f"estimator {bound.name}"):
+                solved = bound.solve(given[index] | block)
+            yield solved
+    streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
+    for block in _ensemble_blocks(sources, sorted(streamed), order, block_messages):
+        outputs: list[Ragged] = []
+        for index, bound in enumerate(estimators):
+            if isinstance(bound, Recursive):
+                streams = {topic: block[topic] for topic in bound.streams}
+                events = merge_events(streams, order)
+                with foreign_code(f"estimator {bound.name}"):
+                    states[index], produced = bound.run(states[index], Block(streams, events))
+                outputs += produced
+        yield outputs
+
+
+def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, Ragged]:
+    runs = [source.read(topics) for source in sources]
+    return {topic: gather([run[topic] for run in runs]) for topic in topics}
+
+
+def _ensemble_blocks(
+    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
+) -> Iterator[dict[str, Ragged]]:
+    """The next block of every run, until all runs are at their end.
+
+    The runs need not be at the same time: each has its own state.
+    """
+    if not topics:
+        return
+    empty = {topic: sources[0].empty(topic) for topic in topics}
+    ended: dict[str, Stream] = {}
+    is_empty = True
+    runs = [source.blocks(topics, order, block_messages) for source in sources]
+    for blocks in zip_longest(*runs, fillvalue=ended):
+        yield {topic: gather([block.get(topic, empty[topic]) for block in blocks]) for topic in topics}
+        is_empty = False
+    if is_empty:
+        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
+
+
+def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
+    """Join a replay's blocks into whole output streams by topic, each run's rows together."""
+    parts: dict[str, list[Ragged]] = {}
+    for block in outputs:
+        for ragged in block:
+            parts.setdefault(ragged.stream.topic, []).append(ragged)
+    return {topic: _join(found) for topic, found in parts.items()}
+
+
+def _join(parts: list[Ragged]) -> Ragged:
+    if len(parts) == 1:
+        return parts[0]
+    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    stream = concatenate([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)

@@ -1,0 +1,537 @@
+"""Localization of robots in the plane from odometry and sightings of mapped landmarks.
+
+Dead reckoning, the extended and the unscented Kalman filter. The state is (x_m, y_m, heading_rad); the
+odometry's velocity holds until the next one. Ranges, bearings and range-bearings are one kind of event
+whose missing component is NaN.
+"""
+
+import copy
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+from scipy.stats import chi2
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Topic, make_stream, schemas
+from recorders.models.planar import (
+    drive,
+    drive_jacobians,
+    range_bearing,
+    range_bearing_jacobian,
+    wrap_angle,
+)
+from recorders.parameters import Parameters
+from replay.blocks import Block, Ragged, filled_rows, ragged_rows
+from replay.compile import compile_over_runs
+from replay.engine import Bound, Estimator, Recursive
+from replay.estimators.gaussian import (
+    Filter,
+    Floats,
+    Function,
+    Innovation,
+    Models,
+    correct,
+    is_finite,
+    linearised,
+    no_innovation,
+    sampled,
+    unscented_points,
+)
+
+SENSORS = ("range_bearing", "range", "bearing")
+FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
+ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
+
+
+class DeadReckoningParameters(Parameters):
+    """Noise densities are per square root of a second; None takes what the log's channels state."""
+
+    forward_noise_density: NonNegativeFloat | None = None
+    turn_noise_density: NonNegativeFloat | None = None
+
+
+class LocalizationParameters(DeadReckoningParameters):
+    """Sensor noise and bias, and how improbable a measurement must be to be kept out."""
+
+    sigma_range_m: PositiveFloat | None = None
+    sigma_bearing_rad: PositiveFloat | None = None
+    bias_range_m: float = 0.0
+    bias_bearing_rad: float = 0.0
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
+
+
+class UnscentedParameters(LocalizationParameters):
+    """The unscented filter's spread: 3 - n is Julier's choice for a Gaussian."""
+
+    kappa: float = 0.0
+
+
+class Carried(NamedTuple):
+    """What a filter carries from block to block; first axis = run."""
+
+    mean: Floats
+    covariance: Floats
+    velocity: Floats
+    time_ns: NDArray[np.int64]
+    failure: NDArray[np.int64]
+
+
+class Landmarks(NamedTuple):
+    """The maps of all runs end to end: keys are run * 2^32 + landmark, sorted; positions (n, 2)."""
+
+    keys: NDArray[np.int64]
+    positions: Floats
+
+
+class Settings(NamedTuple):
+    """What the filter is told.
+
+    Noise densities (2,) of the velocity, the sensors' bias (2,) and variances (sensors, 2), and the
+    gate by the number of measured components (3,).
+    """
+
+    velocity_density: Floats
+    bias: Floats
+    variance: Floats
+    gate: Floats
+
+
+class Sightings(NamedTuple):
+    """The events of all runs in order.
+
+    Odometry has sensor -1 and value (forward, turn); a sighting has value (range, bearing) and, as
+    target, the row of its target on the map, -1 if it is not there.
+    """
+
+    offsets: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    sensor: NDArray[np.int64]
+    value: Floats
+    target: NDArray[np.int64]
+    is_last: NDArray[np.bool_]
+
+
+class Poses(NamedTuple):
+    """The estimates, as the kernel notes them: run r fills the rows from `end[r]` on, and moves it."""
+
+    end: NDArray[np.int64]
+    event: NDArray[np.int64]
+    mean: Floats
+    covariance: Floats
+
+
+class Looks(NamedTuple):
+    """The innovations, as the kernel notes them; see `Poses`."""
+
+    end: NDArray[np.int64]
+    event: NDArray[np.int64]
+    difference: Floats
+    covariance: Floats
+    squared: Floats
+    accepted: NDArray[np.int64]
+
+
+def fill_motion_jacobians(
+    pose: Floats, velocity: Floats, duration_s: float, transition: Floats, gain: Floats
+) -> None:
+    """The Jacobians of `drive` by the pose (3, 3) and by the velocity (3, 2)."""
+    by_heading, by_forward, by_turn = drive_jacobians(pose, velocity, duration_s)
+    transition[:] = 0.0
+    gain[:] = 0.0
+    for row in range(2):
+        transition[row, row] = 1.0
+        transition[row, 2] = by_heading[row]
+        gain[row, 0] = by_forward[row]
+        gain[row, 1] = by_turn[row]
+    transition[2, 2] = 1.0
+    gain[2, 1] = duration_s
+
+
+def fill_sensor_jacobian(pose: Floats, target: Floats, rows: Floats) -> None:
+    """The Jacobian of `range_bearing` by the pose (2, 3)."""
+    by_range, by_bearing = range_bearing_jacobian(pose, target)
+    for column in range(3):
+        rows[0, column] = by_range[column]
+        rows[1, column] = by_bearing[column]
+
+
+MODELS = Models(drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
+
+
+def note_pose(poses: Poses, run: int, event: int, mean: Floats, covariance: Floats) -> None:
+    """Fill the next row of a run's poses."""
+    row = poses.end[run]
+    poses.event[row] = event
+    for i in range(3):
+        poses.mean[row, i] = mean[i]
+        for j in range(3):
+            poses.covariance[row, i, j] = covariance[i, j]
+    poses.end[run] = row + 1
+
+
+def note_look(looks: Looks, run: int, event: int, innovation: Innovation) -> int:
+    """Begin the next row of a run's looks, and return it; it counts when `end` is moved."""
+    row = looks.end[run]
+    looks.event[row] = event
+    for i in range(2):
+        looks.difference[row, i] = innovation.difference[i]
+        for j in range(2):
+            missing = np.isnan(innovation.difference[i] + innovation.difference[j])
+            looks.covariance[row, i, j] = np.nan if missing else innovation.covariance[i, j]
+    return row
+
+
+def localization(steps: Filter) -> Function:
+    """The loop over the events of one run, specialised to a filter."""
+    _, predict, innovate = steps
+
+    def take_in(
+        run: int,
+        event: int,
+        events: Sightings,
+        positions: Floats,
+        settings: Settings,
+        carried: Carried,
+        looks: Looks,
+        scratch: tuple[Innovation, Any],
+    ) -> int:
+        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did."""
+        mean, covariance, velocity = carried.mean[run], carried.covariance[run], carried.velocity[run]
+        sensor, target, value = events.sensor[event], events.target[event], events.value[event]
+        innovation, memory = scratch
+        duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
+        if duration_s > 0.0:
+            carried.time_ns[run] = events.time_ns[event]
+            if not predict(mean, covariance, velocity, settings.velocity_density, duration_s, memory):
+                return NOT_POSITIVE_DEFINITE
+        if sensor < 0:
+            velocity[0], velocity[1] = value[0], value[1]
+        elif target >= 0 and duration_s >= 0.0:
+            variance = settings.variance[sensor]
+            if not innovate(mean, covariance, positions[target], value, variance, innovation, memory):
+                return NOT_POSITIVE_DEFINITE
+            row = note_look(looks, run, event, innovation)
+            squared, accepted = correct(mean, covariance, innovation, settings.gate)
+            if np.isnan(squared):
+                return NOT_POSITIVE_DEFINITE
+            looks.squared[row], looks.accepted[row] = squared, accepted
+            looks.end[run] = row + 1
+        return ALL_WELL if is_finite(mean, covariance) else NOT_FINITE
+
+    def localize(
+        run: int,
+        events: Sightings,
+        positions: Floats,
+        settings: Settings,
+        carried: Carried,
+        poses: Poses,
+        looks: Looks,
+        scratch: tuple[Innovation, Any],
+    ) -> None:
+        """Move what is carried, and fill poses and looks, until the events end or the filter fails."""
+        start_ns = carried.time_ns[run]
+        for event in range(events.offsets[run], events.offsets[run + 1]):
+            if carried.failure[run] != ALL_WELL:
+                break
+            carried.failure[run] = take_in(
+                run, event, events, positions, settings, carried, looks, scratch
+            )
+            due = events.is_last[event] and events.time_ns[event] >= start_ns
+            if due and carried.failure[run] == ALL_WELL:
+                note_pose(poses, run, event, carried.mean[run], carried.covariance[run])
+
+    return localize
+
+
+@lru_cache(maxsize=8)
+def _compiled(kind: str) -> tuple[Function, Function]:
+    """The loop over the runs, and what makes the filter's memory."""
+    steps = {"linearised": linearised, "sampled": sampled}[kind](MODELS)
+    return compile_over_runs(localization(steps), allocates=False), steps.memory
+
+
+def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landmarks]:
+    """The state at every run's prior, and the maps.
+
+    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance.
+    """
+    prior = whole[prior_topic]
+    rows = prior.offsets[:-1]
+    if np.any(np.diff(prior.offsets) == 0):
+        raise BadInput(f"topic {prior_topic}: a run has no prior message; the filter cannot start")
+    mean = prior["mean"][rows]
+    if mean.shape[1] != 3 or prior["covariance"].shape[1] != 9:
+        raise BadInput(f"topic {prior_topic}: a prior of (x_m, y_m, heading_rad) is needed")
+    covariance = prior["covariance"][rows].reshape(-1, 3, 3)
+    if np.any(np.linalg.eigvalsh(covariance)[:, 0] <= 0):
+        raise BadInput(f"topic {prior_topic}: the prior's covariance is not positive definite")
+    carried = Carried(
+        mean,
+        covariance,
+        np.zeros((prior.runs, 2)),
+        prior.stream.publish_time_ns[rows],
+        np.full(prior.runs, -1),
+    )
+    return carried, _landmarks(whole["/landmarks"])
+
+
+def _landmarks(landmarks: Ragged) -> Landmarks:
+    run = np.repeat(np.arange(landmarks.runs), np.diff(landmarks.offsets))
+    keys = (run << 32) + landmarks["landmark_id"]
+    order = np.argsort(keys, kind="stable")
+    positions = landmarks["position_m"].reshape(len(keys), -1)[:, :2]
+    return Landmarks(keys[order], np.ascontiguousarray(positions[order]))
+
+
+def run(
+    state: tuple[Carried, Landmarks],
+    block: Block,
+    *,
+    kind: str,
+    samples: tuple[Floats, ...],
+    settings: Settings,
+    outputs: "Outputs",
+) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
+    """Filter a block; see `replay.engine.Recursive`."""
+    before, landmarks = state
+    carried = copy.deepcopy(before)
+    order = block.events
+    run_of = np.repeat(np.arange(len(before.failure)), np.diff(order.offsets))
+    target_id = block.column("target_id", missing=0).astype(np.int64)
+    target = _rows_on_map(landmarks, (run_of << 32) + target_id)
+    sensor = order.topic - 1
+    value = np.stack(
+        [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
+    )
+    value[sensor >= 0] -= settings.bias
+    events = Sightings(order.offsets, order.time_ns, sensor, value, target, order.is_last)
+    started = order.time_ns >= before.time_ns[run_of]
+    pose_rows = ragged_rows(order.is_last & started, order.offsets)
+    look_rows = ragged_rows((target >= 0) & started, order.offsets)
+    poses, looks = _no_poses(pose_rows), _no_looks(look_rows)
+    loop, memory = _compiled(kind)
+    loop(
+        len(before.failure),
+        events,
+        landmarks.positions,
+        settings,
+        carried,
+        poses,
+        looks,
+        scratch=lambda: (no_innovation(3, 2), memory(3, 2, 2, *samples)),
+    )
+    return (carried, landmarks), [
+        outputs.poses(poses, pose_rows, events),
+        outputs.innovations(looks, look_rows, events, target_id),
+        outputs.failures(before, carried),
+    ]
+
+
+def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    if len(landmarks.keys) == 0:
+        return np.full(len(keys), -1)
+    rows = np.minimum(np.searchsorted(landmarks.keys, keys), len(landmarks.keys) - 1)
+    return np.where(landmarks.keys[rows] == keys, rows, -1)
+
+
+def _no_poses(offsets: NDArray[np.int64]) -> Poses:
+    rows = offsets[-1]
+    return Poses(
+        offsets[:-1].copy(), np.empty(rows, np.int64), np.empty((rows, 3)), np.empty((rows, 3, 3))
+    )
+
+
+def _no_looks(offsets: NDArray[np.int64]) -> Looks:
+    rows = offsets[-1]
+    return Looks(
+        offsets[:-1].copy(),
+        np.empty(rows, np.int64),
+        np.empty((rows, 2)),
+        np.empty((rows, 2, 2)),
+        np.empty(rows),
+        np.empty(rows, np.int64),
+    )
+
+
+class Outputs(NamedTuple):
+    """The output topics of one bound filter: the parts of their names, and how results fill them."""
+
+    name: str
+    truth: str
+
+    def poses(self, poses: Poses, offsets: NDArray[np.int64], events: Sightings) -> Ragged:
+        """The estimates at every distinct stamp."""
+        rows, offsets = filled_rows(offsets, poses.end)
+        mean = poses.mean[rows]
+        mean[:, 2] = wrap_angle(mean[:, 2])
+        return self._ragged(
+            "pose",
+            schemas.GAUSSIAN_ESTIMATE,
+            offsets,
+            events.time_ns[poses.event[rows]],
+            {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+            mean=mean,
+            covariance=poses.covariance[rows].reshape(-1, 9),
+        )
+
+    def innovations(
+        self,
+        looks: Looks,
+        offsets: NDArray[np.int64],
+        events: Sightings,
+        target_id: NDArray[np.int64],
+    ) -> Ragged:
+        """How every sighting of the map fitted."""
+        rows, offsets = filled_rows(offsets, looks.end)
+        return self._ragged(
+            "innovation",
+            schemas.INNOVATION,
+            offsets,
+            events.time_ns[looks.event[rows]],
+            {"components": "range_m,bearing_rad", "kinds": "linear,angle"},
+            target_id=target_id[looks.event[rows]],
+            accepted=looks.accepted[rows],
+            innovation=looks.difference[rows],
+            covariance=looks.covariance[rows].reshape(-1, 4),
+            normalised_innovation_squared=looks.squared[rows],
+        )
+
+    def failures(self, before: Carried, after: Carried) -> Ragged:
+        """The runs that failed in this block."""
+        failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
+        return self._ragged(
+            "failure",
+            schemas.FAILURE,
+            np.searchsorted(failed, np.arange(len(after.failure) + 1)),
+            after.time_ns[failed],
+            {"reasons": "; ".join(FAILURES)},
+            reason=after.failure[failed],
+        )
+
+    def _ragged(
+        self,
+        leaf: str,
+        schema: Schema,
+        offsets: NDArray[np.int64],
+        time_ns: NDArray[np.int64],
+        metadata: Mapping[str, str],
+        **columns: NDArray[Any],
+    ) -> Ragged:
+        topic = f"/estimates/{self.name}/{leaf}"
+        metadata = {**metadata, "truth": self.truth}
+        return Ragged(make_stream(topic, schema, time_ns, metadata=metadata, **columns), offsets)
+
+
+def _stated(topic: Topic, name: str, given: float | None) -> float:
+    """A parameter as given, else as the channel's metadata states it."""
+    if given is not None:
+        return given
+    try:
+        return float(topic.metadata[name])
+    except (KeyError, ValueError):
+        raise BadInput(
+            f"topic {topic.name} does not state {name}; give it with --set {name}=..."
+        ) from None
+
+
+def _bind(
+    name: str,
+    topics: Mapping[str, Topic],
+    parameters: DeadReckoningParameters,
+    *,
+    kind: str,
+    samples: tuple[Floats, ...] = (),
+) -> list[Bound]:
+    """One filter for every robot that has odometry, a prior and, unless it only reckons, a sensor."""
+    bound: list[Bound] = []
+    for topic in topics.values():
+        prefix, _, leaf = topic.name.rpartition("/")
+        if leaf != "odometry" or topic.schema_name != schemas.ODOMETRY.full_name:
+            continue
+        sensed: list[str] = []
+        if isinstance(parameters, LocalizationParameters):
+            sensed = [f"{prefix}/{sensor}" for sensor in SENSORS if f"{prefix}/{sensor}" in topics]
+        if f"{prefix}/prior" not in topics or "/landmarks" not in topics:
+            continue
+        if isinstance(parameters, LocalizationParameters) and not sensed:
+            continue
+        settings = _settings(topics, topic, sensed, parameters)
+        bound.append(
+            Recursive(
+                f"{name}{prefix}",
+                (topic.name, *sensed),
+                (f"{prefix}/prior", "/landmarks"),
+                partial(start, prior_topic=f"{prefix}/prior"),
+                partial(
+                    run,
+                    kind=kind,
+                    samples=samples,
+                    settings=settings,
+                    outputs=Outputs(f"{name}{prefix}", f"{prefix}/truth"),
+                ),
+            )
+        )
+    return bound
+
+
+def _settings(
+    topics: Mapping[str, Topic],
+    odometry: Topic,
+    sensed: list[str],
+    parameters: DeadReckoningParameters,
+) -> Settings:
+    density = [
+        _stated(odometry, "forward_noise_density", parameters.forward_noise_density),
+        _stated(odometry, "turn_noise_density", parameters.turn_noise_density),
+    ]
+    variance = np.full((len(sensed), 2), np.nan)
+    bias = np.zeros(2)
+    gate = np.full(3, np.inf)
+    if isinstance(parameters, LocalizationParameters):
+        for row, topic in enumerate(sensed):
+            if not topic.endswith("/bearing"):
+                sigma = _stated(topics[topic], "sigma_range_m", parameters.sigma_range_m)
+                variance[row, 0] = sigma**2
+            if not topic.endswith("/range"):
+                sigma = _stated(topics[topic], "sigma_bearing_rad", parameters.sigma_bearing_rad)
+                variance[row, 1] = sigma**2
+        bias = np.array([parameters.bias_range_m, parameters.bias_bearing_rad])
+        gate[1:] = chi2.ppf(parameters.gate_probability, [1, 2])
+    return Settings(np.array(density), bias, variance, gate)
+
+
+def _bind_linearised(
+    name: str, topics: Mapping[str, Topic], parameters: DeadReckoningParameters
+) -> list[Bound]:
+    return _bind(name, topics, parameters, kind="linearised")
+
+
+def _bind_unscented(
+    name: str, topics: Mapping[str, Topic], parameters: UnscentedParameters
+) -> list[Bound]:
+    samples = unscented_points(3, parameters.kappa)
+    return _bind(name, topics, parameters, kind="sampled", samples=samples)
+
+
+DEAD_RECKONING = Estimator(
+    "robot pose from odometry alone",
+    "/landmarks and, per robot, .../odometry and .../prior",
+    DeadReckoningParameters,
+    _bind_linearised,
+)
+EKF = Estimator(
+    "robot pose from odometry and mapped landmarks, extended Kalman filter",
+    "/landmarks and, per robot, .../odometry, .../prior and one of .../range_bearing, range, bearing",
+    LocalizationParameters,
+    _bind_linearised,
+)
+UKF = Estimator(
+    "robot pose from odometry and mapped landmarks, unscented Kalman filter",
+    EKF.needs,
+    UnscentedParameters,
+    _bind_unscented,
+)
