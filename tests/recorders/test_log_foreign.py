@@ -508,6 +508,10 @@ def forget_a_message(summary):
     statistics(summary).message_count -= 1
 
 
+def count_no_messages(summary):
+    statistics(summary).channel_message_counts.clear()
+
+
 def forget_a_schema(summary):
     summary.remove(next(each for each in summary if isinstance(each, records.Schema)))
 
@@ -523,6 +527,7 @@ LIES = [
     shift_the_span,
     forget_a_channel,
     forget_a_message,
+    count_no_messages,
     forget_a_schema,
 ]
 
@@ -552,7 +557,7 @@ def test_an_index_that_lies_is_found_out(tmp_path, lie, clock):
     assert_reads_as(open_log(path), honest, clock)
     path.write_bytes(with_summary(path.read_bytes(), lie))
     assert_reads_as(open_log(path, recover=True), honest, clock)
-    if lie in (leave_out_a_chunk, state_a_wrong_length, forget_a_schema):
+    if lie in (leave_out_a_chunk, state_a_wrong_length, count_no_messages, forget_a_schema):
         assert_reads_as(open_log(path), honest, clock)
     else:
         with pytest.raises(BadInput, match="--recover"):
