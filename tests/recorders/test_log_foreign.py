@@ -453,6 +453,34 @@ def with_summary(raw: bytes, change) -> bytes:
     return raw[:start] + section + struct.pack("<I", zlib.crc32(section)) + raw[-8:]
 
 
+def test_messages_beside_indexed_chunks_are_read(tmp_path):
+    """MCAP lets messages stand outside the chunks of an indexed file; no index tells of them."""
+    path = tmp_path / "run.mcap"
+    (bearings,) = [stream for stream in some_streams(2) if stream.topic == "/bearing"]
+    with LogWriter(path, chunk_bytes=700) as log:
+        log.write([bearings])
+    raw = bytearray(path.read_bytes())
+    payload = struct.pack("<HIQQ", 1, 99, 1100, 1050) + CLOCK + TARGET + ANGLE
+    loose = struct.pack("<BQ", 5, len(payload)) + payload
+    (start,) = struct.unpack_from("<Q", raw, len(raw) - 28)
+    struct.pack_into("<Q", raw, len(raw) - 28, start + 2 * len(loose))
+    second_chunk = open_log(path).container.regions[1].offset
+    data_end = start - 13
+    raw = raw[:second_chunk] + loose + raw[second_chunk:data_end] + loose + raw[data_end:]
+
+    def count_them(summary):
+        for entry in chunk_indexes(summary)[1:]:
+            entry.chunk_start_offset += len(loose)
+        statistics(summary).channel_message_counts[1] += 2
+        statistics(summary).message_count += 2
+
+    path.write_bytes(with_summary(bytes(raw), count_them))
+    for recover in (False, True):
+        found = read(path, "/bearing", recover=recover)
+        assert sorted(found.publish_time_ns) == sorted([*bearings.publish_time_ns, 1050, 1050])
+        assert found["target_id"][found.log_time_ns == 1100][-2:].tolist() == [6, 6]
+
+
 def chunk_indexes(summary):
     return [each for each in summary if isinstance(each, records.ChunkIndex)]
 
