@@ -66,6 +66,21 @@ def test_what_is_no_log_is_refused(tmp_path):
         assert refusal(tmp_path / name, lambda path: open_log(path, recover=True)).endswith(sentence)
 
 
+def test_a_log_that_vanishes_or_changes_after_it_was_opened_is_told(whole):
+    """Another program may remove or replace a log while it is read."""
+    raw, _, path = whole
+    path.write_bytes(raw)
+    log = open_log(path)
+    path.unlink()
+    assert refusal(log, lambda log: read_streams(log, TOPICS)).endswith("(No such file or directory)")
+    path.write_bytes(raw[:100])
+    assert refusal(log, lambda log: read_streams(log, TOPICS)).endswith(
+        "(it became shorter while it was read)"
+    )
+    path.write_bytes(raw[:20] + raw)
+    assert "is damaged" in refusal(log, lambda log: read_streams(log, TOPICS))
+
+
 def messages_by_chunk(raw: bytes) -> list[tuple[int, Counter]]:
     """Where each chunk ends, and how many messages each topic has up to there, as mcap reads it."""
     ends, topics, counts = [], {}, Counter()
