@@ -1,6 +1,6 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
-from recorders.log.reader import Log, open_log, read_blocks, read_streams
+from recorders.log.reader import Log, open_log, read_blocks, read_empty, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
 from recorders.log.streams import Stream, make_stream
@@ -16,6 +16,7 @@ __all__ = [
     "make_stream",
     "open_log",
     "read_blocks",
+    "read_empty",
     "read_streams",
     "write_log",
 ]

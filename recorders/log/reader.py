@@ -159,7 +159,9 @@ def read_streams(
     for block in read_blocks(log, topics, order=order, start_ns=start_ns, end_ns=end_ns):
         for topic, stream in block.items():
             parts[topic].append(stream)
-    return {topic: concatenate(found) if found else _empty(log, topic) for topic, found in parts.items()}
+    return {
+        topic: concatenate(found) if found else read_empty(log, topic) for topic, found in parts.items()
+    }
 
 
 def read_blocks(
@@ -292,7 +294,8 @@ def _delays(log: Log, topics: Sequence[str], decoders: list["_Decoder"]) -> tupl
     return (smallest, largest) if smallest <= largest else (0, 0)
 
 
-def _empty(log: Log, topic: str) -> Stream:
+def read_empty(log: Log, topic: str) -> Stream:
+    """A topic without its messages: its schema and metadata."""
     found = log.require(topic)
     return empty_stream(topic, _Decoder(log, topic, found.channel_ids[0]).schema, found.metadata)
 

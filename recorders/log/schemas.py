@@ -286,9 +286,14 @@ INNOVATION = _declare(
     "How one measurement fitted the prediction, and whether the gate let it in.",
     _identifier("target_id"),
     _identifier("accepted"),
-    _vector("innovation"),
-    _vector("covariance"),
+    _vector("innovation", may_be_nan=True),
+    _vector("covariance", may_be_nan=True),
     _real("normalised_innovation_squared"),
+)
+FAILURE = _declare(
+    "Failure",
+    "A run ended here; the channel's metadata lists the reasons by number.",
+    _identifier("reason"),
 )
 SOLUTION = _declare(
     "Solution",

@@ -4,18 +4,9 @@ The system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivari
 2016, section IV. Component-first: scalars and arrays alike.
 """
 
-from typing import Any
-
 import numpy as np
 
-# A number, or an array of them: the annotation of everything a component may be.
-Component = Any
-Components = tuple[Any, ...]
-
-
-def wrap_angle(angle_rad: Component) -> Component:
-    """The equal angle in [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+from recorders.models.planar import Component
 
 
 def turn_together(

@@ -44,7 +44,7 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
     d = z.shape[-1] if z.ndim else 0
     if d not in (2, 4) or axes.shape[-2:] != (d, d):
         raise BadInput(
-            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d) and (..., d), d 2 or 4"
+            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d), (..., d), d 2 or 4"
         )
     if not np.isfinite(z).all():
         raise BadInput("Bingham concentrations must be finite; give numbers, 0 for no concentration")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.models.headings import wrap_angle
+from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal_kernels as kernels
 from replay.distributions.batches import flatten
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recorders.models.headings import Component, Components, wrap_angle
+from recorders.models.planar import Component, Components, wrap_angle
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.

@@ -15,7 +15,8 @@ from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.models.headings import turn_together, wrap_angle
+from recorders.models.headings import turn_together
+from recorders.models.planar import wrap_angle
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples

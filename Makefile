@@ -1,0 +1,45 @@
+# make demo, make test: each does all of its own set-up in .venv; only Python 3.11 or newer is needed.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: demo test bench format clean
+
+demo: .venv/with-fuselog
+	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
+	$(BIN)/fuselog report demo/landmarks --out demo/report.html
+	@echo
+	@echo "Scrub the timeline:  $(BIN)/fuselog view demo/landmarks"
+	@echo "Read the report:     demo/report.html (open it in a browser)"
+	@echo "Summary figure:      demo/landmarks/figures/errors-robot1.svg"
+	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
+	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
+
+test: .venv/with-test
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+bench: .venv/with-bench
+	$(BIN)/python -m tests.bench
+
+format: .venv/with-test
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf .venv demo out build *.egg-info
+
+.venv/with-fuselog: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(INSTALL) --editable .
+	@touch $@
+
+.venv/with-test: .venv/with-fuselog
+	$(INSTALL) --editable '.[test]'
+	@touch $@
+
+.venv/with-bench: .venv/with-fuselog
+	$(INSTALL) --editable '.[bench]'
+	@touch $@

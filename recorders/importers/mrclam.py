@@ -1,0 +1,171 @@
+"""UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
+
+K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011. A
+folder holds Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and
+measurements as text columns.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.parameters import Parameters
+from recorders.recording import Importer, Recording
+
+POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
+
+
+class MrclamParameters(Parameters):
+    """What the data do not say: sensor data sheets and how well the start is known.
+
+    The same for all sets and robots. The odometry's densities are those of its error over 1 to 20 s,
+    rounded up. The errors of successive ranges and bearings are alike (lag 1: 0.5-0.7) at up to ten a
+    second, which a filter takes for independent: their sigmas are a few times the scatter.
+    """
+
+    forward_noise_density: PositiveFloat = 0.05
+    turn_noise_density: PositiveFloat = 0.05
+    sigma_range_m: PositiveFloat = 0.8
+    sigma_bearing_rad: PositiveFloat = 0.05
+    prior_sigma_m: PositiveFloat = 0.05
+    prior_sigma_rad: PositiveFloat = 0.05
+
+
+def read(folder: Path, parameters: MrclamParameters) -> Recording:
+    """Read a set; unknown barcodes are dropped and counted in the notes.
+
+    Raises BadInput that names the file and line where one is missing or malformed.
+    """
+    if not folder.is_dir():
+        raise BadInput(f"{folder}: not a folder; give the folder that holds Barcodes.dat")
+    barcodes = _table(folder / "Barcodes.dat", 2)
+    landmarks = _table(folder / "Landmark_Groundtruth.dat", 5)
+    robots = _robots(folder)
+    subject_of = dict(zip(barcodes[:, 1].astype(int), barcodes[:, 0].astype(int), strict=True))
+    truths = {robot: _timed(folder / f"Robot{robot}_Groundtruth.dat", 4) for robot in robots}
+    epoch_ns = min(int(times_ns[0]) for times_ns, _ in truths.values())
+    streams = [
+        make_stream(
+            "/landmarks",
+            schemas.LANDMARK,
+            np.full(len(landmarks), epoch_ns),
+            landmark_id=landmarks[:, 0],
+            position_m=landmarks[:, 1:3],
+        )
+    ]
+    notes: dict[str, str] = {}
+    for robot in robots:
+        streams += _robot_streams(folder, robot, truths[robot], subject_of, parameters, notes)
+    return Recording(streams, epoch_ns, notes)
+
+
+def _robots(folder: Path) -> list[int]:
+    names = [re.fullmatch(r"Robot(\d+)_\w+\.dat", path.name) for path in folder.iterdir()]
+    robots = sorted({int(name.group(1)) for name in names if name})
+    if not robots:
+        raise BadInput(f"{folder}: no RobotN_*.dat files; give the folder of one MRCLAM set")
+    return robots
+
+
+def _robot_streams(
+    folder: Path,
+    robot: int,
+    truth: tuple[NDArray[np.int64], NDArray[np.float64]],
+    subject_of: dict[int, int],
+    parameters: MrclamParameters,
+    notes: dict[str, str],
+) -> list[Stream]:
+    truth_ns, poses = truth
+    odometry_ns, odometry = _timed(folder / f"Robot{robot}_Odometry.dat", 3)
+    seen_ns, seen = _timed(folder / f"Robot{robot}_Measurement.dat", 4)
+    codes = seen[:, 0].astype(int)
+    known = np.isin(codes, list(subject_of))
+    for code, count in zip(*np.unique(codes[~known], return_counts=True), strict=True):
+        notes[f"robot {robot}, unknown barcode {code}"] = f"{count} measurements dropped"
+    targets = np.array([subject_of[code] for code in codes[known]], np.uint32)
+    prefix = f"/robot{robot}"
+    sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
+    start_ns = max(odometry_ns[0], truth_ns[0])
+    row = min(int(np.searchsorted(truth_ns, start_ns)), len(truth_ns) - 1)
+    return [
+        make_stream(
+            f"{prefix}/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            truth_ns[row : row + 1],
+            metadata=POSE,
+            mean=poses[row : row + 1],
+            covariance=np.diag(sigma**2).reshape(1, 9),
+        ),
+        make_stream(f"{prefix}/truth", schemas.TRUTH_STATE, truth_ns, metadata=POSE, state=poses),
+        make_stream(
+            f"{prefix}/odometry",
+            schemas.ODOMETRY,
+            odometry_ns,
+            metadata={
+                "forward_noise_density": repr(parameters.forward_noise_density),
+                "turn_noise_density": repr(parameters.turn_noise_density),
+            },
+            forward_mps=odometry[:, 0],
+            turn_radps=odometry[:, 1],
+        ),
+        make_stream(
+            f"{prefix}/range_bearing",
+            schemas.RANGE_BEARING,
+            seen_ns[known],
+            metadata={
+                "sigma_range_m": repr(parameters.sigma_range_m),
+                "sigma_bearing_rad": repr(parameters.sigma_bearing_rad),
+            },
+            target_id=targets,
+            range_m=seen[known, 1],
+            bearing_rad=seen[known, 2],
+        ),
+    ]
+
+
+def _table(path: Path, columns: int) -> NDArray[np.float64]:
+    """The numbers of one file, (rows, columns)."""
+    try:
+        table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
+    except FileNotFoundError:
+        raise BadInput(f"{path}: missing; an MRCLAM folder needs it") from None
+    except pd.errors.EmptyDataError:
+        raise BadInput(f"{path}: no data rows") from None
+    except (OSError, pd.errors.ParserError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: cannot be read as columns ({error})") from None
+    if table.shape[1] != columns:
+        raise BadInput(f"{path}: expected {columns} columns, found {table.shape[1]}")
+    numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    bad = ~np.isfinite(numbers)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise BadInput(
+            f"{path}: data row {row + 1}, column {column + 1} is {table.iloc[row, column]!r}, no number"
+        )
+    return numbers
+
+
+def _timed(path: Path, columns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
+
+    The stamps are read to the millisecond they are printed in: as doubles they are not exact.
+    """
+    table = _table(path, columns)
+    times_ns = np.rint(table[:, 0] * 1e6).astype(np.int64) * 1000
+    if times_ns.min() < 0:
+        raise BadInput(f"{path}: a time is negative")
+    order = np.argsort(times_ns, kind="stable")
+    return times_ns[order], table[order, 1:]
+
+
+MRCLAM = Importer(
+    "UTIAS multi-robot cooperative localization and mapping sets: a folder of RobotN_*.dat files",
+    MrclamParameters,
+    read,
+)

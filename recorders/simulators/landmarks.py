@@ -1,0 +1,331 @@
+"""Robots drive among landmarks: odometry, ranges, bearings and relative bearings, truth.
+
+Odometry reads the velocity that holds from its stamp to the next; the robot drives that velocity plus
+white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.log import Schema, Stream, make_stream, schemas
+from recorders.models.planar import drive, range_bearing, wrap_angle
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+FieldOfView = Annotated[float, Field(gt=0, le=360)]
+SENSORS = {
+    "range_bearing": schemas.RANGE_BEARING,
+    "range": schemas.RANGE,
+    "bearing": schemas.BEARING,
+    "relative_bearing": schemas.RELATIVE_BEARING,
+}
+POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
+
+
+class Sensor(Parameters):
+    """What every sensor of a robot has in common; a rate of zero switches it off."""
+
+    rate_hz: NonNegativeFloat = 0.0
+    maximum_range_m: PositiveFloat = 8.0
+    field_of_view_deg: FieldOfView = 360.0
+    outlier_probability: Probability = 0.0
+    dropout_probability: Probability = 0.0
+    outages_per_minute: NonNegativeFloat = 0.0
+    outage_s: PositiveFloat = 3.0
+    latency_s: NonNegativeFloat = 0.0
+    latency_jitter_s: NonNegativeFloat = 0.0
+    clock_offset_s: float = 0.0
+    stamp_offset_s: float = 0.0
+    sigma_range_m: NonNegativeFloat = 0.1
+    sigma_bearing_rad: NonNegativeFloat = 0.02
+    bias_range_m: float = 0.0
+    bias_bearing_rad: float = 0.0
+
+
+class LandmarksParameters(Parameters):
+    """The scenario; noise densities are per square root of a second."""
+
+    duration_s: PositiveFloat = 60.0
+    robots: PositiveInt = 1
+    landmarks: Annotated[int, Field(ge=0)] = 12
+    arena_m: PositiveFloat = 12.0
+    speed_mps: PositiveFloat = 0.6
+    odometry_rate_hz: PositiveFloat = 20.0
+    odometry_latency_s: NonNegativeFloat = 0.0
+    forward_noise_density: NonNegativeFloat = 0.02
+    turn_noise_density: NonNegativeFloat = 0.01
+    forward_scale_error: Annotated[float, Field(gt=-1)] = 0.0
+    turn_bias_radps: float = 0.0
+    prior_sigma_m: PositiveFloat = 0.1
+    prior_sigma_rad: PositiveFloat = 0.05
+    robots_see_each_other: bool = False
+    range_bearing: Sensor = Sensor(rate_hz=5.0)
+    range: Sensor = Sensor()
+    bearing: Sensor = Sensor()
+    relative_bearing: Sensor = Sensor()
+
+
+class Drive(NamedTuple):
+    """What one robot did: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
+
+    times_s: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    true_velocity: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+
+    def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Exact poses (n, 3) at any times within the drive."""
+        steps = np.searchsorted(self.times_s, times_s, side="right") - 1
+        steps = np.clip(steps, 0, len(self.true_velocity) - 1)
+        return np.stack(
+            drive(self.poses[steps].T, self.true_velocity[steps].T, times_s - self.times_s[steps]),
+            axis=1,
+        )
+
+
+class Sightings(NamedTuple):
+    """One sensor's looks: stamps (n,), pairs of look and target, and what is true of each pair."""
+
+    times_s: NDArray[np.float64]
+    look: NDArray[np.int64]
+    target: NDArray[np.int64]
+    range_m: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    outages_s: NDArray[np.float64]
+
+
+def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recording:
+    """Record one run; every robot and sensor draws from a random stream of its own."""
+    map_rng, *robot_rngs = rng.spawn(1 + parameters.robots)
+    half = 0.5 * parameters.arena_m
+    landmarks = map_rng.uniform(-half, half, (parameters.landmarks, 2))
+    first_landmark = parameters.robots + 1
+    streams = [
+        make_stream(
+            "/landmarks",
+            schemas.LANDMARK,
+            np.full(parameters.landmarks, SIMULATION_EPOCH_NS),
+            landmark_id=np.arange(first_landmark, first_landmark + parameters.landmarks),
+            position_m=landmarks,
+        )
+    ]
+    children = [robot_rng.spawn(6) for robot_rng in robot_rngs]
+    drives = [_drive(parameters, number, rngs[0]) for number, rngs in enumerate(children)]
+    for number, rngs in enumerate(children, start=1):
+        streams += _robot_streams(parameters, number, drives, landmarks, rngs)
+    return Recording(streams)
+
+
+def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generator) -> Drive:
+    """Drive around the arena on a wavering circle."""
+    steps = max(1, round(parameters.duration_s * parameters.odometry_rate_hz))
+    step_s = 1.0 / parameters.odometry_rate_hz
+    times_s = np.arange(steps + 1) * step_s
+    radius_m = parameters.arena_m * rng.uniform(0.25, 0.35)
+    phase, period_s = rng.uniform(0, 2 * np.pi), rng.uniform(12, 20)
+    forward = np.full(steps, parameters.speed_mps)
+    turn = forward / radius_m * (1 + 0.6 * np.sin(2 * np.pi * times_s[:-1] / period_s + phase))
+    odometry = np.stack([forward, turn if number % 2 == 0 else -turn], axis=1)
+    density = [parameters.forward_noise_density, parameters.turn_noise_density]
+    noise = rng.normal(size=(steps, 2)) * density / np.sqrt(step_s)
+    scale = np.array([1 + parameters.forward_scale_error, 1.0])
+    true_velocity: NDArray[np.float64] = (
+        odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    )
+    start = rng.uniform(0, 2 * np.pi)
+    turned = np.cumsum(true_velocity[:, 1] * step_s)
+    heading: NDArray[np.float64] = start + np.pi / 2 + np.append(0.0, turned)
+    if number % 2:
+        heading += np.pi
+    origin = np.zeros((3, steps))
+    origin[2] = heading[:-1]
+    moves = drive(origin, true_velocity.T, step_s)
+    x = radius_m * np.cos(start) + np.append(0.0, np.cumsum(moves[0]))
+    y = radius_m * np.sin(start) + np.append(0.0, np.cumsum(moves[1]))
+    poses: NDArray[np.float64] = np.stack([x, y, heading], axis=1)
+    return Drive(times_s, poses, true_velocity, odometry)
+
+
+def _robot_streams(
+    parameters: LandmarksParameters,
+    number: int,
+    drives: list[Drive],
+    landmarks: NDArray[np.float64],
+    rngs: list[np.random.Generator],
+) -> list[Stream]:
+    robot = drives[number - 1]
+    prefix = f"/robot{number}"
+    stamps_ns = _stamps(robot.times_s)
+    truth = robot.poses.copy()
+    truth[:, 2] = wrap_angle(truth[:, 2])
+    sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
+    prior = truth[0] + rngs[1].normal(size=3) * sigma
+    streams = [
+        make_stream(
+            f"{prefix}/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            stamps_ns[:1],
+            metadata=POSE,
+            mean=prior[None],
+            covariance=np.diag(sigma**2).reshape(1, 9),
+        ),
+        make_stream(f"{prefix}/truth", schemas.TRUTH_STATE, stamps_ns, metadata=POSE, state=truth),
+        make_stream(
+            f"{prefix}/odometry",
+            schemas.ODOMETRY,
+            stamps_ns[:-1],
+            log_time_ns=_stamps(robot.times_s[:-1] + parameters.odometry_latency_s),
+            metadata={
+                "forward_noise_density": repr(parameters.forward_noise_density),
+                "turn_noise_density": repr(parameters.turn_noise_density),
+            },
+            forward_mps=robot.odometry[:, 0],
+            turn_radps=robot.odometry[:, 1],
+        ),
+    ]
+    targets = _targets(parameters, number, drives, landmarks)
+    for (name, schema), sensor_rng in zip(SENSORS.items(), rngs[2:], strict=True):
+        sensor: Sensor = getattr(parameters, name)
+        if sensor.rate_hz == 0:
+            continue
+        seen = _look(sensor, robot, targets, sensor_rng)
+        look, columns = _measure(schema, sensor, seen, sensor_rng)
+        stated = {key: repr(getattr(sensor, key)) for key in ("sigma_range_m", "sigma_bearing_rad")}
+        streams.append(
+            make_stream(
+                f"{prefix}/{name}",
+                schema,
+                **_clocks(sensor, seen.times_s, look, sensor_rng),
+                metadata=stated,
+                **columns,
+            )
+        )
+        if sensor.outages_per_minute > 0:
+            streams.append(_outages(f"{prefix}/{name}/outages", seen))
+    return streams
+
+
+def _targets(
+    parameters: LandmarksParameters,
+    number: int,
+    drives: list[Drive],
+    landmarks: NDArray[np.float64],
+) -> Mapping[int, Drive | NDArray[np.float64]]:
+    """What robot `number` may see, by target number: points, and robots that move."""
+    seen: dict[int, Drive | NDArray[np.float64]] = {}
+    if parameters.robots_see_each_other:
+        seen = {other: each for other, each in enumerate(drives, start=1) if other != number}
+    return seen | dict(enumerate(landmarks, start=parameters.robots + 1))
+
+
+def _look(
+    sensor: Sensor,
+    robot: Drive,
+    targets: Mapping[int, Drive | NDArray[np.float64]],
+    rng: np.random.Generator,
+) -> Sightings:
+    """Everything in range and view at the sensor's rate, less dropouts and outages."""
+    times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
+    outage_count = rng.poisson(sensor.outages_per_minute * robot.times_s[-1] / 60)
+    starts_s = np.sort(rng.uniform(0, robot.times_s[-1], outage_count))
+    outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
+    dead = np.any((times_s[:, None] >= outages_s[:, 0]) & (times_s[:, None] < outages_s[:, 1]), 1)
+    pose = robot.pose_at(times_s)
+    places = np.array(
+        [
+            each.pose_at(times_s)[:, :2].T
+            if isinstance(each, Drive)
+            else np.broadcast_to(each[:, None], (2, len(times_s)))
+            for each in targets.values()
+        ]
+    ).reshape(len(targets), 2, len(times_s))
+    distance, bearing = range_bearing(pose.T[:, None, :], places.transpose(1, 0, 2))
+    bearing = wrap_angle(bearing)
+    half_view = np.radians(sensor.field_of_view_deg) / 2
+    visible = (distance <= sensor.maximum_range_m) & (np.abs(bearing) <= half_view) & ~dead
+    visible &= rng.uniform(size=visible.shape) >= sensor.dropout_probability
+    look, target = np.nonzero(visible.T)
+    numbers = np.array(list(targets), dtype=np.int64)
+    return Sightings(
+        times_s, look, numbers[target], distance.T[look, target], bearing.T[look, target], outages_s
+    )
+
+
+def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A measured range: bias, noise, and outliers anywhere in the sensor's range."""
+    measured = true_m + sensor.bias_range_m + rng.normal(size=len(true_m)) * sensor.sigma_range_m
+    wild = rng.uniform(0, sensor.maximum_range_m, len(true_m))
+    is_outlier = rng.uniform(size=len(true_m)) < sensor.outlier_probability
+    return np.abs(np.where(is_outlier, wild, measured))
+
+
+def _bearing(sensor: Sensor, true_rad: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
+    """A measured bearing: bias, noise, and outliers in any direction."""
+    noise = rng.normal(size=len(true_rad)) * sensor.sigma_bearing_rad
+    wild = rng.uniform(-np.pi, np.pi, len(true_rad))
+    is_outlier = rng.uniform(size=len(true_rad)) < sensor.outlier_probability
+    return wrap_angle(np.where(is_outlier, wild, true_rad + sensor.bias_bearing_rad + noise))
+
+
+def _clocks(
+    sensor: Sensor, times_s: NDArray[np.float64], look: NDArray[np.int64], rng: np.random.Generator
+) -> dict[str, NDArray[np.int64]]:
+    """The three clocks of every message; messages of one look share them."""
+    delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
+    return {
+        "publish_time_ns": _stamps(times_s + sensor.stamp_offset_s)[look],
+        "log_time_ns": _stamps(times_s + delay_s)[look],
+        "sensor_time_ns": _stamps(times_s + sensor.clock_offset_s)[look],
+    }
+
+
+def _measure(
+    schema: Schema, sensor: Sensor, seen: Sightings, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], dict[str, NDArray]]:
+    """The look that every message belongs to, and the messages' columns."""
+    names = [entry.name for entry in schema]
+    columns: dict[str, NDArray] = {"target_id": seen.target}
+    if "range_m" in names:
+        columns["range_m"] = _range(sensor, seen.range_m, rng)
+    if schema is schemas.RELATIVE_BEARING:
+        bearing = _bearing(sensor, seen.bearing_rad, rng)
+        first, second = _pairs(seen)
+        columns = {
+            "first_id": seen.target[first],
+            "second_id": seen.target[second],
+            "angle_rad": wrap_angle(bearing[first] - bearing[second]),
+        }
+        return seen.look[first], columns
+    if "bearing_rad" in names:
+        columns["bearing_rad"] = _bearing(sensor, seen.bearing_rad, rng)
+    return seen.look, columns
+
+
+def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows of all pairs of targets that share a look."""
+    first, second = np.triu_indices(int(np.bincount(seen.look).max(initial=0)), k=1)
+    count = np.bincount(seen.look, minlength=len(seen.times_s))
+    start = np.cumsum(count) - count
+    look, pair = np.nonzero(second < count[:, None])
+    return start[look] + first[pair], start[look] + second[pair]
+
+
+def _outages(topic: str, seen: Sightings) -> Stream:
+    spans_ns = _stamps(seen.outages_s)
+    return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
+
+
+def _stamps(seconds: NDArray[np.float64]) -> NDArray[np.int64]:
+    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
+
+
+LANDMARKS = Simulator(
+    "robots with odometry drive among landmarks; range, bearing and relative-bearing sensors",
+    LandmarksParameters,
+    simulate,
+)

@@ -1,0 +1,141 @@
+"""Compiles a kernel together with the model functions it is made of, once per source text.
+
+numba finds a kernel in its disk cache only if it is a module-level function, and does not notice that a
+function from another file has changed. So the sources of a kernel and of everything it calls are written
+as one module into the user's cache folder, named by their hash: a changed model is a new file, a known
+one loads in a fraction of a second. Kernels stay plain Python functions that also run uncompiled.
+"""
+
+import ast
+import hashlib
+import importlib.util
+import inspect
+import os
+import sys
+import tempfile
+import textwrap
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numba
+
+from recorders.errors import BadInput
+
+
+def cache_folder() -> Path:
+    """Where fuselog keeps what it can make again: FUSELOG_CACHE, or the user's cache folder."""
+    stated = os.environ.get("FUSELOG_CACHE")
+    if stated:
+        return Path(stated)
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "fuselog"
+
+
+def compile_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """Compile a function of one run into a loop over all runs, on all cores.
+
+    Args:
+        run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
+            belongs to that run. It may be a closure over model functions and numbers: that is how it is
+            specialised. It may use NumPy and functions that keep to the same.
+
+    Returns `loop(runs, *arguments)`; its results do not depend on the number of runs or cores.
+    Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+    """
+    bundle = _Bundle()
+    bundle.add("run_once", run_once)
+    names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
+    text = "\n".join(
+        [
+            "from __future__ import annotations",
+            "import numba",
+            *sorted(bundle.imports - {"import numba as numba"}),
+            *bundle.definitions,
+            # numba loses writes to arrays of a NamedTuple inside prange itself: the loop only calls
+            "@numba.njit(cache=True, parallel=True)",
+            f"def loop(runs, {names}):",
+            "    for run in numba.prange(runs):",
+            f"        run_once(run, {names})",
+            "",
+        ]
+    )
+    return _load(text).loop
+
+
+class _Bundle:
+    """Sources in the order they are needed, and the imports above them."""
+
+    def __init__(self) -> None:
+        self.imports: set[str] = set()
+        self.definitions: list[str] = []
+        self._values: dict[str, Any] = {}
+
+    def add(self, name: str, value: Any) -> None:
+        """Define `name`, and before it what it needs."""
+        if name in self._values:
+            if self._values[name] is not value:
+                raise BadInput(
+                    f"a kernel reaches two different things called '{name}'; rename one of them"
+                )
+            return
+        self._values[name] = value
+        if isinstance(value, FunctionType):
+            self._add_function(name, value)
+        elif isinstance(value, ModuleType):
+            self.imports.add(f"import {value.__name__} as {name}")
+        elif isinstance(value, bool | int | float | str | tuple):
+            self.definitions.append(f"{name} = {value!r}")
+        else:
+            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {name}")
+
+    def _add_function(self, name: str, function: FunctionType) -> None:
+        if name != function.__name__:
+            self.add(function.__name__, function)
+            self.definitions.append(f"{name} = {function.__name__}")
+            return
+        closure = inspect.getclosurevars(function)
+        for needed, value in {**closure.globals, **closure.nonlocals}.items():
+            self.add(needed, value)
+        self.definitions.append(f"@numba.njit\n{_source(function)}")
+
+
+def _source(function: FunctionType) -> str:
+    """A function's source without its decorators and docstring."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError) as error:
+        raise BadInput(
+            f"the source of {function.__qualname__} is not at hand ({error}); "
+            "define it as a function in a file"
+        ) from error
+    definition = tree.body[0]
+    if not isinstance(definition, ast.FunctionDef):
+        raise BadInput(f"{function.__qualname__} is no `def` function; kernels are made of these")
+    definition.decorator_list = []
+    if ast.get_docstring(definition) is not None:
+        definition.body = definition.body[1:]
+    return ast.unparse(definition)
+
+
+@lru_cache(maxsize=64)
+def _load(text: str) -> ModuleType:
+    stamp = f"{numba.__version__} {version('numpy')}"
+    digest = hashlib.sha256((stamp + text).encode()).hexdigest()[:24]
+    folder = cache_folder() / "kernels"
+    path = folder / f"kernel_{digest}.py"
+    if not path.exists() or path.read_text() != text:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as part:
+            part.write(text)
+        Path(part.name).replace(path)
+    specification = importlib.util.spec_from_file_location(path.stem, path)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[path.stem] = module  # numba's cache looks for it there
+    specification.loader.exec_module(module)
+    return module

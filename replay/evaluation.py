@@ -1,0 +1,292 @@
+"""Estimates against truth: alignment, errors, and whether the filter's own covariance can be believed.
+
+An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
+truth is interpolated at the estimate's stamps, never over a gap; errors of angles are wrapped. NEES and
+NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
+from recorders.models.planar import wrap_angle
+from replay.blocks import Ragged
+from replay.sources import Source
+
+Floats = NDArray[np.float64]
+KINDS = ("linear", "angle")
+POSITION = ("x_m", "y_m", "z_m")
+
+
+@dataclass(frozen=True)
+class Errors:
+    """One estimate stream of an ensemble against its truth, where there is truth.
+
+    Attributes:
+        estimator: the estimator's label, such as `ekf`.
+        case: what it estimates, such as `robot1`; may be empty.
+        components: names of the d components; kinds: "linear" or "angle" each.
+        run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
+        elapsed_s: (n,) time since the run's epoch.
+        error: (n, d) estimate - truth, angles wrapped.
+        covariance: (n, d, d) the estimator's own.
+        nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
+            definite.
+        without_truth: how many estimates had no truth within the gap limit.
+    """
+
+    estimator: str
+    case: str
+    components: tuple[str, ...]
+    kinds: tuple[str, ...]
+    run: NDArray[np.int64]
+    step: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    elapsed_s: Floats
+    error: Floats
+    covariance: Floats
+    nees: Floats
+    without_truth: int
+
+    @property
+    def position(self) -> list[int]:
+        """The indices of the position's components."""
+        return [index for index, name in enumerate(self.components) if name in POSITION]
+
+
+class Innovations(NamedTuple):
+    """One innovation stream of an ensemble; `degrees` is the number of measured components."""
+
+    estimator: str
+    case: str
+    run: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    accepted: NDArray[np.bool_]
+    squared: Floats
+    degrees: NDArray[np.int64]
+
+
+def split_topic(topic: str) -> tuple[str, str]:
+    """Estimator and case of an estimate topic: /estimates/ESTIMATOR/CASE.../LEAF."""
+    parts = topic.removeprefix("/estimates/").split("/")
+    return parts[0], "/".join(parts[1:-1])
+
+
+def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
+    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
+    result = np.full(len(error), np.nan)
+    if error.shape[1] == 0 or len(error) == 0:
+        return result
+    good = np.linalg.eigvalsh(covariance)[:, 0] > 0
+    solved = np.linalg.solve(covariance[good], error[good, :, None])[..., 0]
+    result[good] = np.sum(error[good] * solved, axis=1)
+    return result
+
+
+def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
+    """Where the mean of `runs` chi-square values lies with this probability if all is well."""
+    tail = 0.5 * (1 - probability)
+    interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
+    return float(interval[0]), float(interval[1])
+
+
+def truth_at(
+    truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
+) -> Floats:
+    """The truth's state (n, d) at any stamps, linear in time; NaN over gaps longer than the limit.
+
+    Angles are interpolated the short way round. A stamp that the truth has exactly needs no neighbour.
+    """
+    times = truth.publish_time_ns
+    state = truth["state"]
+    if len(times) == 0:
+        return np.full((len(time_ns), state.shape[1]), np.nan)
+    right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
+    left = np.where(times[right] > time_ns, right - 1, right).clip(0)
+    span = times[right] - times[left]
+    weight = (time_ns - times[left]) / np.maximum(span, 1)
+    change = state[right] - state[left]
+    angular = np.array([kind == "angle" for kind in kinds])
+    change[:, angular] = wrap_angle(change[:, angular])
+    value = state[left] + weight[:, None] * change
+    inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
+    value[~inside] = np.nan
+    return value
+
+
+def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float = 0.2) -> Errors | None:
+    """Errors of a Gaussian estimate stream of an ensemble; None where no run has its truth.
+
+    Raises BadInput where the stream does not say what its components are, or the truth lacks them.
+    """
+    stream = estimates.stream
+    estimator, case = split_topic(stream.topic)
+    components = tuple(stream.components)
+    kinds = tuple(stream.metadata.get("kinds", "").split(","))
+    if len(components) != len(kinds) or not set(kinds) <= set(KINDS):
+        raise BadInput(
+            f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
+            f"out of {', '.join(KINDS)}"
+        )
+    truth_topic = stream.metadata.get("truth", "")
+    if not all(truth_topic in source.topics for source in sources):
+        return None
+    references = [
+        _reference(source, truth_topic, components, kinds, estimates.of_run(run), gap_limit_s)
+        for run, source in enumerate(sources)
+    ]
+    size = len(components)
+    error = stream["mean"].reshape(len(stream), size) - np.concatenate(references)
+    angular = np.array([kind == "angle" for kind in kinds])
+    error[:, angular] = wrap_angle(error[:, angular])
+    known = np.isfinite(error).all(axis=1)
+    counts = np.diff(estimates.offsets)
+    run = np.repeat(np.arange(len(counts)), counts)
+    step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
+    epochs = np.array([source.run.epoch_ns if source.run else 0 for source in sources])
+    covariance = stream["covariance"].reshape(len(stream), size, size)[known]
+    return Errors(
+        estimator,
+        case,
+        components,
+        kinds,
+        run[known],
+        step[known],
+        stream.publish_time_ns[known],
+        (stream.publish_time_ns - epochs[run])[known] * 1e-9,
+        error[known],
+        covariance,
+        squared_mahalanobis(error[known], covariance),
+        int((~known).sum()),
+    )
+
+
+def _reference(
+    source: Source,
+    topic: str,
+    components: Sequence[str],
+    kinds: Sequence[str],
+    estimates: Stream,
+    gap_limit_s: float,
+) -> Floats:
+    truth = source.read([topic])[topic]
+    there = truth.components
+    missing = [name for name in components if name not in there]
+    if missing:
+        raise BadInput(
+            f"{source.name}: topic {topic} has no component {missing[0]} to judge "
+            f"{estimates.topic} by; it has {', '.join(there) or 'no named components'}"
+        )
+    all_kinds = ["linear"] * len(there)
+    columns = [there.index(name) for name in components]
+    for column, kind in zip(columns, kinds, strict=True):
+        all_kinds[column] = kind
+    return truth_at(truth, estimates.publish_time_ns, all_kinds, gap_limit_s)[:, columns]
+
+
+def innovations_of(stream: Ragged) -> Innovations:
+    """The innovations of an ensemble."""
+    estimator, case = split_topic(stream.stream.topic)
+    return Innovations(
+        estimator,
+        case,
+        np.repeat(np.arange(stream.runs), np.diff(stream.offsets)),
+        stream.stream.publish_time_ns,
+        stream["accepted"] != 0,
+        stream["normalised_innovation_squared"],
+        np.isfinite(stream["innovation"]).sum(axis=1),
+    )
+
+
+def error_table(errors: Errors) -> pd.DataFrame:
+    """One row per run and step: error and sigma of every component, NEES."""
+    sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": errors.run,
+        "step": errors.step,
+        "time_ns": errors.time_ns,
+        "elapsed_s": errors.elapsed_s,
+    }
+    for index, name in enumerate(errors.components):
+        columns[f"error_{name}"] = errors.error[:, index]
+        columns[f"sigma_{name}"] = sigma[:, index]
+    columns["nees"] = errors.nees
+    return pd.DataFrame(columns)
+
+
+def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
+    """One row per step over the runs: RMSE of position and components, mean NEES with its interval."""
+    steps, index, runs = np.unique(errors.step, return_inverse=True, return_counts=True)
+    table = pd.DataFrame(
+        {"estimator": errors.estimator, "case": errors.case, "step": steps, "runs": runs}
+    )
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(index, values, len(runs)) / runs
+
+    table["elapsed_s"] = mean(errors.elapsed_s)
+    if errors.position:
+        table["position_rmse_m"] = np.sqrt(mean(np.sum(errors.error[:, errors.position] ** 2, 1)))
+    for column, name in enumerate(errors.components):
+        table[f"rmse_{name}"] = np.sqrt(mean(errors.error[:, column] ** 2))
+    table["nees"] = mean(errors.nees)
+    size = len(errors.components)
+    bounds = {count: chi_square_interval(size, count, probability) for count in set(runs.tolist())}
+    table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
+    table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
+    return table
+
+
+def accuracy(errors: Errors) -> dict[str, float]:
+    """RMSE of the position and of every component over all runs and steps."""
+    values: dict[str, float] = {}
+    if errors.position:
+        squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
+        values["position_rmse_m"] = float(np.sqrt(squared.mean()))
+    for column, name in enumerate(errors.components):
+        if column not in errors.position:
+            quantity, _, unit = name.rpartition("_")
+            rmse = float(np.sqrt(np.mean(errors.error[:, column] ** 2)))
+            values[f"{quantity}_rmse_{unit}"] = rmse
+    return values
+
+
+def consistency(errors: Errors) -> dict[str, float]:
+    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
+    values = {"nees": float(np.nanmean(errors.nees))}
+    if errors.position and len(errors.position) < len(errors.components):
+        block = errors.covariance[:, errors.position][:, :, errors.position]
+        nees = squared_mahalanobis(errors.error[:, errors.position], block)
+        values["position_nees"] = float(np.nanmean(nees))
+    table = step_table(errors)
+    inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
+    values["nees_steps_within_95"] = float(inside.mean())
+    return values
+
+
+def innovation_metrics(innovations: Innovations) -> dict[str, float]:
+    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
+    if len(innovations.squared) == 0:
+        return {}
+    return {
+        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
+        "gated_share": float(1 - innovations.accepted.mean()),
+    }
+
+
+def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:
+    """The Gaussian estimate streams among a replay's outputs."""
+    return [
+        ragged
+        for ragged in outputs.values()
+        if ragged.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
+    ]

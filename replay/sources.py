@@ -1,0 +1,147 @@
+"""Where a replay reads from: a log file, or a recording that is still in memory."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Log, RunMetadata, Stream, read_blocks, read_empty, read_streams
+from recorders.log.reader import Order, Topic
+from recorders.recording import Recording
+
+
+class Source(Protocol):
+    """One run, as replay and evaluation see it."""
+
+    @property
+    def name(self) -> str:
+        """What to call the run in a message."""
+
+    @property
+    def run(self) -> RunMetadata | None:
+        """What the run was."""
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """What it holds."""
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order."""
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+
+    def blocks(
+        self, topics: Sequence[str], order: Order, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """A log file, read lazily."""
+
+    log: Log
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The log's path."""
+        return str(self.log.path)
+
+    @property
+    def run(self) -> RunMetadata | None:
+        """The log's run metadata."""
+        return self.log.run
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """The log's topics."""
+        return self.log.topics
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order, whatever the source's span."""
+        return read_streams(self.log, topics)
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+        return read_empty(self.log, topic)
+
+    def blocks(
+        self, topics: Sequence[str], order: Order, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Blocks of the source's span."""
+        return read_blocks(
+            self.log,
+            topics,
+            order=order,
+            start_ns=self.start_ns,
+            end_ns=self.end_ns,
+            block_messages=block_messages,
+        )
+
+
+@dataclass(frozen=True)
+class MemorySource:
+    """A recording in memory: replayed as if it had been written and read back."""
+
+    streams: Mapping[str, Stream]
+    run: RunMetadata | None
+    name: str
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """The recording's topics."""
+        return {
+            topic: Topic(topic, stream.schema.full_name, "protobuf", (), stream.metadata, len(stream))
+            for topic, stream in self.streams.items()
+        }
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order."""
+        missing = [topic for topic in topics if topic not in self.streams]
+        if missing:
+            raise BadInput(
+                f"{self.name}: no topic {missing[0]}; it has {', '.join(sorted(self.streams))}"
+            )
+        return {topic: self._in_order(topic, "publish_time") for topic in topics}
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+        return self.streams[topic].take(slice(0, 0))
+
+    def blocks(
+        self,
+        topics: Sequence[str],
+        order: Order,
+        block_messages: int,  # noqa: ARG002
+    ) -> Iterator[dict[str, Stream]]:
+        """One block: everything is in memory already."""
+        block = {topic: self._in_order(topic, order) for topic in topics}
+        yield {topic: stream for topic, stream in block.items() if len(stream)}
+
+    def _in_order(self, topic: str, order: Order) -> Stream:
+        stream = self.streams[topic]
+        clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
+        if np.all(clock[1:] >= clock[:-1]):
+            return stream
+        return stream.take(np.lexsort((stream.position, clock)))
+
+
+def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
+    """A recording with the positions that a log of it would have: merged by log time, ties in order."""
+    streams = recording.streams
+    ranks = np.empty(sum(map(len, streams)), np.int64)
+    times = [stream.log_time_ns for stream in streams]
+    ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
+    cuts = np.cumsum([len(stream) for stream in streams])[:-1]
+    placed = [
+        replace(stream, position=rank)
+        for stream, rank in zip(streams, np.split(ranks, cuts), strict=True)
+    ]
+    return MemorySource(
+        {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
+    )
