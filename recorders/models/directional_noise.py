@@ -33,7 +33,7 @@ def sample_bingham(
 
     Exact rejection sampling under an angular central Gaussian envelope (Kent, Ganeiban, Mardia, "A new
     unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018);
-    at least 45 % of the proposals are taken. For many samples of one distribution broadcast it.
+    at least 44 % of the proposals are taken. For many samples of one distribution broadcast it.
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):

@@ -33,7 +33,7 @@ def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
 
 
 def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
-    """Left (+) right: the complex product (24) for (..., 2), the Hamilton product (34) for (..., 4)."""
+    """The complex product (24) of left and right (..., 2), or Hamilton's product (34) of (..., 4)."""
     return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
 
 

@@ -82,7 +82,7 @@ def parameter_matrix(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_normaliser(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """Log F (...) of concentrations (..., d) of any offset: (5), where (6) and (14) misprint d / 2."""
+    """The logarithm of F (...) for concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
     z = np.asarray(concentrations, float)
     top = z.max(axis=-1)
     integrand, _ = _on_contour(z - top[..., None])
@@ -102,7 +102,7 @@ def covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
-    """Log f(x) (...) at unit vectors x (..., d); F stands for 1 / F in the print's (10)-(11)."""
+    """The log density (...) at unit vectors x (..., d); F stands for 1 / F in the print's (10)-(11)."""
     along = np.einsum("...ij,...i->...j", bingham.axes, np.asarray(x, float))
     exponent = (bingham.concentrations * along**2).sum(-1)
     return exponent - log_normaliser(bingham.concentrations)
@@ -207,9 +207,9 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
 def saddlepoint_log_normaliser(concentrations: ArrayLike, order: int = 2) -> NDArray[np.float64]:
     """The paper's log F (...) for concentrations (..., d): Kume and Wood's saddlepoint approximation.
 
-    Here for comparison: `log_normaliser` is exact, and faster. At order 1, F is too large by up to
-    16.6 %, where all concentrations but one are large. Order 2 has the factor exp(T) and is off by up to
-    6.4 %, at z = (-4.1, -4.1, -4.1, 0).
+    Here for comparison: `log_normaliser` is exact, and faster. At order 1, F is off by up to 16.6 %,
+    where all concentrations but one are large. Order 2 has the factor exp(T) and is off by up to 6.4 %,
+    at z = (-4.1, -4.1, -4.1, 0).
     """
     if order not in (1, 2):
         raise BadInput(f"saddlepoint order {order}: give 1, or 2 for the correction by exp(T)")

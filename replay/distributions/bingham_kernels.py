@@ -1,4 +1,4 @@
-"""Compiled scalar kernels of the Bingham distribution, for any dimension up to four.
+"""Compiled scalar kernels of the Bingham distribution, d = 2 and 4.
 
 The normalisation constant is an inverse Laplace transform at 1, from which the saddlepoint approximation
 of Kume and Wood (Biometrika 92, 2005) starts too:
@@ -155,7 +155,7 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def compose(left: NDArray, right: NDArray, out: NDArray) -> None:
-    """Out = left (+) right, all (d,); `out` is neither of the others."""
+    """Write left (+) right to `out`, all (d,); `out` is neither of the others."""
     for i in range(len(out)):
         out[i] = 0.0
         for j in range(len(out)):
@@ -164,14 +164,14 @@ def compose(left: NDArray, right: NDArray, out: NDArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def compose_columns(left: NDArray, columns: NDArray, out: NDArray) -> None:
-    """out[:, k] = left (+) columns[:, k]."""
+    """Write left (+) columns[:, k] to out[:, k]."""
     for k in range(out.shape[1]):
         compose(left, columns[:, k], out[:, k])
 
 
 @njit(cache=True, error_model="numpy")
 def turn_columns(columns: NDArray, increment: NDArray) -> None:
-    """columns[:, k] (+) increment in place: axes (d, d) after a known increment (d,)."""
+    """Make columns[:, k] (+) increment of the columns, in place: axes after a known increment (d,)."""
     before = columns.copy()
     for k in range(columns.shape[1]):
         compose(before[:, k], increment, columns[:, k])
@@ -188,7 +188,7 @@ def framed(matrix: NDArray, frame: NDArray) -> NDArray:
 
 @njit(cache=True, error_model="numpy")
 def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
-    """Out = columns diag(weights) columns^T."""
+    """Write columns diag(weights) columns^T to `out`."""
     d = len(weights)
     for i in range(d):
         for j in range(i + 1):
@@ -200,7 +200,7 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
 
 @njit(cache=True, error_model="numpy")
 def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
-    """E(x (+) y (x (+) y)^T) of independent x, y from E(x x^T) and E(y y^T): lemmas 2 and 4.
+    """Write the second moment of x (+) y to `out`, from those of independent x and y: lemmas 2 and 4.
 
     Lemma 2 stands as printed; its proof, (111)-(115), has wrong signs.
     """

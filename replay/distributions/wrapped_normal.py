@@ -109,8 +109,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 
     Raises BadInput where w5 leaves no real positions or |r_c| > 1.
     """
-    if not 0.0 <= central_weight <= 0.5:
-        raise BadInput(f"central weight {central_weight:g}: give 0 to 0.5; .2 is the paper's")
+    require_central_weight(central_weight)
     if not np.all(np.abs(moments.correlation) <= 1.0):
         raise BadInput("a circular correlation lies in [-1, 1]; check the moments")
     a, b, w1, w3 = kernels.diracs(
@@ -119,6 +118,12 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
     offsets = np.stack([a, b], axis=-1)[..., None, :] * kernels.DIRAC_SIGNS
     weights = np.stack([w1, w1, w3, w3, np.full_like(w1, central_weight)], -1)
     return Samples(wrap_angle(moments.mean[..., None, :] + offsets), weights)
+
+
+def require_central_weight(central_weight: float) -> None:
+    """BadInput where w5 is not in [0, 1/2], where the five samples have real positions for every m_1."""
+    if not 0.0 <= central_weight <= 0.5:
+        raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, .2 is the paper's")
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:

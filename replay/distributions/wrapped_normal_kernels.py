@@ -19,7 +19,7 @@ UNIFORM = 80.0
 _REACH = 8.6
 _MLE_WRAPS = 3
 _MLE_GRID = 64
-_MLE_REFINEMENTS = 40
+_MLE_REFINEMENTS = 34
 # the five samples are the mean plus these multiples of (a, b)
 DIRAC_SIGNS = ((-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (0.0, 0.0))
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -124,14 +124,18 @@ def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c2
         if value > best:
             best, centre = value, position
     low, high = centre - spacing, centre + spacing
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left = _log_likelihood(math.sin(left), deviations, weights, turns)
+    at_right = _log_likelihood(math.sin(right), deviations, weights, turns)
     for _ in range(_MLE_REFINEMENTS):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        if _log_likelihood(math.sin(left), deviations, weights, turns) > _log_likelihood(
-            math.sin(right), deviations, weights, turns
-        ):
-            high = right
+        if at_left > at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = _log_likelihood(math.sin(left), deviations, weights, turns)
         else:
-            low = left
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = _log_likelihood(math.sin(right), deviations, weights, turns)
     return math.sin(0.5 * (low + high)) * math.sqrt(c11 * c22)
 
 
@@ -149,7 +153,8 @@ def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float
                 density += math.exp(
                     -scale * (first * first - 2.0 * rho * first * second + second * second)
                 )
-        total += weights[n] * math.log(density)
+        # a sample beyond the reach of doubles must not hide the others
+        total += weights[n] * math.log(density + 1e-300)
     return total
 
 

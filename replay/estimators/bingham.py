@@ -117,10 +117,12 @@ def _bingham_run(
         if not math.isnan(steps.increment[row, 0]):
             turn_columns(axes, steps.increment[row])
             if not predict(axes, z, system):
-                # NaN stays: all later rows of the run are NaN as well
-                axes[:], z[:] = np.nan, np.nan
+                z[:] = np.nan
         if not math.isnan(steps.measurement[row, 0]):
             update(axes, z, inverse_noise, steps.measurement[row])
+        if math.isnan(z[0]):
+            # NaN stays: all later rows of the run are NaN as well
+            axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
 

@@ -73,7 +73,7 @@ def run_torus_grid_filter(
     n = state.shape[1]
     grid = torus_grid(n).reshape(-1, 2)
     transition = _transition(model, grid)
-    probability = state.reshape(-1, n * n)
+    probability = state.reshape(-1, n * n).copy()
     means = np.empty(measurement.shape)
     for runs, rows in _in_step(offsets):
         prior = (transition @ probability[runs].T).T
@@ -100,7 +100,9 @@ def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> NDArray[np.
 def _transition(model: HeadingModel, grid: NDArray) -> sparse.csr_array:
     """Probabilities of the next cell (rows) given the last one (columns)."""
     moved = np.stack(turn_together(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
-    reached = wrapped_normal.density(WrappedNormal(moved, model.system), grid[:, None, :])
+    reached = np.stack(
+        [wrapped_normal.density(WrappedNormal(each, model.system), grid) for each in moved], axis=1
+    )
     reached[reached < _NEGLIGIBLE * reached.max()] = 0.0
     return sparse.csr_array(reached / reached.sum(axis=0))
 

@@ -141,41 +141,31 @@ def _inertial_filter(
     estimates: OrientationEstimates,
 ) -> None:
     for run in prange(len(samples.offsets) - 1):
-        _filter_run(model, state, samples, estimates, run)
-
-
-@njit(cache=True, error_model="numpy")
-def _filter_run(
-    model: InertialModel,
-    state: InertialState,
-    samples: InertialSamples,
-    estimates: OrientationEstimates,
-    run: int,
-) -> None:
-    for row in range(samples.offsets[run], samples.offsets[run + 1]):
-        rate, force, field = samples.rate[row], samples.force[row], samples.field[row]
-        if not math.isfinite(rate.sum() + force.sum() + field.sum()):
-            continue
-        elapsed_s = _accumulate(model, state, run, samples.time_ns[row], rate, force, field)
-        if elapsed_s >= model.block_s:
-            _end_block(model, state, run, elapsed_s)
-            elapsed_s = 0.0
-        if state.concentrations[run, 0] < 0.0:
-            variance = model.drift_sigma_rad**2 * elapsed_s
-            _dead_reckon(state, run, variance, estimates.orientation[row], estimates.covariance[row])
+        for row in range(samples.offsets[run], samples.offsets[run + 1]):
+            elapsed_s = _accumulate(model, state, run, samples, row)
+            if elapsed_s >= model.block_s:
+                _end_block(model, state, run, elapsed_s)
+                elapsed_s = 0.0
+            if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
+                _dead_reckon(model, state, run, elapsed_s, estimates, row)
 
 
 @njit(cache=True, error_model="numpy")
 def _accumulate(
-    model: InertialModel,
-    state: InertialState,
-    run: int,
-    time_ns: int,
-    rate: NDArray,
-    force: NDArray,
-    field: NDArray,
+    model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
 ) -> float:
-    """Add one sample to the rest and to the block, in place; returns the block's length in s."""
+    """Add one sample to the rest and to the block, in place.
+
+    Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
+    """
+    time_ns, rate, force, field = (
+        samples.time_ns[row],
+        samples.rate[row],
+        samples.force[row],
+        samples.field[row],
+    )
+    if not math.isfinite(rate.sum() + force.sum() + field.sum()):
+        return math.nan
     times = state.time_ns[run]
     duration_s = (time_ns - times[1]) * _NS
     if times[0] < 0:
@@ -231,17 +221,24 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
 
 @njit(cache=True, error_model="numpy")
 def _dead_reckon(
-    state: InertialState, run: int, variance: float, orientation: NDArray, covariance: NDArray
+    model: InertialModel,
+    state: InertialState,
+    run: int,
+    elapsed_s: float,
+    estimates: OrientationEstimates,
+    row: int,
 ) -> None:
-    """The orientation since the block's start, and its error grown by `variance` (rad^2) per axis."""
-    increment = state.increment[run]
-    compose(state.axes[run, :, 3], increment, orientation)
-    covariance[:] = state.covariance[run]
+    """The orientation that the block's increment leads to, and the error that it adds."""
+    increment, covariance = state.increment[run], estimates.covariance[row]
+    compose(state.axes[run, :, 3], increment, estimates.orientation[row])
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = state.covariance[run, i, j]
     for i in range(3):
         _carry(increment, covariance[i])
     for i in range(3):
         _carry(increment, covariance[:, i])
-        covariance[i, i] += variance
+        covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
 
 
 @njit(cache=True, error_model="numpy")

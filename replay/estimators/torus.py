@@ -18,7 +18,11 @@ from recorders.errors import BadInput
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
 from replay.distributions.gaussian_kernels import condition
-from replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
+from replay.distributions.wrapped_normal import (
+    WrappedNormal,
+    make_wrapped_normal,
+    require_central_weight,
+)
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
 
 # Functions with a parallel loop hold calls only: numba would turn array statements in them into loops of
@@ -48,8 +52,10 @@ def make_heading_model(
     """A checked model; BadInput where a covariance is not positive definite or a number not finite."""
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
         raise BadInput("coupling and drift of a heading model must be finite, the drift two numbers")
-    covariances = (make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement))
-    return HeadingModel(float(coupling_rad), np.array(drift_rad, float), *covariances)
+    covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
+    return HeadingModel(
+        float(coupling_rad), np.array(drift_rad, float), *map(np.ascontiguousarray, covariances)
+    )
 
 
 def run_toroidal_filter(
@@ -76,6 +82,7 @@ def run_toroidal_filter(
         The state after the last row, and the estimates of all rows, batch axis (rows,). A run that
         fails is NaN from there on.
     """
+    require_central_weight(central_weight)
     return _run(_toroidal_filter, model, state, offsets, measurement, central_weight)
 
 
