@@ -82,7 +82,7 @@ def parameter_matrix(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_normaliser(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """The logarithm of F (...) for concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
+    """The logarithm of F (...), concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
     z = np.asarray(concentrations, float)
     top = z.max(axis=-1)
     integrand, _ = _on_contour(z - top[..., None])

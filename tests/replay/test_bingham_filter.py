@@ -22,7 +22,7 @@ from replay.estimators.bingham import (
 )
 from replay.estimators.grid import run_axis_grid_filter
 
-STEPS = 100
+RUNS, STEPS = 1000, 100
 
 
 class Case(NamedTuple):
@@ -78,56 +78,57 @@ def simulate(given: Case, runs: int, seed: int, gaussian: bool) -> tuple[np.ndar
     return truth, steps
 
 
-def mean_rmse_deg(truth: np.ndarray, estimate: np.ndarray) -> float:
-    """(66)-(68), averaged over runs; half the rotation angle for orientations."""
+def rmse_deg(truth: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    """(66)-(68) of every run (runs,); half the rotation angle for orientations."""
     error = axis_angle_between(truth, estimate.reshape(truth.shape))
-    return float(np.degrees(np.sqrt((error**2).mean(axis=1))).mean())
+    return np.degrees(np.sqrt((error**2).mean(axis=1)))
 
 
 @pytest.mark.parametrize(
-    ("d", "gaussian", "runs", "expected", "tolerance"),
+    ("d", "gaussian", "means", "medians", "tolerance"),
     [
-        (2, False, 1000, (14.23, 18.82, 24.35), (0.5, 1.2, 1.5)),
-        (2, True, 1000, (10.47, 13.16, 16.68), (0.3, 0.8, 1.0)),
-        (4, False, 300, (2.890, 4.461, 2.891), (0.03, 0.17, 0.03)),
-        (4, True, 300, (2.891, 3.937, 2.891), (0.03, 0.15, 0.03)),
+        (2, False, (14.23, 18.82, 24.35), (13.50, 16.32, 20.39), (0.48, 1.1, 1.1)),
+        (2, True, (10.47, 13.16, 16.68), (10.23, 12.08, 14.49), (0.48, 1.1, 1.1)),
+        (4, False, (2.890, 4.461, 2.891), (2.889, 4.356, 2.888), (0.03, 0.17, 0.03)),
+        (4, True, (2.891, 3.937, 2.891), (2.888, 3.807, 2.887), (0.03, 0.17, 0.03)),
     ],
 )
-def test_evaluation_of_the_paper(d, gaussian, runs, expected, tolerance):
+def test_evaluation_of_the_paper(d, gaussian, means, medians, tolerance):
     """Figures 4 and 5: Bingham filter, additive Kalman filter, Kalman filter with noise in the frame.
 
-    The tolerances are the sheet's for 100 runs over sqrt(runs / 100).
+    The tolerances are about three combined standard errors; the sheet's numbers are of 1000 runs too.
     """
     given = case(d)
-    truth, steps = simulate(given, runs, 5, gaussian)
+    truth, steps = simulate(given, RUNS, 5, gaussian)
     start, gaussian_noise = gaussians(given)
     noise = given.noise
     if gaussian:
         noise = BinghamNoise(
             *(bingham.fit_projected_gaussian(np.eye(d)[0], each) for each in gaussian_noise)
         )
-    _, own = run_bingham_filter(noise, widen(given.start, runs), steps)
+    _, own = run_bingham_filter(noise, widen(given.start, RUNS), steps)
     rivals = [
-        run_kalman_filter(gaussian_noise, widen(start, runs), steps, rotated=rotated)[1].mean
+        run_kalman_filter(gaussian_noise, widen(start, RUNS), steps, rotated=rotated)[1].mean
         for rotated in (False, True)
     ]
-    found = [mean_rmse_deg(truth, estimate) for estimate in (own.mode, *rivals)]
-    assert np.all(np.abs(np.subtract(found, expected)) < tolerance), found
-    assert found[0] < found[1]
+    errors = [rmse_deg(truth, estimate) for estimate in (own.mode, *rivals)]
+    for expected, found in ((means, np.mean(errors, axis=1)), (medians, np.median(errors, axis=1))):
+        assert np.all(np.abs(np.subtract(found, expected)) < tolerance), found
+        assert found[0] < found[1], "the claim: better than the additive Kalman filter in all scenarios"
 
 
 def test_bingham_filter_is_as_good_as_a_grid():
     """In two dimensions 720 cells reach 14.227 over 1000 runs: nothing is left to gain."""
     given = case(2)
-    truth, steps = simulate(given, 200, 1, False)
-    _, own = run_bingham_filter(given.noise, widen(given.start, 200), steps)
+    truth, steps = simulate(given, 100, 1, False)
+    _, own = run_bingham_filter(given.noise, widen(given.start, 100), steps)
     angle = np.pi / 720 * np.arange(720)
     prior = np.exp(bingham.log_density(given.start, np.stack([np.cos(angle), np.sin(angle)], -1)))
-    cells = np.broadcast_to(prior / prior.sum(), (200, 720))
+    cells = np.broadcast_to(prior / prior.sum(), (100, 720))
     _, axes = run_axis_grid_filter(given.noise, cells, steps)
-    best = mean_rmse_deg(truth, axes)
-    assert mean_rmse_deg(truth, own.mode) == pytest.approx(best, abs=0.05)
-    assert best == pytest.approx(14.23, abs=1.5 / np.sqrt(2.0))
+    best = rmse_deg(truth, axes).mean()
+    assert rmse_deg(truth, own.mode).mean() == pytest.approx(best, abs=0.05)
+    assert best == pytest.approx(14.23, abs=1.5)
 
 
 MEASURED = np.array([[8, 7, 9, 9], [9, 8, 7, 7], [8, 9, 8, 6]], float)
