@@ -1,8 +1,8 @@
 """Filters for axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
 
-The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, the modified
-Kalman filters that it is compared with, and a grid filter for axes as a reference. All take an ensemble
-as ragged rows and go through it in compiled loops, parallel over runs.
+The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
+Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in
+compiled loops, parallel over runs.
 """
 
 import math

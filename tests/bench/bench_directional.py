@@ -35,8 +35,8 @@ def main() -> list[Row]:
     z = np.array(Z_SYSTEM)
     many_moments, many_z = np.broadcast_to(moments, (1000, 4, 4)), np.broadcast_to(z, (1000, 4))
     ours = {
-        "predict + update, ensemble of 1000 runs": ("step", filter_us(measured, 1000)),
-        "predict + update, one log": ("step", filter_us(measured, 1)),
+        "predict + update, 1000 runs of 100 steps": ("step", filter_us(measured, 1000)),
+        "predict + update, one log of 2000 steps": ("step", filter_us(np.tile(measured, (20, 1)), 1)),
         "moment fit, batch of 1000": ("fit", us(lambda: bingham.fit(many_moments)) / 1000),
         "moment fit, single": ("fit", us(lambda: bingham.fit(moments))),
         "F and moments, batch of 1000": (
@@ -62,7 +62,8 @@ def filter_us(measured: np.ndarray, runs: int) -> float:
     start = make_bingham(np.eye(4), Z_START)
     state = Bingham(*(np.broadcast_to(part, (runs, *part.shape)) for part in start))
     rows = np.tile(measured, (runs, 1))
-    steps: Steps = make_steps(np.arange(runs + 1) * STEPS, np.tile(np.eye(4)[0], (len(rows), 1)), rows)
+    offsets = np.arange(runs + 1) * len(measured)
+    steps: Steps = make_steps(offsets, np.tile(np.eye(4)[0], (len(rows), 1)), rows)
     return us(lambda: run_bingham_filter(noise, state, steps)) / len(rows)
 
 
