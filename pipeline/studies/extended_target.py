@@ -132,15 +132,15 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
 
     None for an experiment of one's own that lacks the paper's filters or steps.
     """
+    first, middle, last = KEY_STEPS
     at = at_keys.set_index(["step", "estimator"])
     if not {(step, name) for step in KEY_STEPS for name in (*PAPER, *SMART)} <= set(at.index):
         return []
     area = {step: dict(at.loc[step]["area_rmse_m2"]) for step in KEY_STEPS}
     size = {step: dict(at.loc[step]["size_rmse_m2"]) for step in KEY_STEPS}
     position = {step: dict(at.loc[step]["position_rmse_m"]) for step in KEY_STEPS}
-    flipped = at.loc[(last, "rukf-10")]["flipped_runs"]
+    flipped = dict(at.loc[last]["flipped_runs"])["rukf-10"]
     median = dict(at.loc[75]["median_area_m2"])
-    first, middle, last = KEY_STEPS
     unchanged = steps[steps["estimator"] == "ukf"]["median_area_m2"]
     path = {
         name: " / ".join(f"{area[step][name]:.3g}" for step in KEY_STEPS) for name in (*PAPER, *SMART)
@@ -161,8 +161,8 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
         judged(
             "The RUKF's area error is high and decreases only at a very low rate",
             "as the UKF's",
-            f"{' / '.join(format(size[step]['rukf-10'], '.3g') for step in KEY_STEPS)} m2 at steps 25 / 75 "
-            f"/ 150 without the flipped signs; UKF {path['ukf']} m2",
+            f"without signs {size[first]['rukf-10']:.3g} / {size[middle]['rukf-10']:.3g} / "
+            f"{size[last]['rukf-10']:.3g} m2 at steps 25 / 75 / 150; UKF {path['ukf']} m2",
             size[last]["rukf-10"] > 0.5 * size[first]["rukf-10"],
             f"with the signs of {flipped:.0f} runs, all seeds together, {path['rukf-10']} m2",
         ),

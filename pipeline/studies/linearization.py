@@ -14,13 +14,14 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
-from pipeline.ensemble import Replayed, replay_in_memory
+from pipeline.ensemble import Replayed, judge, replay_in_memory
 from pipeline.experiment import Experiment, Setting
 from pipeline.studies.localization import obtain, write_logs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.sources import MemorySource
+from replay.blocks import Ragged, gather
+from replay.sources import MemorySource, Source
+from replay.timeline.show import show
 
 Floats = NDArray[np.float64]
 REFERENCE = "analytic"
@@ -75,6 +76,7 @@ def ensembles(
         outputs = replay_in_memory(sources, experiment.estimators, progress=setting.progress)
         if number == 0:
             write_logs(again, setting, sources, Replayed(sources, outputs, [], []))
+            _draw_first_run(again, setting, sources, outputs)
         outputs |= replay_in_memory(sources, extra or {}, progress=setting.progress)
         truth = np.stack([source.streams["/truth"]["state"][1:] for source in sources])
         labels = [*experiment.estimators, *(extra or {})]
@@ -83,6 +85,14 @@ def ensembles(
             truth,
             {label: track(outputs[f"/estimates/{label}/state"], truth.shape[1]) for label in labels},
         )
+
+
+def _draw_first_run(
+    experiment: Experiment, setting: Setting, sources: Sequence[Source], outputs: dict[str, Ragged]
+) -> None:
+    of_run = {topic: gather([ragged.of_run(0)]) for topic, ragged in outputs.items()}
+    first = judge(sources[:1], of_run, experiment.gap_limit_s)
+    show(sources[0], of_run, first.errors, save=setting.folder / "timeline.rrd")
 
 
 def track(estimates: Ragged, steps: int) -> Track:
