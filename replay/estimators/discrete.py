@@ -15,23 +15,34 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.reader import Topic
-from replay.blocks import Block, Events, Ragged
+from replay.blocks import Block, Events, Ragged, of_runs
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Recursive
-from replay.estimators.gaussian import Floats, Function, correct
+from replay.estimators.gaussian import (
+    ALL_WELL,
+    FAILURES,
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
+    Floats,
+    Function,
+    Innovation,
+    SampleMemory,
+    correct,
+    is_finite,
+    no_innovation,
+)
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
 PRIOR, TRUTH = "/prior", "/truth"
-FAILURES = ("a covariance is no longer positive definite", "the estimate is no longer finite")
 
 
 class Steps(NamedTuple):
     """A filter's steps before the Kalman update; both tell whether the covariance is positive definite.
 
-    predict(mean, covariance, noise, points, weights) moves mean (n,) and covariance (n, n) in place.
-    innovate(mean, covariance, measured, noise, points, weights, innovation, innovation_covariance,
-    cross_covariance) fills the last three: (m,), (m, m), (n, m).
+    predict(mean, covariance, noise, step, memory) moves mean (n,) and covariance (n, n) in place.
+    innovate(mean, covariance, measured, noise, innovation, step, memory) fills the innovation. One of
+    them may use the step's samples.
     """
 
     predict: Function
@@ -43,6 +54,7 @@ class System(NamedTuple):
 
     `reads` numbers make a measurement. `noise` names what the topic's metadata states and the filters
     use, `measured` and `state` the components, `sampled` the dimension in which a filter samples.
+    `memory(noise, sets)` makes what the steps work in.
     """
 
     topic: str
@@ -52,11 +64,12 @@ class System(NamedTuple):
     measured: tuple[str, ...]
     state: tuple[str, ...]
     sampled: int
+    memory: Callable[[Floats, SampleSets], SampleMemory]
     steps: Mapping[str, Steps]
 
 
 class Carried(NamedTuple):
-    """What a filter carries from block to block; first axis = run. `failure` is -1 while all is well."""
+    """What a filter carries from block to block; first axis = run. see `FAILURES`."""
 
     mean: Floats
     covariance: Floats
@@ -74,9 +87,44 @@ class Results(NamedTuple):
     squared: Floats
 
 
+def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covariance: Floats) -> None:
+    """Copy a mean and its covariance."""
+    for i in range(len(mean)):
+        to_mean[i] = mean[i]
+        for j in range(len(mean)):
+            to_covariance[i, j] = covariance[i, j]
+
+
 def stepwise(steps: Steps) -> Function:
     """The loop over the measurements of one run, specialised to a filter; changes `carried` in place."""
     predict, innovate = steps
+
+    def step(
+        row: int,
+        mean: Floats,
+        covariance: Floats,
+        measured: Floats,
+        noise: Floats,
+        gate: Floats,
+        results: Results,
+        scratch: tuple[Innovation, SampleMemory],
+    ) -> int:
+        """Take one measurement in; returns what failed, ALL_WELL where nothing did."""
+        innovation, memory = scratch
+        if not predict(mean, covariance, noise, row, memory):
+            return NOT_POSITIVE_DEFINITE
+        if not innovate(mean, covariance, measured, noise, innovation, row, memory):
+            return NOT_POSITIVE_DEFINITE
+        difference, spread = results.innovation[row], results.innovation_covariance[row]
+        copy_gaussian(innovation.difference, innovation.covariance, difference, spread)
+        squared, _ = correct(mean, covariance, innovation, gate)
+        if np.isnan(squared):
+            return NOT_POSITIVE_DEFINITE
+        if not is_finite(mean, covariance):
+            return NOT_FINITE
+        copy_gaussian(mean, covariance, results.mean[row], results.covariance[row])
+        results.squared[row] = squared
+        return ALL_WELL
 
     def filter_run(
         run: int,
@@ -84,59 +132,26 @@ def stepwise(steps: Steps) -> Function:
         time_ns: NDArray[np.int64],
         measured: Floats,
         noise: Floats,
-        samples: SampleSets,
+        gate: Floats,
         carried: Carried,
         results: Results,
+        scratch: tuple[Innovation, SampleMemory],
     ) -> None:
         mean, covariance = carried.mean[run], carried.covariance[run]
-        values = results.innovation.shape[1]
-        cross_covariance = np.empty((len(mean), values))
-        no_gate = np.full(values + 1, np.inf)
         for row in range(offsets[run], offsets[run + 1]):
-            if carried.failure[run] >= 0:
-                continue
+            if carried.failure[run] != ALL_WELL:
+                break
             carried.time_ns[run] = time_ns[row]
-            chosen = (row - samples.first) * samples.stride
-            points, weights = samples.points[chosen], samples.weights[chosen]
-            innovation = results.innovation[row]
-            innovation_covariance = results.innovation_covariance[row]
-            regular = predict(mean, covariance, noise, points, weights) and innovate(
-                mean,
-                covariance,
-                measured[row],
-                noise,
-                points,
-                weights,
-                innovation,
-                innovation_covariance,
-                cross_covariance,
+            carried.failure[run] = step(
+                row, mean, covariance, measured[row], noise, gate, results, scratch
             )
-            squared = np.nan
-            if regular:
-                squared, _ = correct(
-                    mean,
-                    covariance,
-                    innovation,
-                    innovation_covariance,
-                    cross_covariance,
-                    values,
-                    no_gate,
-                )
-            if not np.isfinite(mean.sum()):
-                carried.failure[run] = 1
-            elif np.isnan(squared):
-                carried.failure[run] = 0
-            else:
-                results.squared[row] = squared
-                results.mean[row] = mean
-                results.covariance[row] = covariance
 
     return filter_run
 
 
 @lru_cache(maxsize=16)
 def _compiled(steps: Steps) -> Function:
-    return compile_over_runs(stepwise(steps))
+    return compile_over_runs(stepwise(steps), allocates=False)
 
 
 class Filter(NamedTuple):
@@ -201,14 +216,14 @@ def start(whole: Mapping[str, Ragged], system: System) -> State:
     if not np.all(np.linalg.eigvalsh(covariance)[:, 0] > 0):
         raise BadInput(f"topic {PRIOR}: the prior's covariance is not positive definite")
     time_ns = prior.stream.publish_time_ns[rows]
-    return Carried(mean, covariance, time_ns, np.full(prior.runs, -1)), (None,) * prior.runs
+    return Carried(mean, covariance, time_ns, np.full(prior.runs, ALL_WELL)), (None,) * prior.runs
 
 
 def run(state: State, block: Block, *, settings: Filter) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
     before, generators = state
     system, offsets = settings.system, block.events.offsets
-    measured = block.streams[system.topic][system.column][block.events.row]
+    measured = block.streams[system.topic][system.column][block.events.source]
     if measured.shape[1] != system.reads:
         raise BadInput(
             f"topic {system.topic}: {system.reads} numbers per message are needed, "
@@ -219,26 +234,25 @@ def run(state: State, block: Block, *, settings: Filter) -> tuple[State, list[Ra
     after = copy.deepcopy(before)
     results = _blank_results(system, len(measured))
     loop = _compiled(system.steps[settings.kind])
-    for runs, samples in sets_by_runs(settings.sampler, generators, offsets):
-        part = _of_runs(after, runs)
-        bounds = offsets[runs.start : runs.stop + 1]
+    for runs, sets in sets_by_runs(settings.sampler, generators, offsets):
         loop(
-            len(part.mean),
-            bounds,
+            runs.stop - runs.start,
+            offsets[runs.start : runs.stop + 1],
             block.events.time_ns,
             measured,
             settings.noise,
-            samples,
-            part,
+            np.full(len(system.measured) + 1, np.inf),
+            of_runs(after, runs),
             results,
+            scratch=partial(_scratch, settings, sets),
         )
     return (after, generators), _outputs(settings, block.events, results, before, after)
 
 
-def _of_runs(carried: Carried, runs: slice) -> Carried:
-    """Views of some runs' part, for a kernel to change in place."""
-    mean, covariance, time_ns, failure = carried
-    return Carried(mean[runs], covariance[runs], time_ns[runs], failure[runs])
+def _scratch(settings: Filter, sets: SampleSets) -> tuple[Innovation, SampleMemory]:
+    system = settings.system
+    memory = system.memory(settings.noise, sets)
+    return no_innovation(len(system.state), len(system.measured)), memory
 
 
 def _blank_results(system: System, count: int) -> Results:
@@ -280,7 +294,7 @@ def _outputs(
         covariance=results.innovation_covariance[done].reshape(-1, len(system.measured) ** 2),
         normalised_innovation_squared=results.squared[done],
     )
-    failed = np.flatnonzero((after.failure >= 0) & (before.failure < 0))
+    failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
     failures = make_stream(
         f"{topic}/failure",
         schemas.FAILURE,

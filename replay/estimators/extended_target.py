@@ -10,8 +10,16 @@ import numpy as np
 from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_point
 from recorders.models.planar import Component, Components
 from replay.estimators.discrete import Steps, System
-from replay.estimators.gaussian import Floats, cholesky
-from replay.estimators.regression import regression
+from replay.estimators.gaussian import (
+    Floats,
+    Innovation,
+    SampleMemory,
+    cross,
+    regression,
+    sample_memory,
+    spread,
+)
+from replay.sampling.sets import SampleSets
 
 STATES = 4
 JOINT = 8  # half sides, centre, scales, noise of the point
@@ -31,8 +39,8 @@ def predict(
     mean: Floats,  # noqa: ARG001
     covariance: Floats,
     noise: Floats,
-    points: Floats,  # noqa: ARG001
-    weights: Floats,  # noqa: ARG001
+    step: int,  # noqa: ARG001
+    memory: SampleMemory,  # noqa: ARG001
 ) -> bool:
     """One step of the random walk, exactly."""
     for row in range(STATES):
@@ -44,28 +52,28 @@ def innovate_sampled(
     mean: Floats,
     covariance: Floats,
     measured: Floats,
-    noise: Floats,
-    points: Floats,
-    weights: Floats,
-    innovation: Floats,
-    innovation_covariance: Floats,
-    cross_covariance: Floats,
+    noise: Floats,  # noqa: ARG001
+    innovation: Innovation,
+    step: int,
+    memory: SampleMemory,
 ) -> bool:
     """The moments of the quadratic measurement by regression over state and noise together."""
-    joint, factor = np.zeros(JOINT), np.zeros((JOINT, JOINT))
-    if not cholesky(factor, covariance, STATES):
+    if not spread(covariance, step, memory):
         return False
-    for row in range(STATES):
-        joint[row] = mean[row]
-    for axis in range(2):
-        factor[4 + axis, 4 + axis] = np.sqrt(SCALE_VARIANCE)
-        factor[6 + axis, 6 + axis] = np.sqrt(noise[2])
-    predicted = np.empty(4)
-    regress(joint, factor, (), points, weights, predicted, innovation_covariance, cross_covariance)
+    regress(mean, (), innovation.covariance, step, memory)
+    cross(innovation.cross_covariance, step, memory)
     seen = quadratic(measured)
     for i in range(4):
-        innovation[i] = seen[i] - predicted[i]
+        innovation.difference[i] = seen[i] - memory.shift[i]
     return True
+
+
+def memory_of(noise: Floats, sets: SampleSets) -> SampleMemory:
+    """What a filter works in: its factor holds the noise that is sampled with the state."""
+    memory = sample_memory(sets, states=STATES, values=4)
+    sigmas = np.sqrt([SCALE_VARIANCE, SCALE_VARIANCE, noise[2], noise[2]])
+    memory.factor[STATES:, STATES:] = np.diag(sigmas)
+    return memory
 
 
 def innovate_analytic(
@@ -73,11 +81,9 @@ def innovate_analytic(
     covariance: Floats,
     measured: Floats,
     noise: Floats,
-    points: Floats,  # noqa: ARG001
-    weights: Floats,  # noqa: ARG001
-    innovation: Floats,
-    innovation_covariance: Floats,
-    cross_covariance: Floats,
+    innovation: Innovation,
+    step: int,  # noqa: ARG001
+    memory: SampleMemory,  # noqa: ARG001
 ) -> bool:
     """The exact moments of the quadratic measurement y = (m, m^2).
 
@@ -86,12 +92,13 @@ def innovate_analytic(
     covariance of E(y | state) = (c, c^2 + v); squares of Gaussians have Cov(s^2, t^2) =
     2 P_st^2 + 4 m_s m_t P_st and Cov(s, t^2) = 2 m_t P_st.
     """
+    difference, innovation_covariance, cross_covariance = innovation
     seen = quadratic(measured)
     for i in range(2):
         size, place = i, 2 + i
         variance, with_place, with_square = scatter(mean, covariance, i, noise[2])
-        innovation[i] = seen[i] - mean[place]
-        innovation[2 + i] = seen[2 + i] - variance - mean[place] ** 2 - covariance[place, place]
+        difference[i] = seen[i] - mean[place]
+        difference[2 + i] = seen[2 + i] - variance - mean[place] ** 2 - covariance[place, place]
         for row in range(STATES):
             cross_covariance[row, i] = covariance[row, place]
             cross_covariance[row, 2 + i] = 2.0 * (
@@ -151,6 +158,7 @@ EXTENDED_TARGET = System(
     measured=("x_m", "y_m", "x_squared_m2", "y_squared_m2"),
     state=("half_x_m", "half_y_m", "x_m", "y_m"),
     sampled=JOINT,
+    memory=memory_of,
     steps={
         "sampled": Steps(predict, innovate_sampled),
         "analytic": Steps(predict, innovate_analytic),

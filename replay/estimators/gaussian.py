@@ -12,17 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
+from replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
 Function = Callable[..., Any]
+
+FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
+ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
 
 
 class Models(NamedTuple):
     """A family's component-first models, and their Jacobians as functions that fill arrays.
 
     Attributes:
+        states: n, how many components the state has.
         motion: (state, control, duration_s) -> the next state, a tuple.
         motion_jacobians: (state, control, duration_s, transition, gain) fills the Jacobians by the
             state (n, n) and by the control (n, controls).
@@ -31,6 +35,7 @@ class Models(NamedTuple):
         angular: for every component of the sensor, whether it is an angle.
     """
 
+    states: int
     motion: Function
     motion_jacobians: Function
     sensor: Function
@@ -63,13 +68,14 @@ class Filter(NamedTuple):
     """The steps of a recursive Gaussian filter, before the Kalman update that `correct` does.
 
     Attributes:
-        memory: (states, controls, components, *samples) -> what the other two work in.
-        predict: (mean, covariance, control, control_density, duration_s, memory) moves mean (n,) and
-            covariance (n, n) in place; the control's noise density is per square root of a second.
-        innovate: (mean, covariance, target, measured, variance, innovation, memory) fills an
+        memory: (states, controls, components, sets) -> what the other two work in.
+        predict: (mean, covariance, control, control_density, duration_s, event, memory) moves mean (n,)
+            and covariance (n, n) in place; the control's noise density is per square root of a second.
+        innovate: (mean, covariance, target, measured, variance, innovation, event, memory) fills an
             `Innovation`; `measured` (m,) is NaN where it has no such component.
 
-    The steps return False where the covariance is not positive definite.
+    The event's number tells a randomised sampling which samples to take. The steps return False where
+    the covariance is not positive definite.
     """
 
     memory: Function
@@ -195,9 +201,14 @@ class LinearMemory(NamedTuple):
 
 def linearised(models: Models) -> Filter:
     """The extended Kalman filter: first-order Taylor expansion at the mean."""
-    motion, motion_jacobians, sensor, sensor_jacobian, angular = models
+    _, motion, motion_jacobians, sensor, sensor_jacobian, angular = models
 
-    def memory(states: int, controls: int, components: int) -> LinearMemory:
+    def memory(
+        states: int,
+        controls: int,
+        components: int,
+        sets: SampleSets,  # noqa: ARG001
+    ) -> LinearMemory:
         return LinearMemory(
             transition=np.empty((states, states)),
             product=np.empty((states, states)),
@@ -211,6 +222,7 @@ def linearised(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
+        event: int,  # noqa: ARG001
         memory: LinearMemory,
     ) -> bool:
         transition, product, gain = memory.transition, memory.product, memory.gain
@@ -239,6 +251,7 @@ def linearised(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
+        event: int,  # noqa: ARG001
         memory: LinearMemory,
     ) -> bool:
         difference, innovation_covariance, cross_covariance = innovation
@@ -261,16 +274,89 @@ def linearised(models: Models) -> Filter:
     return Filter(memory, predict, innovate)
 
 
-def spread(offsets: Floats, factor: Floats, covariance: Floats, points: Floats) -> bool:
-    """Fill the samples' offsets (L, n) from the mean; False where P is not positive definite."""
+class SampleMemory(NamedTuple):
+    """Samples of N(0, I), and what a regression at them works in.
+
+    Attributes:
+        points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
+        factor: (N, N) lower factor of the covariance of state (n) and noise (N - n): `spread` fills the
+            state's block, the noise's is given, the rest is zero.
+        gain: (n, controls), of control noise.
+        offsets: (L, N) the samples' distances from the mean.
+        sample: (N,).
+        values, shift: (L, m) and (m,), of the function's values.
+    """
+
+    points: Floats
+    weights: Floats
+    first: int
+    stride: int
+    factor: Floats
+    gain: Floats
+    offsets: Floats
+    sample: Floats
+    values: Floats
+    shift: Floats
+
+
+def sample_memory(sets: SampleSets, states: int, values: int, controls: int = 0) -> SampleMemory:
+    """Memory for regressions with up to so many values; the noise's part of the factor is zero."""
+    _, count, dimension = sets.points.shape
+    return SampleMemory(
+        *sets,
+        factor=np.zeros((dimension, dimension)),
+        gain=np.empty((states, controls)),
+        offsets=np.empty((count, dimension)),
+        sample=np.empty(dimension),
+        values=np.empty((count, values)),
+        shift=np.empty(values),
+    )
+
+
+def spread(covariance: Floats, use: int, memory: SampleMemory) -> bool:
+    """Move the samples of use number `use`; False where P is not positive definite."""
+    points = memory.points[(use - memory.first) * memory.stride]
+    factor, offsets = memory.factor, memory.offsets
     if not cholesky(factor, covariance, len(covariance)):
         return False
-    for index in range(len(points)):
-        for row in range(len(covariance)):
+    for index in range(len(offsets)):
+        for row in range(len(factor)):
             offsets[index, row] = 0.0
             for k in range(row + 1):
                 offsets[index, row] += factor[row, k] * points[index, k]
     return True
+
+
+def regression(function: Function, angular: tuple[bool, ...]) -> Function:
+    """Statistical linear regression of a component-first `function(z, *arguments)`.
+
+    Its z (N,) is the state, and after it whatever noise of zero mean enters other than by addition. The
+    kernel takes samples that `spread` has moved, and fills the mean of the values, `memory.shift`, and
+    their covariance (m, m); `cross` then gives their covariance with the state. Values that are
+    `angular` need no mean of their own: all count as differences from the value at the mean.
+
+    Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF
+    2014, (19)-(24); (24) prints y_{k,i} where the noise sample is meant.
+    """
+
+    def regress(
+        mean: Floats, arguments: tuple[Any, ...], covariance: Floats, use: int, memory: SampleMemory
+    ) -> None:
+        offsets, sample, values, shift = memory.offsets, memory.sample, memory.values, memory.shift
+        for row in range(len(sample)):
+            sample[row] = mean[row] if row < len(mean) else 0.0
+        centre = function(sample, *arguments)
+        for index in range(len(offsets)):
+            for row in range(len(sample)):
+                sample[row] = offsets[index, row] + (mean[row] if row < len(mean) else 0.0)
+            value = function(sample, *arguments)
+            for i in range(len(covariance)):
+                values[index, i] = wrap(value[i] - centre[i], angular[i])
+        moments(shift, covariance, values, memory.weights[(use - memory.first) * memory.stride])
+        for i in range(len(covariance)):
+            shift[i] += centre[i]
+
+    return regress
 
 
 def moments(shift: Floats, covariance: Floats, values: Floats, weights: Floats) -> None:
@@ -288,42 +374,29 @@ def moments(shift: Floats, covariance: Floats, values: Floats, weights: Floats) 
             covariance[row, column] = covariance[column, row] = entry
 
 
-class SampleMemory(NamedTuple):
-    """What `sampled` works in, beside the samples (L, n) and their weights (L,)."""
-
-    points: Floats
-    weights: Floats
-    factor: Floats
-    gain: Floats
-    offsets: Floats
-    sample: Floats
-    values: Floats
-    shift: Floats
+def cross(cross_covariance: Floats, use: int, memory: SampleMemory) -> None:
+    """Fill the covariance (n, m) of the state with the values of the last regression."""
+    weights = memory.weights[(use - memory.first) * memory.stride]
+    for row in range(cross_covariance.shape[0]):
+        for i in range(cross_covariance.shape[1]):
+            entry = 0.0
+            for index in range(len(weights)):
+                entry += weights[index] * memory.offsets[index, row] * memory.values[index, i]
+            cross_covariance[row, i] = entry
 
 
 def sampled(models: Models) -> Filter:
-    """A linear regression Kalman filter: moments of the function at samples of the Gaussian.
+    """A linear regression Kalman filter, with whatever samples; see `regression`.
 
-    The samples are `points` (L, n) with `weights` (L,), of zero mean and unit covariance, moved to mean
-    and covariance by its Cholesky factor. Values are taken as differences from the value at the mean,
-    so that angles need no mean of their own. The motion noise enters by the control's Jacobian.
+    An event has two uses of samples, prediction and update. The motion noise enters by the control's
+    Jacobian, the sensor's by addition.
     """
-    motion, motion_jacobians, sensor, _, angular = models
+    states, motion, motion_jacobians, sensor, _, angular = models
+    regress_motion = regression(motion, (False,) * states)
+    regress_sensor = regression(sensor, angular)
 
-    def memory(
-        states: int, controls: int, components: int, points: Floats, weights: Floats
-    ) -> SampleMemory:
-        columns = max(states, components)
-        return SampleMemory(
-            points=points,
-            weights=weights,
-            factor=np.empty((states, states)),
-            gain=np.empty((states, controls)),
-            offsets=np.empty((len(points), states)),
-            sample=np.empty(states),
-            values=np.empty((len(points), columns)),
-            shift=np.empty(columns),
-        )
+    def memory(states: int, controls: int, components: int, sets: SampleSets) -> SampleMemory:
+        return sample_memory(sets, states, max(states, components), controls)
 
     def predict(
         mean: Floats,
@@ -331,23 +404,16 @@ def sampled(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
+        event: int,
         memory: SampleMemory,
     ) -> bool:
-        points, weights, factor, gain, offsets, sample, values, shift = memory
-        if not spread(offsets, factor, covariance, points):
+        if not spread(covariance, 2 * event, memory):
             return False
-        motion_jacobians(mean, control, duration_s, factor, gain)  # the factor is used up
-        centre = motion(mean, control, duration_s)
-        for index in range(len(offsets)):
-            for row in range(len(mean)):
-                sample[row] = mean[row] + offsets[index, row]
-            moved = motion(sample, control, duration_s)
-            for row in range(len(mean)):
-                values[index, row] = moved[row] - centre[row]
-        moments(shift, covariance, values, weights)
-        add_control_noise(covariance, gain, control_density, duration_s)
+        motion_jacobians(mean, control, duration_s, memory.factor, memory.gain)  # the factor is used up
+        regress_motion(mean, (control, duration_s), covariance, 2 * event, memory)
+        add_control_noise(covariance, memory.gain, control_density, duration_s)
         for row in range(len(mean)):
-            mean[row] = centre[row] + shift[row]
+            mean[row] = memory.shift[row]
         return True
 
     def innovate(
@@ -357,43 +423,16 @@ def sampled(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
+        event: int,
         memory: SampleMemory,
     ) -> bool:
-        points, weights, factor, _, offsets, sample, values, shift = memory
-        difference, innovation_covariance, cross_covariance = innovation
-        if not spread(offsets, factor, covariance, points):
+        if not spread(covariance, 2 * event + 1, memory):
             return False
-        centre = sensor(mean, target)
-        for index in range(len(offsets)):
-            for row in range(len(mean)):
-                sample[row] = mean[row] + offsets[index, row]
-            seen = sensor(sample, target)
-            for i in range(len(measured)):
-                values[index, i] = wrap(seen[i] - centre[i], angular[i])
-        moments(shift, innovation_covariance, values, weights)
+        regress_sensor(mean, (target,), innovation.covariance, 2 * event + 1, memory)
+        cross(innovation.cross_covariance, 2 * event + 1, memory)
         for i in range(len(measured)):
-            difference[i] = wrap(measured[i] - centre[i] - shift[i], angular[i])
-            innovation_covariance[i, i] += variance[i]
-            for row in range(len(mean)):
-                cross_covariance[row, i] = 0.0
-                for index in range(len(weights)):
-                    cross_covariance[row, i] += weights[index] * offsets[index, row] * values[index, i]
+            innovation.difference[i] = wrap(measured[i] - memory.shift[i], angular[i])
+            innovation.covariance[i, i] += variance[i]
         return True
 
     return Filter(memory, predict, innovate)
-
-
-def unscented_points(dimension: int, kappa: float) -> tuple[Floats, Floats]:
-    """The unscented samples of N(0, I): points (2n + 1, n), the centre first, and weights (2n + 1,).
-
-    Julier and Uhlmann: radius sqrt(n + kappa), centre weight kappa / (n + kappa).
-    Raises BadInput unless n + kappa is positive.
-    """
-    spread = dimension + kappa
-    if not spread > 0:
-        raise BadInput(f"kappa = {kappa}: dimension + kappa must be positive, here above {-dimension}")
-    axes = np.sqrt(spread) * np.eye(dimension)
-    points = np.concatenate([np.zeros((1, dimension)), axes, -axes])
-    weights = np.full(2 * dimension + 1, 0.5 / spread)
-    weights[0] = kappa / spread
-    return points, weights

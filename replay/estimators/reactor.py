@@ -4,30 +4,31 @@ Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filt
 section VI.A and appendix (which prints x_hat where the noise's mean w_hat is meant).
 """
 
-import numpy as np
-
 from recorders.models.reactor import CONSUMED, PRODUCED, react
 from replay.estimators.discrete import Steps, System
-from replay.estimators.gaussian import Floats, cholesky
-from replay.estimators.regression import regression
+from replay.estimators.gaussian import (
+    Floats,
+    Innovation,
+    SampleMemory,
+    regression,
+    sample_memory,
+    spread,
+)
+from replay.sampling.sets import SampleSets
 
 # noise = (step_s, process_variance, pressure_variance)
 regress = regression(react, (False, False))
 
 
 def predict_sampled(
-    mean: Floats, covariance: Floats, noise: Floats, points: Floats, weights: Floats
+    mean: Floats, covariance: Floats, noise: Floats, step: int, memory: SampleMemory
 ) -> bool:
     """Move mean and covariance by statistical linear regression; the noise is additive."""
-    factor = np.empty((2, 2))
-    if not cholesky(factor, covariance, 2):
+    if not spread(covariance, step, memory):
         return False
-    moved, spread = np.empty(2), np.empty((2, 2))
-    regress(mean, factor, (noise[0],), points, weights, moved, spread, np.empty((0, 2)))
+    regress(mean, (noise[0],), covariance, step, memory)
     for row in range(2):
-        mean[row] = moved[row]
-        for column in range(2):
-            covariance[row, column] = spread[row, column]
+        mean[row] = memory.shift[row]
         covariance[row, row] += noise[1]
     return True
 
@@ -36,8 +37,8 @@ def predict_analytic(
     mean: Floats,
     covariance: Floats,
     noise: Floats,
-    points: Floats,  # noqa: ARG001
-    weights: Floats,  # noqa: ARG001
+    step: int,  # noqa: ARG001
+    memory: SampleMemory,  # noqa: ARG001
 ) -> bool:
     """Move mean and covariance by their exact moments.
 
@@ -62,18 +63,22 @@ def innovate(
     covariance: Floats,
     measured: Floats,
     noise: Floats,
-    points: Floats,  # noqa: ARG001
-    weights: Floats,  # noqa: ARG001
-    innovation: Floats,
-    innovation_covariance: Floats,
-    cross_covariance: Floats,
+    innovation: Innovation,
+    step: int,  # noqa: ARG001
+    memory: SampleMemory,  # noqa: ARG001
 ) -> bool:
     """The measured total against the predicted one, and the covariances: the Kalman filter's own."""
-    innovation[0] = measured[0] - mean[0] - mean[1]
+    cross = innovation.cross_covariance
+    innovation.difference[0] = measured[0] - mean[0] - mean[1]
     for row in range(2):
-        cross_covariance[row, 0] = covariance[row, 0] + covariance[row, 1]
-    innovation_covariance[0, 0] = cross_covariance[0, 0] + cross_covariance[1, 0] + noise[2]
+        cross[row, 0] = covariance[row, 0] + covariance[row, 1]
+    innovation.covariance[0, 0] = cross[0, 0] + cross[1, 0] + noise[2]
     return True
+
+
+def memory_of(noise: Floats, sets: SampleSets) -> SampleMemory:  # noqa: ARG001
+    """What a filter works in."""
+    return sample_memory(sets, states=2, values=2)
 
 
 REACTOR = System(
@@ -84,6 +89,7 @@ REACTOR = System(
     measured=("total_pressure",),
     state=("pressure_a", "pressure_b"),
     sampled=2,
+    memory=memory_of,
     steps={
         "sampled": Steps(predict_sampled, innovate),
         "analytic": Steps(predict_analytic, innovate),

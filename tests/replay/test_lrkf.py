@@ -7,13 +7,16 @@ import pytest
 
 from pipeline.ensemble import record_ensemble
 from recorders.errors import BadInput
+from recorders.log import LogWriter, open_log
 from recorders.models.planar import range_bearing
 from replay.engine import bind, collect, replay
 from replay.estimators import extended_target, reactor
-from replay.estimators.regression import regression
+from replay.estimators.gaussian import cross, no_innovation, regression, sample_memory, spread
 from replay.sampling import Samples, parse_sampling
-from replay.sources import MemorySource
+from replay.sampling.sets import SampleSets
+from replay.sources import LogSource, MemorySource
 
+PARAMETERS = {"batch-reactor": {}, "extended-target": {}, "landmarks": {"duration_s": 5.0}}
 SAMPLINGS = ["ukf", "gf-25", "rukf-12", "s2kf-50", "s2kf-100:symmetric", "s2kf-25:rotation=3"]
 
 
@@ -21,13 +24,19 @@ def samples_of(name: str, dimension: int) -> Samples:
     return parse_sampling(name).at(dimension).draw(np.random.default_rng(1), ())
 
 
-def regress(function, angular, mean, covariance, samples, states, *arguments):
+def as_sets(samples: Samples) -> SampleSets:
+    return SampleSets(samples.points[None], samples.weights[None], 0, 0)
+
+
+def regress(function, angular, mean, covariance, samples, *arguments):
     """Mean, covariance and cross-covariance by the kernel, uncompiled."""
-    count = len(angular)
-    result = np.empty(count), np.empty((count, count)), np.empty((states, count))
-    factor = np.linalg.cholesky(covariance)
-    regression(function, angular)(mean, factor, arguments, *samples, *result)
-    return result
+    count, states = len(angular), len(mean)
+    memory = sample_memory(as_sets(samples), states, count)
+    found, with_state = np.empty((count, count)), np.empty((states, count))
+    assert spread(covariance, 0, memory)
+    regression(function, angular)(mean, arguments, found, 0, memory)
+    cross(with_state, 0, memory)
+    return memory.shift, found, with_state
 
 
 def random_gaussian(dimension: int, seed: int):
@@ -45,7 +54,7 @@ def test_a_linear_function_is_regressed_exactly(name):
     def function(z, offset):
         return a[0] @ z + offset, a[1] @ z - offset
 
-    found = regress(function, (False, False), mean, covariance, samples_of(name, 3), 3, 7.0)
+    found = regress(function, (False, False), mean, covariance, samples_of(name, 3), 7.0)
     np.testing.assert_allclose(found[0], a @ mean + [7, -7], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found[1], a @ covariance @ a.T, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found[2], covariance @ a.T, rtol=1e-9, atol=1e-9)
@@ -58,7 +67,7 @@ def test_angles_across_the_cut_are_regressed_as_away_from_it():
 
     def both(target, heading):
         mean = np.array([0.0, 0.0, heading])
-        return regress(range_bearing, (False, True), mean, covariance, samples, 3, target)
+        return regress(range_bearing, (False, True), mean, covariance, samples, target)
 
     here, there = both((5.0, 0.0), pose[2]), both((5.0, 0.0), pose[2] + 2 * np.pi)
     across = both((-5.0, 1e-9), pose[2])
@@ -70,7 +79,8 @@ def test_angles_across_the_cut_are_regressed_as_away_from_it():
 
 def predicted(predict, mean, covariance, samples):
     mean, covariance = mean.copy(), covariance.copy()
-    assert predict(mean, covariance, np.array([0.1, 1e-5, 0.1]), *samples)
+    noise = np.array([0.1, 1e-5, 0.1])
+    assert predict(mean, covariance, noise, 0, reactor.memory_of(noise, as_sets(samples)))
     return mean, covariance
 
 
@@ -103,23 +113,23 @@ def gauss_hermite(dimension: int, nodes: int) -> Samples:
 
 
 def innovated(innovate, mean, covariance, measured, samples):
-    result = np.empty(4), np.empty((4, 4)), np.empty((4, 4))
-    noise = np.array([1e-4, 1e-3, 1.0])
-    assert innovate(mean, covariance, measured, noise, *samples, *result)
-    return result
+    innovation, noise = no_innovation(4, 4), np.array([1e-4, 1e-3, 1.0])
+    memory = extended_target.memory_of(noise, as_sets(samples))
+    assert innovate(mean, covariance, measured, noise, innovation, 0, memory)
+    return innovation
 
 
 def test_extended_target_first_update_has_the_moments_of_the_sheet():
     """spec/s2kf.md, prior I + C^v: analytic moments, and the UKF's blindness for the size."""
     mean, covariance = np.array([1.0, 1, 0, 0]), np.diag([1.0001, 1.0001, 1.001, 1.001])
     samples = samples_of("ukf", 8)
-    innovation, spread, cross = innovated(
+    difference, found, with_state = innovated(
         extended_target.innovate_analytic, mean, covariance, np.zeros(2), samples
     )
-    np.testing.assert_allclose(-innovation, [0, 0, 2.6677, 2.6677], atol=1e-12)
-    np.testing.assert_allclose(np.diag(spread), [2.6677, 2.6677, 16.23351325, 16.23351325], atol=1e-8)
-    np.testing.assert_allclose(cross[:2, 2:], 0.66673333 * np.eye(2), atol=1e-8)
-    np.testing.assert_allclose(cross[2:, :2], 1.001 * np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(-difference, [0, 0, 2.6677, 2.6677], atol=1e-12)
+    np.testing.assert_allclose(np.diag(found), [2.6677, 2.6677, 16.23351325, 16.23351325], atol=1e-8)
+    np.testing.assert_allclose(with_state[:2, 2:], 0.66673333 * np.eye(2), atol=1e-8)
+    np.testing.assert_allclose(with_state[2:, :2], 1.001 * np.eye(2), atol=1e-12)
     blind = innovated(extended_target.innovate_sampled, mean, covariance, np.zeros(2), samples)
     np.testing.assert_allclose(blind[2][:2, 2:], 0, atol=1e-12)
 
@@ -159,11 +169,17 @@ def estimates(sources, names, **settings):
     return found
 
 
-@pytest.mark.parametrize("name", ["lrkf:s2kf-50", "lrkf:rukf-3", "analytic"])
-@pytest.mark.parametrize("scenario", ["batch-reactor", "extended-target"])
+CASES = [
+    *((scenario, name) for scenario in PARAMETERS for name in ("lrkf:s2kf-50", "lrkf:rukf-3")),
+    ("batch-reactor", "analytic"),
+    ("extended-target", "analytic"),
+]
+
+
+@pytest.mark.parametrize(("scenario", "name"), CASES)
 def test_a_run_alone_and_in_an_ensemble_gives_the_same_bytes(scenario, name):
     """Also for a randomised sampling, whose draws may depend on the run alone."""
-    sources = record_ensemble(scenario, {}, seed=3, runs=3)
+    sources = record_ensemble(scenario, PARAMETERS[scenario], seed=3, runs=3)
     together = estimates(sources, [name])[name]
     for run, source in enumerate(sources):
         alone = estimates([source], [name])[name]
@@ -223,3 +239,36 @@ def test_a_run_that_loses_definiteness_is_told_and_the_others_go_on():
     assert 0 < len(failed) < 50
     assert set(failed["reason"]) == {0}
     np.testing.assert_array_equal(np.diff(failed.offsets), steps < 20)
+
+
+def test_robot_filters_are_one_house():
+    """`ukf` is the LRKF with unscented samples, byte for byte, and every sampling follows the robot."""
+    sources = record_ensemble("landmarks", PARAMETERS["landmarks"], seed=2, runs=2)
+    names = ["lrkf:ukf:kappa=0", "lrkf:s2kf-50", "lrkf:gf-3", "lrkf:rukf-12"]
+    found = estimates(sources, ["ukf", *names])
+    means = {name: each[f"/estimates/{name}/robot1/pose"]["mean"] for name, each in found.items()}
+    np.testing.assert_array_equal(means[names[0]], means["ukf"])
+    for name in names[1:]:
+        apart = np.abs(means[name] - means["ukf"]).max()
+        assert 0 < apart < 0.02, (name, apart)
+
+
+@pytest.mark.parametrize(("scenario", "name"), CASES)
+def test_a_log_in_blocks_gives_the_same_bytes(scenario, name, tmp_path):
+    """State, samples and draws are carried over the cuts between blocks."""
+    (source,) = record_ensemble(scenario, PARAMETERS[scenario], seed=4, runs=1)
+    with LogWriter(tmp_path / "run.mcap", source.run) as writer:
+        writer.write(source.streams.values())
+    log = LogSource(open_log(tmp_path / "run.mcap"))
+    bound = bind(name, [log], {})
+    whole, cut = collect(replay([log], bound)), collect(replay([log], bound, block_messages=7))
+    for topic, ragged in whole.items():
+        for column, values in ragged.stream.columns.items():
+            np.testing.assert_array_equal(values, cut[topic][column])
+
+
+def test_robot_parameters_are_refused_for_other_systems():
+    """A gate that is given but not used would be believed."""
+    (source,) = record_ensemble("batch-reactor", {}, seed=0, runs=1)
+    with pytest.raises(BadInput, match="gate_probability is for robots"):
+        bind("lrkf:ukf", [source], {"gate_probability": 0.9})
