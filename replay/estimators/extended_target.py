@@ -14,10 +14,8 @@ from replay.estimators.gaussian import (
     Floats,
     Innovation,
     SampleMemory,
-    cross,
     regression,
     sample_memory,
-    spread,
 )
 from replay.sampling.sets import SampleSets
 
@@ -32,7 +30,7 @@ def measure(joint: Components) -> tuple[Component, Component, Component, Compone
 
 
 # noise = (size_drift_m2, position_drift_m2, point_variance_m2)
-regress = regression(measure, (False, False, False, False))
+regress = regression(measure, (False,) * 4, states=STATES, noises=4)
 
 
 def predict(
@@ -58,10 +56,9 @@ def innovate_sampled(
     memory: SampleMemory,
 ) -> bool:
     """The moments of the quadratic measurement by regression over state and noise together."""
-    if not spread(covariance, step, memory):
+    _, spread, cross = innovation
+    if not regress(mean, covariance, (), spread, cross, step, memory):
         return False
-    regress(mean, (), innovation.covariance, step, memory)
-    cross(innovation.cross_covariance, step, memory)
     seen = quadratic(measured)
     for i in range(4):
         innovation.difference[i] = seen[i] - memory.shift[i]

@@ -279,12 +279,13 @@ class SampleMemory(NamedTuple):
 
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
-        factor: (N, N) lower factor of the covariance of state (n) and noise (N - n): `spread` fills the
-            state's block, the noise's is given, the rest is zero.
+        factor: (N, N) lower factor of the covariance of state (n) and noise (N - n): the state's block
+            is filled in, the noise's is given, the rest is zero.
         gain: (n, controls), of control noise.
-        offsets: (L, N) the samples' distances from the mean.
+        offsets: (N, L) the samples' distances from the mean.
         sample: (N,).
-        values, shift: (L, m) and (m,), of the function's values.
+        values, shift: (m, L) and (m,), of the function's values.
+        cross: (n, m), for a covariance that is not needed.
     """
 
     points: Floats
@@ -297,6 +298,7 @@ class SampleMemory(NamedTuple):
     sample: Floats
     values: Floats
     shift: Floats
+    cross: Floats
 
 
 def sample_memory(sets: SampleSets, states: int, values: int, controls: int = 0) -> SampleMemory:
@@ -306,83 +308,115 @@ def sample_memory(sets: SampleSets, states: int, values: int, controls: int = 0)
         *sets,
         factor=np.zeros((dimension, dimension)),
         gain=np.empty((states, controls)),
-        offsets=np.empty((count, dimension)),
+        offsets=np.empty((dimension, count)),
         sample=np.empty(dimension),
-        values=np.empty((count, values)),
+        values=np.empty((values, count)),
         shift=np.empty(values),
+        cross=np.empty((states, values)),
     )
 
 
-def spread(covariance: Floats, use: int, memory: SampleMemory) -> bool:
-    """Move the samples of use number `use`; False where P is not positive definite."""
-    points = memory.points[(use - memory.first) * memory.stride]
-    factor, offsets = memory.factor, memory.offsets
-    if not cholesky(factor, covariance, len(covariance)):
-        return False
-    for index in range(len(offsets)):
-        for row in range(len(factor)):
-            offsets[index, row] = 0.0
-            for k in range(row + 1):
-                offsets[index, row] += factor[row, k] * points[index, k]
-    return True
-
-
-def regression(function: Function, angular: tuple[bool, ...]) -> Function:
+def regression(function: Function, angular: tuple[bool, ...], states: int, noises: int = 0) -> Function:
     """Statistical linear regression of a component-first `function(z, *arguments)`.
 
-    Its z (N,) is the state, and after it whatever noise of zero mean enters other than by addition. The
-    kernel takes samples that `spread` has moved, and fills the mean of the values, `memory.shift`, and
-    their covariance (m, m); `cross` then gives their covariance with the state. Values that are
-    `angular` need no mean of their own: all count as differences from the value at the mean.
+    Its z is the state (n,) and after it the noise, of zero mean, that enters other than by addition.
+    The kernel takes the samples of use number `use`, moves them by mean and covariance, and fills the
+    mean of the values, `memory.shift`, their covariance (m, m) and their covariance (n, m) with the
+    state; False where the state's covariance is not positive definite. Values that are `angular` need
+    no mean of their own: all count as differences from the value at the mean.
 
     Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF
     2014, (19)-(24); (24) prints y_{k,i} where the noise sample is meant.
     """
+    size, values = states + noises, len(angular)  # constants, so that the loops over them are unrolled
+
+    def spread(covariance: Floats, points: Floats, memory: SampleMemory) -> bool:
+        factor, offsets = memory.factor, memory.offsets
+        if not cholesky(factor, covariance, states):
+            return False
+        for row in range(size):
+            for index in range(len(points)):
+                entry = 0.0
+                for k in range(row + 1):
+                    entry += factor[row, k] * points[index, k]
+                offsets[row, index] = entry
+        return True
+
+    def evaluate(mean: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
+        sample, offsets, changes = memory.sample, memory.offsets, memory.values
+        for row in range(size):
+            sample[row] = mean[row] if row < states else 0.0
+        centre = function(sample, *arguments)
+        for index in range(offsets.shape[1]):
+            for row in range(states):
+                sample[row] = mean[row] + offsets[row, index]
+            for row in range(states, size):
+                sample[row] = offsets[row, index]
+            value = function(sample, *arguments)
+            for i in range(values):
+                changes[i, index] = wrap(value[i] - centre[i], angular[i])
+        for i in range(values):
+            memory.shift[i] = centre[i]
+
+    def moments(
+        weights: Floats, memory: SampleMemory, covariance: Floats, cross_covariance: Floats
+    ) -> None:
+        changes, offsets = memory.values, memory.offsets
+        for i in range(values):
+            shift = weighted_sum(weights, changes[i])
+            memory.shift[i] += shift
+            for index in range(len(weights)):
+                changes[i, index] -= shift
+            for j in range(i + 1):
+                covariance[i, j] = covariance[j, i] = weighted_product(weights, changes[i], changes[j])
+            for row in range(states):
+                cross_covariance[row, i] = weighted_product(weights, offsets[row], changes[i])
 
     def regress(
-        mean: Floats, arguments: tuple[Any, ...], covariance: Floats, use: int, memory: SampleMemory
-    ) -> None:
-        offsets, sample, values, shift = memory.offsets, memory.sample, memory.values, memory.shift
-        for row in range(len(sample)):
-            sample[row] = mean[row] if row < len(mean) else 0.0
-        centre = function(sample, *arguments)
-        for index in range(len(offsets)):
-            for row in range(len(sample)):
-                sample[row] = offsets[index, row] + (mean[row] if row < len(mean) else 0.0)
-            value = function(sample, *arguments)
-            for i in range(len(covariance)):
-                values[index, i] = wrap(value[i] - centre[i], angular[i])
-        moments(shift, covariance, values, memory.weights[(use - memory.first) * memory.stride])
-        for i in range(len(covariance)):
-            shift[i] += centre[i]
+        mean: Floats,
+        covariance: Floats,
+        arguments: tuple[Any, ...],
+        value_covariance: Floats,
+        cross_covariance: Floats,
+        use: int,
+        memory: SampleMemory,
+    ) -> bool:
+        chosen = (use - memory.first) * memory.stride
+        if not spread(covariance, memory.points[chosen], memory):
+            return False
+        evaluate(mean, arguments, memory)
+        moments(memory.weights[chosen], memory, value_covariance, cross_covariance)
+        return True
 
     return regress
 
 
-def moments(shift: Floats, covariance: Floats, values: Floats, weights: Floats) -> None:
-    """Fill mean and covariance (d, d) of the first d columns of the values, and centre these."""
-    for row in range(len(covariance)):
-        shift[row] = 0.0
-        for index in range(len(weights)):
-            shift[row] += weights[index] * values[index, row]
-        for index in range(len(weights)):
-            values[index, row] -= shift[row]
-        for column in range(row + 1):
-            entry = 0.0
-            for index in range(len(weights)):
-                entry += weights[index] * values[index, row] * values[index, column]
-            covariance[row, column] = covariance[column, row] = entry
+def weighted_sum(weights: Floats, values: Floats) -> float:
+    """Sum of products, by four partial sums: one addition need not wait for the one before."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = len(weights) - len(weights) % 4
+    for k in range(0, whole, 4):
+        a += weights[k] * values[k]
+        b += weights[k + 1] * values[k + 1]
+        c += weights[k + 2] * values[k + 2]
+        d += weights[k + 3] * values[k + 3]
+    for k in range(whole, len(weights)):
+        a += weights[k] * values[k]
+    return (a + b) + (c + d)
 
 
-def cross(cross_covariance: Floats, use: int, memory: SampleMemory) -> None:
-    """Fill the covariance (n, m) of the state with the values of the last regression."""
-    weights = memory.weights[(use - memory.first) * memory.stride]
-    for row in range(cross_covariance.shape[0]):
-        for i in range(cross_covariance.shape[1]):
-            entry = 0.0
-            for index in range(len(weights)):
-                entry += weights[index] * memory.offsets[index, row] * memory.values[index, i]
-            cross_covariance[row, i] = entry
+def weighted_product(weights: Floats, first: Floats, second: Floats) -> float:
+    """Sum of products of three; see `weighted_sum`."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = len(weights) - len(weights) % 4
+    for k in range(0, whole, 4):
+        a += weights[k] * first[k] * second[k]
+        b += weights[k + 1] * first[k + 1] * second[k + 1]
+        c += weights[k + 2] * first[k + 2] * second[k + 2]
+        d += weights[k + 3] * first[k + 3] * second[k + 3]
+    for k in range(whole, len(weights)):
+        a += weights[k] * first[k] * second[k]
+    return (a + b) + (c + d)
 
 
 def sampled(models: Models) -> Filter:
@@ -392,8 +426,8 @@ def sampled(models: Models) -> Filter:
     Jacobian, the sensor's by addition.
     """
     states, motion, motion_jacobians, sensor, _, angular = models
-    regress_motion = regression(motion, (False,) * states)
-    regress_sensor = regression(sensor, angular)
+    regress_motion = regression(motion, (False,) * states, states)
+    regress_sensor = regression(sensor, angular, states)
 
     def memory(states: int, controls: int, components: int, sets: SampleSets) -> SampleMemory:
         return sample_memory(sets, states, max(states, components), controls)
@@ -407,10 +441,10 @@ def sampled(models: Models) -> Filter:
         event: int,
         memory: SampleMemory,
     ) -> bool:
-        if not spread(covariance, 2 * event, memory):
+        arguments, cross = (control, duration_s), memory.cross
+        if not regress_motion(mean, covariance, arguments, covariance, cross, 2 * event, memory):
             return False
         motion_jacobians(mean, control, duration_s, memory.factor, memory.gain)  # the factor is used up
-        regress_motion(mean, (control, duration_s), covariance, 2 * event, memory)
         add_control_noise(covariance, memory.gain, control_density, duration_s)
         for row in range(len(mean)):
             mean[row] = memory.shift[row]
@@ -426,10 +460,9 @@ def sampled(models: Models) -> Filter:
         event: int,
         memory: SampleMemory,
     ) -> bool:
-        if not spread(covariance, 2 * event + 1, memory):
+        _, spread, cross = innovation
+        if not regress_sensor(mean, covariance, (target,), spread, cross, 2 * event + 1, memory):
             return False
-        regress_sensor(mean, (target,), innovation.covariance, 2 * event + 1, memory)
-        cross(innovation.cross_covariance, 2 * event + 1, memory)
         for i in range(len(measured)):
             innovation.difference[i] = wrap(measured[i] - memory.shift[i], angular[i])
             innovation.covariance[i, i] += variance[i]

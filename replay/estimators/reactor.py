@@ -12,21 +12,19 @@ from replay.estimators.gaussian import (
     SampleMemory,
     regression,
     sample_memory,
-    spread,
 )
 from replay.sampling.sets import SampleSets
 
 # noise = (step_s, process_variance, pressure_variance)
-regress = regression(react, (False, False))
+regress = regression(react, (False, False), states=2)
 
 
 def predict_sampled(
     mean: Floats, covariance: Floats, noise: Floats, step: int, memory: SampleMemory
 ) -> bool:
     """Move mean and covariance by statistical linear regression; the noise is additive."""
-    if not spread(covariance, step, memory):
+    if not regress(mean, covariance, (noise[0],), covariance, memory.cross, step, memory):
         return False
-    regress(mean, (noise[0],), covariance, step, memory)
     for row in range(2):
         mean[row] = memory.shift[row]
         covariance[row, row] += noise[1]

@@ -154,9 +154,11 @@ class Reaction(TransitionModel, GaussianModel):
     ndim_state: int = Property(default=2)
 
     def covar(self, **_):
+        """Of the noise."""
         return PROCESS * np.eye(2)
 
     def function(self, state, noise=False, **_):
+        """One step; Stone Soup asks for one without noise."""
         del noise
         return np.array(react(state.state_vector, STEP_S)).reshape(2, -1).view(type(state.state_vector))
 
@@ -190,7 +192,9 @@ def compiled_c() -> Callable[[np.ndarray, Samples], np.ndarray]:
 
     def run(read: np.ndarray, samples: Samples) -> np.ndarray:
         out = np.empty((len(read), 2))
-        function(len(read), np.ascontiguousarray(read), len(samples.weights), *map(np.array, samples), out)
+        function(
+            len(read), np.ascontiguousarray(read), len(samples.weights), *map(np.array, samples), out
+        )
         return out
 
     return run

@@ -11,7 +11,7 @@ from recorders.log import LogWriter, open_log
 from recorders.models.planar import range_bearing
 from replay.engine import bind, collect, replay
 from replay.estimators import extended_target, reactor
-from replay.estimators.gaussian import cross, no_innovation, regression, sample_memory, spread
+from replay.estimators.gaussian import no_innovation, regression, sample_memory
 from replay.sampling import Samples, parse_sampling
 from replay.sampling.sets import SampleSets
 from replay.sources import LogSource, MemorySource
@@ -33,9 +33,8 @@ def regress(function, angular, mean, covariance, samples, *arguments):
     count, states = len(angular), len(mean)
     memory = sample_memory(as_sets(samples), states, count)
     found, with_state = np.empty((count, count)), np.empty((states, count))
-    assert spread(covariance, 0, memory)
-    regression(function, angular)(mean, arguments, found, 0, memory)
-    cross(with_state, 0, memory)
+    regress = regression(function, angular, states)
+    assert regress(mean, covariance, arguments, found, with_state, 0, memory)
     return memory.shift, found, with_state
 
 
