@@ -5,14 +5,17 @@ All register in one way, ours and third parties' alike: as entry points of an in
 `fuselog.timelines`). Listing names imports nothing.
 """
 
+from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from recorders.errors import BadInput
 
 
-def available(kind: str) -> dict[str, EntryPoint]:
+@cache
+def available(kind: str) -> Mapping[str, EntryPoint]:
     """The registered names of a kind ("recorders", say), sorted, with where each comes from."""
     found = entry_points(group=f"fuselog.{kind}")
     return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}

@@ -5,13 +5,21 @@ pitch, roll of each sensor) that are not known. Scheme 3 knows none of them; sch
 zero, which in scheme 2 they are not.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.models.optical import direction, line_of_sight, line_of_sight_gradients, turning_vector
+from recorders.models.optical import (
+    bias_components,
+    direction,
+    line_of_sight,
+    line_of_sight_gradients,
+    target_components,
+    turning_vector,
+)
 from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
 from replay.least_squares import (
@@ -61,14 +69,10 @@ class Observability(NamedTuple):
     sentence: str
 
 
-def parameter_names(scene: Scene, targets: int) -> list[str]:
-    """Names of the parameters, with their units."""
-    places = [f"target_{t}_{axis}_m" for t in range(1, targets + 1) for axis in "xyz"]
-    biases = [
-        f"sensor_{s}_{angle}_bias_rad"
-        for s in range(1, len(scene.position_m) + 1)
-        for angle in ("yaw", "pitch", "roll")
-    ]
+def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]) -> list[str]:
+    """Names of the parameters, with their units, for targets and sensors of these numbers."""
+    places = [name for target in targets for name in target_components(target)]
+    biases = [name for sensor in sensors for name in bias_components(sensor)]
     return places + [name for name, wanted in zip(biases, scene.wanted, strict=True) if wanted]
 
 
@@ -130,7 +134,8 @@ def observability(scene: Scene, measured: Array, parameters: Array) -> Observabi
 
     `measured` only says which lines of sight there are: NaN where none.
     """
-    names = parameter_names(scene, len(measured))
+    counted = (range(1, count + 1) for count in measured.shape[:2])
+    names = parameter_names(scene, *counted)
     [unseen] = unobservable_directions(linearize(scene, measured[None], parameters[None]))
     n, angles = len(parameters), int(np.isfinite(measured).sum())
     rank = n - unseen.shape[1]
