@@ -7,31 +7,35 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from recorders.errors import BadInput
-
 Array = NDArray[np.float64]
+
+# Eigenvalues of a correlation matrix below this are rounding.
+ROUNDING = 1e-14
 
 
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
-    """NEES e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
+    """NEES or NIS e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
 
-    A component of infinite variance counts nothing; NaN where an error or a covariance is NaN. Raises
-    BadInput where a covariance is singular.
+    A component of infinite variance counts nothing. NaN where there are no components, where an error or
+    a covariance is NaN, or where a covariance is not positive definite.
     """
-    n = error.shape[-1]
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     known = ~np.isinf(variance)
-    inverse_sigma = np.where(known, 1.0 / np.sqrt(np.where(known, variance, 1.0)), 0.0)
+    positive = variance > 0.0
+    inverse_sigma = np.where(known & positive, 1.0 / np.sqrt(np.where(positive, variance, 1.0)), 0.0)
     both = known[..., :, None] & known[..., None, :]
     correlation = (
         inverse_sigma[..., :, None] * np.where(both, covariance, 0.0) * inverse_sigma[..., None, :]
     )
-    correlation = np.where(both, correlation, np.eye(n))
+    identity = np.eye(error.shape[-1])
+    correlation = np.where(both, correlation, identity)
+    sound = np.asarray((positive & np.isfinite(correlation).all(axis=-1)).all(axis=-1))
+    correlation = np.where(sound[..., None, None], correlation, identity)
+    sound &= (np.linalg.eigvalsh(correlation) > ROUNDING).all(axis=-1) & (error.shape[-1] > 0)
+    correlation = np.where(sound[..., None, None], correlation, identity)
     scaled = (inverse_sigma * error)[..., None]
-    try:
-        return (np.swapaxes(scaled, -1, -2) @ np.linalg.solve(correlation, scaled))[..., 0, 0]
-    except np.linalg.LinAlgError as failure:
-        raise BadInput("NEES: a covariance is singular; leave out the components it fixes") from failure
+    squared = (np.swapaxes(scaled, -1, -2) @ np.linalg.solve(correlation, scaled))[..., 0, 0]
+    return np.where(sound, squared, np.nan)
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:

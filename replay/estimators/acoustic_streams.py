@@ -6,8 +6,7 @@ from functools import partial
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import schemas
-from recorders.log.reader import Topic
+from recorders.log import Topic, schemas
 from recorders.models.acoustic import Medium, Noise
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
@@ -36,8 +35,9 @@ HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> list[Bound]:
     sensors = sensor_numbers(topics, "detections", schemas.SHOT_DETECTION)
-    needed = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("detections", "position")]
-    if not sensors or not set(needed) <= set(topics):
+    streams = [f"/sensor{s}/detections" for s in sensors]
+    whole = [f"/sensor{s}/position" for s in sensors]
+    if not sensors or not set(whole) <= set(topics):
         return []
     worlds = {_world(topics[f"/sensor{s}/detections"]) for s in sensors}
     if len(worlds) > 1:
@@ -46,7 +46,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     setting = Setting(
         parameters.mode, noise, medium, parameters.estimate_sensors, parameters.cross_covariances
     )
-    return [Batch(name, tuple(needed), partial(_solve, name, sensors, setting))]
+    return [Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, setting))]
 
 
 def _world(topic: Topic) -> tuple[Noise, Medium]:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
-from recorders.log import schemas
-from recorders.log.reader import Topic
+from recorders.log import Topic, schemas
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
@@ -67,10 +66,9 @@ def _bind(
     name: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
 ) -> list[Bound]:
     sensors = sensor_numbers(topics, "line_of_sight", schemas.LINE_OF_SIGHT)
-    needed = [
-        f"/sensor{s}/{leaf}" for s in sensors for leaf in ("line_of_sight", "position", "attitude")
-    ]
-    if not sensors or not set(needed) <= set(topics):
+    streams = [f"/sensor{s}/line_of_sight" for s in sensors]
+    whole = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
+    if not sensors or not set(whole) <= set(topics):
         return []
     sigma = [
         [
@@ -80,7 +78,9 @@ def _bind(
         for s in sensors
     ]
     known = _known_biases(sensors, parameters)
-    return [Batch(name, tuple(needed), partial(_solve, name, sensors, np.array(sigma), known))]
+    return [
+        Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, np.array(sigma), known))
+    ]
 
 
 def _known_biases(sensors: list[int], parameters: PositionsParameters | BiasesParameters) -> Array:

@@ -8,8 +8,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.states import state_metadata
 from replay.blocks import Ragged
 from replay.least_squares import SENTENCES, Solution
@@ -58,7 +57,7 @@ def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, NDArr
     groups = table.groupby(["run", key])
     last = groups["time_ns"].max()
     run = last.index.get_level_values("run").to_numpy()
-    return Batches(runs, run, last.to_numpy()), groups.ngroup().to_numpy(np.int64)
+    return Batches(runs, run, last.to_numpy()), np.asarray(groups.ngroup(), np.int64)
 
 
 def solution_streams(
