@@ -43,13 +43,28 @@ class OpticalParameters(Parameters):
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
     dropout_probability: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
+    @property
+    def nominal_attitude_rad(self) -> Array:
+        """How the sensors were meant to be turned, (sensors, 3)."""
+        return self._per_sensor("nominal_attitude_deg", self.nominal_attitude_deg)
+
+    @property
+    def bias_rad(self) -> Array:
+        """By how much they are not, (sensors, 3)."""
+        return self._per_sensor("bias_deg", self.bias_deg)
+
+    def _per_sensor(self, name: str, given_deg: list[Triple] | None) -> Array:
+        sensors = len(self.sensor_position_m)
+        if given_deg is not None and len(given_deg) != sensors:
+            raise BadInput(f"{name} has {len(given_deg)} rows for {sensors} sensors; give one for each")
+        return np.zeros((sensors, 3)) if given_deg is None else np.radians(given_deg)
+
 
 def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recording:
     """Record one run; raises BadInput where there is not one attitude and one bias for each sensor."""
     sensors = np.array(parameters.sensor_position_m)
     targets = np.array(parameters.target_position_m)
-    nominal = _per_sensor("nominal_attitude_deg", parameters.nominal_attitude_deg, len(sensors))
-    bias = _per_sensor("bias_deg", parameters.bias_deg, len(sensors))
+    nominal, bias = parameters.nominal_attitude_rad, parameters.bias_rad
     looks_ns = _look_times(parameters, len(targets))
     streams = [_truth(looks_ns, targets, bias)]
     for number, (place, attitude) in enumerate(zip(sensors, nominal, strict=True), start=1):
@@ -58,13 +73,6 @@ def simulate(parameters: OpticalParameters, rng: np.random.Generator) -> Recordi
             _sightings(parameters, number, place, attitude + bias[number - 1], targets, looks_ns, rng),
         ]
     return Recording(streams)
-
-
-def _per_sensor(name: str, given: list[Triple] | None, sensors: int) -> Array:
-    """Angles (sensors, 3) in rad, zeros where none are given."""
-    if given is not None and len(given) != sensors:
-        raise BadInput(f"{name} has {len(given)} rows for {sensors} sensors; give one for each")
-    return np.radians(given) if given is not None else np.zeros((sensors, 3))
 
 
 def _look_times(parameters: OpticalParameters, targets: int) -> NDArray[np.int64]:

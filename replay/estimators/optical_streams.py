@@ -5,7 +5,7 @@ next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2
 biases, and scheme 3 `los-biases`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -77,15 +77,15 @@ def _bind(
         ]
         for s in sensors
     ]
-    known = _known_biases(sensors, parameters)
+    known = known_biases(sensors, parameters)
     return [
         Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, np.array(sigma), known))
     ]
 
 
-def _known_biases(sensors: list[int], parameters: PositionsParameters | BiasesParameters) -> Array:
+def known_biases(sensors: Sequence[int], parameters: Parameters) -> Array:
     """The known biases (sensors, 3) in rad, NaN where wanted."""
-    if isinstance(parameters, PositionsParameters):
+    if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]
     unknown = set(parameters.known_bias_deg) - set(names)
