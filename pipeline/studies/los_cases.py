@@ -143,8 +143,8 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     parameters = build(OpticalParameters, values, f"scenario {name}")
 
     def recorded(over: Mapping[str, Any]) -> list[MemorySource]:
-        parts = (recorder, merge(values, over), experiment.seed, experiment.runs, setting.progress)
-        return record_ensemble(*parts)
+        seed = experiment.seed + number - 1  # scenarios share no noise
+        return record_ensemble(recorder, merge(values, over), seed, experiment.runs, setting.progress)
 
     def replayed(sources: list[MemorySource], *schemes: str) -> Replayed:
         estimators = {scheme: experiment.estimators[scheme] for scheme in schemes}

@@ -88,7 +88,8 @@ def _why_not_efficient(case: Case) -> str:
     target, sensor = np.unravel_index(np.abs(elevation).argmax(), elevation.shape)
     steepest = elevation[target, sensor]
     if abs(steepest) < STEEP_DEG:
-        return f"scenario {case.number} lies outside without a singular direction"
+        error = np.nanstd(case.nees) / np.sqrt(case.nees.size)
+        return f"scenario {case.number}, +- {2.0 * error:.2f} (2 sigma), has no singular direction"
     return (
         f"scenario {case.number}: sensor {sensor + 1} sees target {target + 1} at elevation "
         f"{steepest:.1f} deg, where azimuth is nearly singular"

@@ -71,13 +71,13 @@ def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Record
     """Record one run; raises BadInput where a shot is fired before the last one is heard everywhere."""
     shooter = np.array(parameters.shooter_position_m)
     sensors = np.array(parameters.sensor_position_m)
-    travel_s: Array = np.sqrt(np.sum((sensors - shooter) ** 2, axis=1)) / parameters.speed_of_sound_mps
+    travel_s = np.linalg.norm(sensors - shooter, axis=1) / parameters.speed_of_sound_mps
     if travel_s.max() >= parameters.interval_s:
         raise BadInput(
             f"interval_s = {parameters.interval_s}: the sound travels {travel_s.max():.2f} s to the "
             "farthest sensor; fire less often"
         )
-    shots_s: Array = np.arange(parameters.shots) * parameters.interval_s
+    shots_s = parameters.interval_s * np.arange(float(parameters.shots))
     streams = [_truth(parameters, shots_s, travel_s)]
     for number, (place, delay_s) in enumerate(zip(sensors, travel_s, strict=True), start=1):
         streams += [

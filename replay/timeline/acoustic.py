@@ -21,11 +21,11 @@ from replay.timeline.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.plots import draw_quality
+from replay.timeline.plots import draw_quality_in_tabs
 
 CASE = "shooter"
-MUZZLE_BLAST = (86, 180, 233, 110)
-SHOCKWAVE = (204, 121, 167, 160)
+MUZZLE_BLAST = (150, 150, 150, 160)
+SHOCKWAVE = (170, 110, 60, 160)
 CONE_LENGTH = 0.7
 
 
@@ -51,7 +51,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         draw_events(canvas, scene, CASE),
         row_shares=[3, 1],
     )
-    return beside(board, draw_quality(canvas, scene, CASE), CASE)
+    return beside(board, draw_quality_in_tabs(canvas, scene, CASE), CASE)
 
 
 def _places(scene: Scene) -> tuple[np.ndarray, Floats, Floats]:

@@ -18,9 +18,9 @@ from scipy.stats import chi2
 from recorders.log import Stream, schemas
 from recorders.models.optical import bias_components, direction
 from replay.evaluation import Floats
-from replay.timeline.canvas import TRUTH, WRONG, Canvas, Colour, Scene, Timeline, Times, nice
+from replay.timeline.canvas import TRUTH, WRONG, Canvas, Colour, Scene, Timeline, Times, beside, nice
 from replay.timeline.events import draw_events
-from replay.timeline.plots import draw_errors, draw_nees
+from replay.timeline.plots import draw_quality_in_tabs
 
 ROOT = "space"
 SENSOR: Colour = (240, 228, 66)
@@ -59,11 +59,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         draw_events(canvas, scene, ""),
         row_shares=[3, 1],
     )
-    plots: list[rrb.Container | rrb.View] = list(draw_nees(canvas, scene, ""))
-    errors = draw_errors(canvas, scene, "")
-    if errors:
-        plots.append(rrb.Tabs(*errors, name="Errors"))
-    return rrb.Horizontal(board, rrb.Vertical(*plots)) if plots else board
+    return beside(board, draw_quality_in_tabs(canvas, scene, ""), "")
 
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:
@@ -133,7 +129,7 @@ def _draw_estimates(
     sensors: list[Sensor],
     extent: float,
 ) -> float:
-    """Targets' ellipsoids, and corrected lines of sight; returns how far the ellipsoids are magnified."""
+    """Targets' ellipsoids and corrected lines of sight; returns how far the former are magnified."""
     components, times_ns = stream.components, stream.publish_time_ns
     count = sum(name.startswith("target_") for name in components) // 3
     covariances = stream["covariance"].reshape(len(stream), len(components), -1)
