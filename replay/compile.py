@@ -95,7 +95,7 @@ def _over_runs(
         else:
             work(0, runs)
     except NumbaError as error:
-        reason = str(error).splitlines()[-1]
+        reason = next(line for line in str(error).splitlines() if not line.startswith("Failed in"))
         raise BadInput(
             f"kernel '{name}' does not compile: {reason} "
             "(a kernel that makes arrays is compiled with allocates=True)"
@@ -113,21 +113,32 @@ class _Bundle:
 
     def add(self, name: str, value: Any) -> None:
         """Define `name`, and before it what it needs."""
+        value = getattr(
+            value, "py_func", value
+        )  # what numba has compiled is compiled again, with the rest
+        literal = _literal(value)
         if name in self._values:
-            if self._values[name] is not value:
+            known = self._values[name]
+            if known is not value and (literal is None or literal != _literal(known)):
                 raise BadInput(
                     f"a kernel reaches two different things called '{name}'; rename one of them"
                 )
             return
         self._values[name] = value
+        origin = getattr(value, "__qualname__", "<locals>")
         if isinstance(value, FunctionType):
             self._add_function(name, value)
         elif isinstance(value, ModuleType):
             self.imports.add(f"import {value.__name__} as {name}")
-        elif isinstance(value, bool | int | float | str | tuple):
-            self.definitions.append(f"{name} = {value!r}")
+        elif literal is not None:
+            self.definitions.append(f"{name} = {literal}")
+        elif "<locals>" not in origin:
+            self.imports.add(f"from {value.__module__} import {origin} as {name}")
         else:
-            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {name}")
+            raise BadInput(
+                f"a kernel uses '{name}', a {type(value).__name__}, which is neither function, number "
+                "nor tuple, nor can be imported by name: hand it in as an argument"
+            )
 
     def _add_function(self, name: str, function: FunctionType) -> None:
         if name != function.__name__:
@@ -138,6 +149,16 @@ class _Bundle:
         for needed, value in {**closure.globals, **closure.nonlocals}.items():
             self.add(needed, value)
         self.definitions.append(f"{self._decorator}\n{_source(function)}")
+
+
+def _literal(value: Any) -> str | None:
+    """A number, text or tuple of these as source; None for anything else."""
+    if isinstance(value, float):
+        return f"float('{float(value)!r}')"  # infinity and NaN too
+    if isinstance(value, tuple):
+        entries = [_literal(entry) for entry in value]
+        return None if None in entries else f"({''.join(f'{entry}, ' for entry in entries)})"
+    return repr(value) if isinstance(value, bool | int | str) else None
 
 
 def _source(function: FunctionType) -> str:
