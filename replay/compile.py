@@ -95,7 +95,7 @@ def _over_runs(
         else:
             work(0, runs)
     except NumbaError as error:
-        reason = str(error).splitlines()[-1]
+        reason = next(line for line in str(error).splitlines() if not line.startswith("Failed in"))
         raise BadInput(
             f"kernel '{name}' does not compile: {reason} "
             "(a kernel that makes arrays is compiled with allocates=True)"
@@ -116,8 +116,15 @@ class _Bundle:
 
     def add(self, name: str, value: Any) -> str:
         """Define a value, called `name` where it is used, and before it what it needs; its own name."""
-        is_plain = isinstance(value, bool | int | float | str | tuple)
-        key = (name, repr(value)) if is_plain else value
+        value = getattr(value, "py_func", value)  # what numba has compiled is compiled with the rest
+        literal = _literal(value)
+        origin = getattr(value, "__qualname__", "<locals>")
+        if literal is None and "<locals>" in origin and not isinstance(value, FunctionType | ModuleType):
+            raise BadInput(
+                f"a kernel uses '{name}', a {type(value).__name__}, which is neither function, number "
+                "nor tuple, nor can be imported by name: hand it in as an argument"
+            )
+        key = value if literal is None else (name, literal)
         if key in self._names:
             return self._names[key]
         own = self._names[key] = f"{name}_{len(self._names)}"
@@ -125,10 +132,10 @@ class _Bundle:
             self.definitions.append(f"{self._decorator}\n{self._source(own, value)}")
         elif isinstance(value, ModuleType):
             self.imports.add(f"import {value.__name__} as {own}")
-        elif is_plain:
-            self.definitions.append(f"{own} = {value!r}")
+        elif literal is not None:
+            self.definitions.append(f"{own} = {literal}")
         else:
-            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {own}")
+            self.imports.add(f"from {value.__module__} import {origin} as {own}")
         return own
 
     def _source(self, own: str, function: FunctionType) -> str:
@@ -141,6 +148,16 @@ class _Bundle:
             if isinstance(node, ast.Name):
                 node.id = names.get(node.id, node.id)
         return ast.unparse(definition)
+
+
+def _literal(value: Any) -> str | None:
+    """A number, text or tuple of these as source; None for anything else."""
+    if isinstance(value, float):
+        return f"float('{float(value)!r}')"  # infinity and NaN too
+    if isinstance(value, tuple):
+        entries = [_literal(entry) for entry in value]
+        return None if None in entries else f"({''.join(f'{entry}, ' for entry in entries)})"
+    return repr(value) if isinstance(value, bool | int | str) else None
 
 
 def _definition(function: FunctionType) -> ast.FunctionDef:

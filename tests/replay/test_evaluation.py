@@ -130,7 +130,11 @@ def test_errors_of_a_known_case():
     assert_array_equal(errors.run, [0, 0, 1])
     assert_array_equal(errors.step, [0, 1, 0])
     assert_allclose(errors.elapsed_s, [0, 5, 12])
-    expected = {"position_rmse_m": np.sqrt(5 / 3), "heading_rmse_rad": np.sqrt((turn**2 + 0.01) / 3)}
+    expected = {
+        "estimates_without_truth": 0,
+        "position_rmse_m": np.sqrt(5 / 3),
+        "heading_rmse_rad": np.sqrt((turn**2 + 0.01) / 3),
+    }
     assert accuracy(errors) == pytest.approx(expected)
     assert consistency(errors)["position_nees"] == pytest.approx((2 / 7 + 16 / 7) / 3)
 
@@ -175,7 +179,7 @@ def test_normalized_error_squared_is_the_quadratic_form(size: int, seed: int):
 
 
 def test_covariances_that_are_none_give_nan_alone():
-    """Singular, indefinite, infinite or NaN: the others are not touched."""
+    """Singular, indefinite or NaN, and none at all where all is unknown: the others are not touched."""
     eye = np.eye(2)
     odd = [
         eye,
@@ -186,7 +190,7 @@ def test_covariances_that_are_none_give_nan_alone():
         np.nan * eye,
     ]
     found = normalized_error_squared(np.ones((7, 2)), np.array([*odd, 0.5 * eye]))
-    assert_allclose(found, [2, *[np.nan] * 5, 4], rtol=1e-15)
+    assert_allclose(found, [2, *[np.nan] * 3, 0, np.nan, 4], rtol=1e-15)
 
 
 # Intervals, tables, innovations.
