@@ -80,13 +80,19 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
+    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite.
+
+    It is taken in units of the standard deviations, so that units do not decide what is definite.
+    """
     result = np.full(len(error), np.nan)
-    if error.shape[1] == 0 or len(error) == 0:
-        return result
-    good = np.linalg.eigvalsh(covariance)[:, 0] > 0
-    solved = np.linalg.solve(covariance[good], error[good, :, None])[..., 0]
-    result[good] = np.sum(error[good] * solved, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        correlation = covariance / sigma[:, :, None] / sigma[:, None, :]
+    good = np.isfinite(correlation).all(axis=(1, 2)) & (sigma > 0).all(axis=1)
+    good[good] = np.linalg.eigvalsh(correlation[good]).min(axis=1, initial=np.inf) > 0
+    scaled = error[good] / sigma[good]
+    solved = np.linalg.solve(correlation[good], scaled[:, :, None])[..., 0]
+    result[good] = np.sum(scaled * solved, axis=1)
     return result
 
 
