@@ -15,8 +15,7 @@ from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
 from recorders.errors import BadInput, choices
-from recorders.log import Log, open_log
-from recorders.log.reader import Order
+from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
 from replay.engine import configure, find_estimator
@@ -43,7 +42,7 @@ def replay_logs(
     paths = _estimate_paths(logs, out)
     estimators = _estimator_settings(names, settings)
     sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
-    order: Order = "log_time" if arrival_order else "publish_time"
+    order: Clock = "log_time" if arrival_order else "publish_time"
     replay_to_logs(sources, estimators, paths, order=order, progress=progress)
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)

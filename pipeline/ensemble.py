@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from recorders.log import LogWriter, RunMetadata, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import BLOCK_MESSAGES, bind, collect, replay
@@ -104,7 +103,7 @@ def replay_ensemble(
     estimators: Settings,
     *,
     gap_limit_s: float,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
@@ -131,7 +130,7 @@ def replay_to_logs(
     estimators: Settings,
     paths: Sequence[Path],
     *,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
 ) -> None:

@@ -15,13 +15,15 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable
-from functools import lru_cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+from numba.core.errors import NumbaError
 
 from recorders.errors import BadInput
 
@@ -35,18 +37,24 @@ def cache_folder() -> Path:
     return (Path(home) if home else Path.home() / ".cache") / "fuselog"
 
 
-def compile_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) -> Callable[..., None]:
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
         run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
             belongs to that run. It may be a closure over model functions and numbers: that is how it is
             specialised. It may use NumPy and functions that keep to the same.
+        allocates: whether it makes arrays. A kernel that does not is compiled without the counting of
+            references to arrays, and is several times as fast.
 
-    Returns `loop(runs, *arguments)`; its results do not depend on the number of runs or cores.
+    Returns `loop(runs, *arguments, scratch=None)`; its results do not depend on the number of runs or
+    cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
+    that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
     """
-    bundle = _Bundle()
+    # a division by zero gives infinity, which is a failure of its run, and no exception
+    inner = "error_model='numpy', forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True"
+    bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates})")
     bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
     text = "\n".join(
@@ -55,21 +63,50 @@ def compile_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
             "import numba",
             *sorted(bundle.imports - {"import numba as numba"}),
             *bundle.definitions,
-            # numba loses writes to arrays of a NamedTuple inside prange itself: the loop only calls
-            "@numba.njit(cache=True, parallel=True)",
-            f"def loop(runs, {names}):",
-            "    for run in numba.prange(runs):",
+            f"@numba.njit(cache=True, nogil=True, _nrt={allocates})",
+            f"def loop(first, end, {names}):",
+            "    for run in range(first, end):",
             f"        run_once(run, {names})",
             "",
         ]
     )
-    return _load(text).loop
+    return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
+
+
+def _over_runs(
+    runs: int,
+    *arguments: Any,
+    scratch: Callable[[], Any] | None = None,
+    name: str,
+    loop: Callable[..., None],
+) -> None:
+    """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+
+    def work(first: int, end: int) -> None:
+        loop(first, end, *arguments, *([scratch()] if scratch else []))
+
+    cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    try:
+        if cores > 1:
+            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+            with ThreadPoolExecutor(cores) as pool:
+                list(pool.map(work, cuts[:-1], cuts[1:]))
+        else:
+            work(0, runs)
+    except NumbaError as error:
+        reason = str(error).splitlines()[-1]
+        raise BadInput(
+            f"kernel '{name}' does not compile: {reason} "
+            "(a kernel that makes arrays is compiled with allocates=True)"
+        ) from error
 
 
 class _Bundle:
     """Sources in the order they are needed, and the imports above them."""
 
-    def __init__(self) -> None:
+    def __init__(self, decorator: str) -> None:
+        self._decorator = decorator
         self.imports: set[str] = set()
         self.definitions: list[str] = []
         self._values: dict[str, Any] = {}
@@ -100,7 +137,7 @@ class _Bundle:
         closure = inspect.getclosurevars(function)
         for needed, value in {**closure.globals, **closure.nonlocals}.items():
             self.add(needed, value)
-        self.definitions.append(f"@numba.njit\n{_source(function)}")
+        self.definitions.append(f"{self._decorator}\n{_source(function)}")
 
 
 def _source(function: FunctionType) -> str:
@@ -124,18 +161,30 @@ def _source(function: FunctionType) -> str:
 @lru_cache(maxsize=64)
 def _load(text: str) -> ModuleType:
     stamp = f"{numba.__version__} {version('numpy')}"
-    digest = hashlib.sha256((stamp + text).encode()).hexdigest()[:24]
-    folder = cache_folder() / "kernels"
-    path = folder / f"kernel_{digest}.py"
+    name = f"kernel_{hashlib.sha256((stamp + text).encode()).hexdigest()[:24]}"
+    try:
+        return _imported(name, text, cache_folder() / "kernels")
+    except (OSError, RuntimeError):  # numba raises the latter where it finds no folder to write to
+        return _imported(name, text, Path(_own_folder().name))
+
+
+@lru_cache(maxsize=1)
+def _own_folder() -> tempfile.TemporaryDirectory[str]:
+    """Where this process compiles, for itself alone, if the cache folder cannot be written."""
+    return tempfile.TemporaryDirectory(prefix="fuselog-")
+
+
+def _imported(name: str, text: str, folder: Path) -> ModuleType:
+    path = folder / f"{name}.py"
     if not path.exists() or path.read_text() != text:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as part:
             part.write(text)
         Path(part.name).replace(path)
-    specification = importlib.util.spec_from_file_location(path.stem, path)
+    specification = importlib.util.spec_from_file_location(name, path)
     assert specification is not None
     assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)
-    sys.modules[path.stem] = module  # numba's cache looks for it there
+    sys.modules[name] = module  # numba's cache looks for it there
     specification.loader.exec_module(module)
     return module

@@ -16,8 +16,7 @@ from typing import Any, Generic
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Stream
-from recorders.log.reader import Order, Topic
+from recorders.log import Clock, Stream, Topic
 from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
@@ -143,7 +142,7 @@ def replay(
     sources: Sequence[Source],
     estimators: Sequence[Bound],
     *,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
 ) -> Iterator[list[Ragged]]:
     """Replay an ensemble; yields the output streams of all estimators, block by block.
@@ -187,7 +186,7 @@ def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, R
 
 
 def _ensemble_blocks(
-    sources: Sequence[Source], topics: Sequence[str], order: Order, block_messages: int
+    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
     """The next block of every run, until all runs are at their end.
 

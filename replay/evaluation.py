@@ -82,18 +82,19 @@ def split_topic(topic: str) -> tuple[str, str]:
 def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
     """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite.
 
-    It is taken in units of the standard deviations, so that units do not decide what is definite.
+    By the Cholesky factor L of all P at once: it is |L^-1 e|^2.
     """
-    result = np.full(len(error), np.nan)
+    factor, whitened = np.empty_like(covariance), np.empty_like(error)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        correlation = covariance / sigma[:, :, None] / sigma[:, None, :]
-    good = np.isfinite(correlation).all(axis=(1, 2)) & (sigma > 0).all(axis=1)
-    good[good] = np.linalg.eigvalsh(correlation[good]).min(axis=1, initial=np.inf) > 0
-    scaled = error[good] / sigma[good]
-    solved = np.linalg.solve(correlation[good], scaled[:, :, None])[..., 0]
-    result[good] = np.sum(scaled * solved, axis=1)
-    return result
+        for row in range(error.shape[1]):
+            for column in range(row + 1):
+                known = np.sum(factor[:, row, :column] * factor[:, column, :column], axis=1)
+                entry = covariance[:, row, column] - known
+                diagonal = np.sqrt(np.where(entry > 0, entry, np.nan))
+                factor[:, row, column] = entry / factor[:, column, column] if column < row else diagonal
+            known = np.sum(factor[:, row, :row] * whitened[:, :row], axis=1)
+            whitened[:, row] = (error[:, row] - known) / factor[:, row, row]
+    return np.sum(whitened**2, axis=1)
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:

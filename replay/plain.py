@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import ParametersType
 from replay.blocks import Block, Ragged
@@ -334,10 +333,11 @@ def _messages(block: Block) -> Messages:
     """A block's messages, their fields as numbers."""
     events = block.events
     tables = [_numbers(ragged.stream) for ragged in block.streams.values()]
-    value = np.full((len(events.row), max(table.shape[1] for table in tables)), np.nan)
-    for number, table in enumerate(tables):
-        at = events.topic == number
-        value[at, : table.shape[1]] = table[events.row[at]]
+    width = max(table.shape[1] for table in tables)
+    padded = [
+        np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan) for table in tables
+    ]
+    value = np.concatenate(padded)[events.source]
     return Messages(events.offsets, events.time_ns, events.topic, value)
 
 

@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, Stream, read_blocks, read_streams
-from recorders.log.reader import Order, Topic
+from recorders.log import Clock, Log, RunMetadata, Stream, Topic, read_blocks, read_empty, read_streams
 from recorders.recording import Recording
 
 
@@ -38,7 +37,7 @@ class Source(Protocol):
         """The topic without its messages."""
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
@@ -77,10 +76,10 @@ class LogSource:
 
     def empty(self, topic: str) -> Stream:
         """The topic without its messages."""
-        return read_streams(self.log, [topic], end_ns=0)[topic]
+        return read_empty(self.log, topic)
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Blocks of the source's span."""
         return read_blocks(
@@ -130,7 +129,7 @@ class MemorySource:
     def blocks(
         self,
         topics: Sequence[str],
-        order: Order,
+        order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
         """One block, unless there is nothing: everything is in memory already."""
@@ -138,19 +137,20 @@ class MemorySource:
         if block:
             yield block
 
-    def _in_order(self, topic: str, order: Order) -> Stream:
+    def _in_order(self, topic: str, order: Clock) -> Stream:
         stream = self.streams[topic]
         clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
-        if np.all(clock[1:] >= clock[:-1]):
+        later, after = np.diff(clock), np.diff(stream.position)
+        if np.all((later > 0) | ((later == 0) & (after > 0))):
             return stream
         return stream.take(np.lexsort((stream.position, clock)))
 
 
 def log_span_ns(log: Log) -> tuple[int, int]:
     """The first and the last log time of a log; zeros where it has no messages."""
-    regions = log.container.regions
-    first = min((region.start_log_time_ns for region in regions), default=0)
-    return first, max((region.end_log_time_ns for region in regions), default=0)
+    spans = [region.spans["log_time"] for region in log.container.regions]
+    first = min((span.first_ns for span in spans), default=0)
+    return first, max((span.last_ns for span in spans), default=0)
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
