@@ -32,17 +32,17 @@ class Entry:
 def scenarios() -> list[Entry]:
     """Recorders, and the scenario files that ship."""
     files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
-    return _registered("recorders", _recorder) + files
+    return _registered("recorders", Recorder, _recorder) + files
 
 
 def estimators() -> list[Entry]:
     """Estimators with what they need of a log."""
-    return _registered("estimators", _estimator)
+    return _registered("estimators", Estimator, _estimator)
 
 
 def metrics() -> list[Entry]:
     """Metrics that judge estimates."""
-    return _registered("metrics", _metric)
+    return _registered("metrics", Metric, _metric)
 
 
 def experiments() -> list[Entry]:
@@ -66,11 +66,11 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         _print_details(entries[0])
 
 
-def _registered(kind: str, described: Callable[[str, Any], Entry]) -> list[Entry]:
+def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
     """An entry for every registered name."""
 
     def make(name: str) -> Entry:
-        return described(name, load(kind, name))
+        return described(name, load(kind, name, expected))
 
     return [_entry(name, partial(make, name)) for name in available(kind)]
 

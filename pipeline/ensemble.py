@@ -69,8 +69,10 @@ class Replayed:
         for topic, rows in self.outputs.items():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
                 reasons = rows.stream.metadata.get("reasons", "").split("; ")
-                for run in np.flatnonzero(np.diff(rows.offsets)).tolist():
-                    failure, source = rows.of_run(run), self.sources[run]
+                for run, source in enumerate(self.sources):
+                    failure = rows.of_run(run)
+                    if len(failure) == 0:
+                        continue
                     elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
                     reason = reasons[int(failure["reason"][0])]
                     what = " ".join(filter(None, split_topic(topic)))
