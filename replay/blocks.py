@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.log.reader import Order
+from recorders.log import Clock, Stream
 from recorders.log.streams import concatenate
 from replay.compile import compile_over_runs
 
@@ -100,7 +99,7 @@ def gather(parts: Sequence[Stream]) -> Ragged:
     return Ragged(concatenate(filled), offsets)
 
 
-def merge_events(streams: Mapping[str, Ragged], order: Order) -> Events:
+def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
     everything = list(streams.values())
     clock = "publish_time_ns" if order == "publish_time" else "log_time_ns"

@@ -106,8 +106,6 @@ def truth_at(
     """
     times = truth.publish_time_ns
     state = truth["state"]
-    if len(times) == 0:
-        return np.full((len(time_ns), state.shape[1]), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
@@ -150,7 +148,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
-    epochs = np.array([source.run.epoch_ns if source.run else 0 for source in sources])
+    epochs = np.array([source.epoch_ns for source in sources])
     covariance = stream["covariance"].reshape(len(stream), size, size)[known]
     return Errors(
         estimator,
@@ -177,6 +175,8 @@ def _reference(
     gap_limit_s: float,
 ) -> Floats:
     truth = source.read([topic])[topic]
+    if len(truth) == 0:
+        return np.full((len(estimates), len(components)), np.nan)
     there = truth.components
     missing = [name for name in components if name not in there]
     if missing:
@@ -244,43 +244,6 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
     table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
     return table
-
-
-def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of the position and of every component over all runs and steps."""
-    values: dict[str, float] = {}
-    if errors.position:
-        squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
-        values["position_rmse_m"] = float(np.sqrt(squared.mean()))
-    for column, name in enumerate(errors.components):
-        if column not in errors.position:
-            quantity, _, unit = name.rpartition("_")
-            rmse = float(np.sqrt(np.mean(errors.error[:, column] ** 2)))
-            values[f"{quantity}_rmse_{unit}"] = rmse
-    return values
-
-
-def consistency(errors: Errors) -> dict[str, float]:
-    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
-    values = {"nees": float(np.nanmean(errors.nees))}
-    if errors.position and len(errors.position) < len(errors.components):
-        block = errors.covariance[:, errors.position][:, :, errors.position]
-        nees = squared_mahalanobis(errors.error[:, errors.position], block)
-        values["position_nees"] = float(np.nanmean(nees))
-    table = step_table(errors)
-    inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
-    values["nees_steps_within_95"] = float(inside.mean())
-    return values
-
-
-def innovation_metrics(innovations: Innovations) -> dict[str, float]:
-    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
-    if len(innovations.squared) == 0:
-        return {}
-    return {
-        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
-        "gated_share": float(1 - innovations.accepted.mean()),
-    }
 
 
 def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:

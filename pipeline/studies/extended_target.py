@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pipeline.ensemble import hash_streams
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome, judged
 from pipeline.studies.linearization import (
     REFERENCE,
@@ -26,7 +26,6 @@ from pipeline.studies.linearization import (
     rmse,
 )
 from recorders.models.extended_target import area_m2
-from recorders.parameters import build
 
 TURNED = "-rotation-"
 KEY_STEPS = (25, 75, 150)
@@ -34,9 +33,9 @@ PAPER = ("ukf", "rukf-10", "s2kf-25", "s2kf-50")
 SMART = ("s2kf-25", "s2kf-50", "s2kf-100", "s2kf-200")
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    options = build(Options, experiment.options, "options")
+    options: Options = setting.options
     turned = rotated_estimators(experiment, options.rotations)
     tables, sources = [], []
     for number, ensemble in enumerate(ensembles(experiment, setting, options, turned)):
@@ -48,7 +47,8 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
     outcome.tables["summary"] = at_keys
     outcome.metrics |= metrics(at_keys)
     outcome.claims += claims(at_keys, steps)
-    return outcome, hash_streams(sources)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
 
 
 def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict[str, Any]]:
@@ -235,3 +235,8 @@ def error_figure(steps: pd.DataFrame) -> Figure:
     axes[1].legend(fontsize="small")
     figure.suptitle("Extended target against the analytic moments")
     return figure
+
+
+EXTENDED_TARGET = Study(
+    "sampling filters against exact moments: updates by points of an extended target", study, Options
+)

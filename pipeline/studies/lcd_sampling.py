@@ -16,10 +16,10 @@ from pydantic import Field, PositiveInt
 from scipy.spatial.distance import pdist
 from scipy.stats import chi2
 
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
 from recorders.log import LogWriter, RunMetadata, make_stream, schemas
-from recorders.parameters import Parameters, build
+from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.blocks import Ragged, gather
 from replay.sampling import Samples, lcd_distance, lcd_samples, moment_corrected, parse_sampling
@@ -39,9 +39,9 @@ class LcdOptions(Parameters):
     drawn: tuple[str, ...] = ("s2kf-12", "ukf", "gf-7", "rukf-3")
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    options = build(LcdOptions, experiment.options, "options")
+    options: LcdOptions = setting.options
     optimised(2, 3, 1, experiment.seed)  # compiles, so that the first set's time is its own
     rows = [
         optimised(dimension, count, options.starts, experiment.seed)
@@ -57,8 +57,8 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
             outcome.metrics[f"lcd.{name}.{case}"] = float(row[name])
     outcome.metrics |= {f"{name}.distance.drawn": value for name, value in distances.items()}
     outcome.claims += claims(options, sets, distances, experiment.seed)
-    digest = _write(experiment, setting, drawn)
-    return outcome, digest
+    outcome.input_sha256 = _write(experiment, setting, drawn)
+    return outcome
 
 
 def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, float]:
@@ -188,3 +188,8 @@ def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) 
     source = MemorySource({}, run, "samples of N(0, I)")
     show(source, outputs, [], save=setting.folder / "timeline.rrd")
     return digest.hexdigest()
+
+
+LCD_SAMPLING = Study(
+    "samplings of N(0, I): how near they are to it, and what LCD sets cost", study, LcdOptions
+)

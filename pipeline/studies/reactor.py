@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pipeline.ensemble import hash_streams
-from pipeline.experiment import Experiment, Record, Setting
+from pipeline.experiment import Experiment, Record, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome, judged
 from pipeline.studies.linearization import (
     REFERENCE,
@@ -26,7 +26,6 @@ from pipeline.studies.linearization import (
     rmse,
 )
 from recorders.errors import BadInput
-from recorders.parameters import build
 
 CASES = {"printed": "prior as printed", "swapped": "prior swapped"}
 OTHERS = ("ukf", "gf-25", "rukf-12")
@@ -35,9 +34,9 @@ MUCH = 1.05  # a ratio of variances
 EARLY = 5  # steps that count as the beginning
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    options = build(Options, experiment.options, "options")
+    options: Options = setting.options
     outcome = Outcome()
     sources = []
     for case in CASES:
@@ -50,7 +49,8 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
         outcome.figures[f"errors-{case}"] = error_figure(steps, CASES[case])
         outcome.metrics |= metrics(steps, case)
         outcome.claims += claims(steps, CASES[case])
-    return outcome, hash_streams(sources)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
 
 
 def _in_case(experiment: Experiment, case: str) -> Experiment:
@@ -189,3 +189,8 @@ def error_figure(steps: pd.DataFrame, case: str) -> Figure:
     left.legend(fontsize="small")
     figure.suptitle(f"Batch reactor against the analytic moments, {case}")
     return figure
+
+
+REACTOR = Study(
+    "sampling filters against exact moments: nonlinear prediction in a batch reactor", study, Options
+)

@@ -1,63 +1,45 @@
 """Writing logs: whole chunks at a time, and never half a file.
 
-The container's small records are mcap's own; the wide ones (messages and their indexes) are structured
-arrays. A log is written as NAME.mcap.part and renamed when it is whole.
+A log is written as NAME.mcap.part and renamed when it is whole. The container's small records are mcap's
+own; the wide ones (messages and their indexes) come from `packing`.
 """
 
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
-import lz4.frame
 import numpy as np
-import zstandard
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log.layout import layout_of, windows
+from recorders.log.ahead import ahead
+from recorders.log.chunks import COMPRESSIONS, MAGIC, chunk_record
+from recorders.log.layout import layout_of
+from recorders.log.packing import Chunk, chunks_of
 from recorders.log.run import RECORD_NAME, RunMetadata
+from recorders.log.schemas import Schema
+from recorders.log.sealed import PUBLISH_SPANS, seal
 from recorders.log.streams import Stream, check_stream
 
-MAGIC = b"\x89MCAP0\r\n"
-DELAYS_NAME = "fuselog.delays"
 LIBRARY = "fuselog"
-COMPRESSIONS: Mapping[str, Callable[[bytes], bytes]] = {
-    "none": bytes,
-    "lz4": lz4.frame.compress,
-    "zstd": zstandard.compress,
-}
-INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
 
 
 @dataclass
 class _Channel:
     """What the writer must remember of one topic."""
 
-    identifier: int
-    schema_name: str
+    record: records.Channel
+    schema: Schema
     widths: dict[str, int]
-    metadata: dict[str, str]
     messages: int = 0
-    smallest_delay_ns: int = 2**63
-    largest_delay_ns: int = -(2**63)
-
-
-@dataclass
-class _Summary:
-    """What the end of the file repeats of the rest."""
-
-    schemas: list[records.Schema] = field(default_factory=list)
-    channels: list[records.Channel] = field(default_factory=list)
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
 
 
 class LogWriter:
@@ -68,6 +50,8 @@ class LogWriter:
         run: what the run was.
         compression: "zstd", "lz4" or "none".
         chunk_bytes: about how large an uncompressed chunk gets.
+
+    Raises BadInput where the file cannot be written.
     """
 
     def __init__(
@@ -82,26 +66,29 @@ class LogWriter:
             raise BadInput(f"compression '{compression}' is none of {', '.join(COMPRESSIONS)}")
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + ".part")
-        self._run = run
+        self._run = None if run is None else run.to_record()
         self._compression = compression
         self._chunk_bytes = chunk_bytes
         self._channels: dict[str, _Channel] = {}
-        self._summary = _Summary()
-        self._crc = 0
-        self._first_log_time_ns = 2**63
-        self._last_log_time_ns = 0
+        self._schemas: dict[bytes, records.Schema] = {}
+        self._chunks: list[records.ChunkIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._publish_spans: dict[str, str] = {}
+        self._offset = 0
+        self._checksum = 0
+        self._failure: BadInput | None = None
         self._file: BinaryIO
 
     def __enter__(self) -> Self:
-        try:
+        with self._telling():
+            if self.path.is_dir():
+                raise BadInput(f"{self.path}: is a folder; give the name of a log in it")
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._part.open("wb")
-        except OSError as error:
-            raise BadInput(f"{self.path}: cannot be written ({error.strerror})") from error
         self._append(MAGIC)
         self._append_record(records.Header(profile="", library=LIBRARY))
         if self._run is not None:
-            self._append_metadata(RECORD_NAME, self._run.to_record())
+            self._append_metadata(RECORD_NAME, self._run)
         return self
 
     def __exit__(
@@ -111,16 +98,13 @@ class LogWriter:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            if error is not None:
-                raise error
-            self._finish()
-            os.replace(self._part, self.path)
-        except OSError as failure:
-            self._discard()
-            raise BadInput(f"{self.path}: cannot be written ({failure.strerror})") from failure
-        except BaseException:
-            self._discard()
-            raise
+            if error is None:
+                self._finish()
+        finally:
+            # Gone already where the log was finished.
+            with suppress(OSError):
+                self._file.close()
+            self._part.unlink(missing_ok=True)
 
     def write(self, streams: Iterable[Stream]) -> None:
         """Write a block of streams, merged in log-time order; ties keep the order given.
@@ -128,18 +112,38 @@ class LogWriter:
         The chunks that this block fills are in the file when the call returns, so that memory holds one
         block and a cut-off file holds the blocks before it.
 
-        Raises BadInput where a stream breaks its schema (see `check_stream`), or a topic changes its
-        schema, its vectors' widths or its metadata from one block to the next.
+        Raises BadInput where a stream breaks its schema (see `check_stream`), a topic comes twice, or
+        changes its schema, its vectors' widths or its metadata from one block to the next.
         """
         block = list(streams)
+        topics = [stream.topic for stream in block]
+        if len(set(topics)) < len(topics):
+            raise BadInput(
+                f"{self.path}: a topic comes twice among {', '.join(topics)}; join its streams"
+            )
         for stream in block:
             check_stream(stream, f"{self.path}: ")
             self._declare(stream)
-        block = [_in_log_time_order(stream) for stream in block if len(stream)]
-        if block:
-            self._write_block(block)
+        parts = []
+        for stream in block:
+            if len(stream):
+                channel = self._channels[stream.topic]
+                layout = layout_of(stream.schema, channel.widths)
+                parts.append(
+                    layout.build(_in_log_time_order(stream), channel.record.id, channel.messages)
+                )
+                channel.messages += len(stream)
+        if parts:
+            chunks = list(chunks_of(parts, self._chunk_bytes))
+            for chunk, packed in zip(chunks, ahead(self._packed, chunks), strict=True):
+                self._append_chunk(chunk, *packed)
+            self._flush()
+
+    def _packed(self, chunk: Chunk) -> tuple[bytes, bytes]:
+        return chunk_record(chunk.data, chunk.log_time, self._compression)
 
     def _declare(self, stream: Stream) -> None:
+        """Register the stream's topic, or compare it with what it was."""
         widths = {
             entry.name: stream.columns[entry.name].shape[1]
             for entry in stream.schema
@@ -151,9 +155,9 @@ class LogWriter:
             return
         if known.messages == 0:
             known.widths = widths
-        if known.schema_name != stream.schema.full_name:
+        if known.schema.descriptor_set != stream.schema.descriptor_set:
             raise BadInput(
-                f"{self.path}: topic {stream.topic} is {known.schema_name} and cannot become "
+                f"{self.path}: topic {stream.topic} is {known.schema.full_name} and cannot become "
                 f"{stream.schema.full_name}; use another topic"
             )
         if len(stream) and known.widths != widths:
@@ -161,189 +165,142 @@ class LogWriter:
                 f"{self.path}: topic {stream.topic} has vectors of widths {known.widths} and cannot "
                 f"take {widths}; a stream keeps one width, use another topic"
             )
-        if known.metadata != dict(stream.metadata):
+        if known.record.metadata != dict(stream.metadata):
             raise BadInput(f"{self.path}: topic {stream.topic} changes its metadata between blocks")
 
     def _register(self, stream: Stream, widths: dict[str, int]) -> None:
-        schemas = {schema.name: schema for schema in self._summary.schemas}
-        schema = schemas.get(stream.schema.full_name)
-        if schema is None:
-            schema = records.Schema(
-                id=len(schemas) + 1,
-                data=stream.schema.descriptor_set,
+        described = stream.schema.descriptor_set
+        if described not in self._schemas:
+            self._schemas[described] = records.Schema(
+                id=len(self._schemas) + 1,
+                data=described,
                 encoding="protobuf",
                 name=stream.schema.full_name,
             )
-            self._summary.schemas.append(schema)
-            self._append_record(schema)
+            self._append_record(self._schemas[described])
         channel = records.Channel(
             id=len(self._channels) + 1,
             topic=stream.topic,
             message_encoding="protobuf",
             metadata=dict(stream.metadata),
-            schema_id=schema.id,
+            schema_id=self._schemas[described].id,
         )
-        self._summary.channels.append(channel)
         self._append_record(channel)
-        self._channels[stream.topic] = _Channel(channel.id, schema.name, widths, dict(stream.metadata))
+        self._channels[stream.topic] = _Channel(channel, stream.schema, widths)
 
-    def _write_block(self, block: list[Stream]) -> None:
-        packed: list[NDArray[np.void]] = []
-        for stream in block:
-            channel = self._channels[stream.topic]
-            delays_ns = stream.log_time_ns - stream.publish_time_ns
-            channel.smallest_delay_ns = min(channel.smallest_delay_ns, int(delays_ns.min()))
-            channel.largest_delay_ns = max(channel.largest_delay_ns, int(delays_ns.max()))
-            packed.append(
-                layout_of(stream.schema, channel.widths).build(
-                    channel.identifier,
-                    channel.messages,
-                    stream.log_time_ns,
-                    stream.publish_time_ns,
-                    stream.columns,
-                )
-            )
-            channel.messages += len(stream)
-        offsets = _merge(packed)
-        self._write_chunks(_scatter(packed, offsets), packed, offsets)
-
-    def _write_chunks(
-        self, data: NDArray[np.uint8], packed: list[NDArray[np.void]], offsets: list[NDArray]
-    ) -> None:
-        """Cut the block at record borders into chunks of about `chunk_bytes`."""
-        starts = np.sort(np.concatenate(offsets))
-        wanted = np.arange(self._chunk_bytes, len(data), self._chunk_bytes)
-        borders = np.unique(
-            np.concatenate([[0], starts[np.searchsorted(starts, wanted) - 1], [len(data)]])
-        )
-        cuts = [np.searchsorted(each, borders) for each in offsets]
-        for chunk in range(len(borders) - 1):
-            begin, end = int(borders[chunk]), int(borders[chunk + 1])
-            indexes: dict[int, NDArray[np.void]] = {}
-            for part, each, cut in zip(packed, offsets, cuts, strict=True):
-                rows = slice(cut[chunk], cut[chunk + 1])
-                if rows.start < rows.stop:
-                    index = np.empty(rows.stop - rows.start, INDEX_ENTRY)
-                    index["log_time_ns"] = part["log_time_ns"][rows]
-                    index["offset"] = each[rows] - begin
-                    indexes[int(part["channel_id"][0])] = index
-            self._append_chunk(data[begin:end].tobytes(), indexes)
-
-    def _append_chunk(self, data: bytes, indexes: Mapping[int, NDArray[np.void]]) -> None:
-        start = min(int(index["log_time_ns"].min()) for index in indexes.values())
-        end = max(int(index["log_time_ns"].max()) for index in indexes.values())
-        self._first_log_time_ns = min(self._first_log_time_ns, start)
-        self._last_log_time_ns = max(self._last_log_time_ns, end)
-        compression = "" if self._compression == "none" else self._compression
-        chunk = records.Chunk(
-            compression=compression,
-            data=COMPRESSIONS[self._compression](data),
-            message_start_time=start,
-            message_end_time=end,
-            uncompressed_crc=zlib.crc32(data),
-            uncompressed_size=len(data),
-        )
-        chunk_offset = self._file.tell()
-        chunk_length = self._append_record(chunk)
+    def _append_chunk(self, chunk: Chunk, head: bytes, packed: bytes) -> None:
+        start = self._offset
+        self._append(head)
+        self._append(packed)
+        index_start = self._offset
         index_offsets: dict[int, int] = {}
-        index_start = self._file.tell()
-        for channel_id, index in indexes.items():
-            index_offsets[channel_id] = self._file.tell()
-            entries = index.tobytes()
-            self._append(
-                struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries))
-                + entries
+        for channel_id, entries in chunk.indexes.items():
+            index_offsets[channel_id] = self._offset
+            index_head = struct.pack(
+                "<BQHI", Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries)
             )
-        self._summary.chunks.append(
+            self._append(index_head + entries)
+        self._chunks.append(
             records.ChunkIndex(
-                chunk_length=chunk_length,
-                chunk_start_offset=chunk_offset,
-                compression=compression,
-                compressed_size=len(chunk.data),
-                message_end_time=end,
-                message_index_length=self._file.tell() - index_start,
+                chunk_length=index_start - start,
+                chunk_start_offset=start,
+                compression="" if self._compression == "none" else self._compression,
+                compressed_size=len(packed),
+                message_end_time=chunk.log_time.last_ns,
+                message_index_length=self._offset - index_start,
                 message_index_offsets=index_offsets,
-                message_start_time=start,
-                uncompressed_size=len(data),
+                message_start_time=chunk.log_time.first_ns,
+                uncompressed_size=len(chunk.data),
             )
         )
+        self._publish_spans[f"{start}+{index_start - start}"] = (
+            f"{chunk.publish_time.first_ns} {chunk.publish_time.last_ns}"
+        )
 
-    def _append_metadata(self, name: str, values: dict[str, str]) -> None:
-        offset = self._file.tell()
-        length = self._append_record(records.Metadata(name=name, metadata=values))
-        self._summary.metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
+    def _append_metadata(self, name: str, pairs: Mapping[str, str]) -> None:
+        start = self._offset
+        self._append_record(records.Metadata(name=name, metadata=seal(pairs)))
+        length = self._offset - start
+        self._metadata.append(records.MetadataIndex(offset=start, length=length, name=name))
 
-    def _append_record(self, record: records.McapRecord) -> int:
+    def _append_record(self, record: records.McapRecord) -> None:
         builder = RecordBuilder()
         record.write(builder)
-        return self._append(builder.end())
+        self._append(builder.end())
 
-    def _append(self, data: bytes) -> int:
-        self._crc = zlib.crc32(data, self._crc)
-        self._file.write(data)
-        return len(data)
+    def _append(self, data: bytes) -> None:
+        self._checksum = zlib.crc32(data, self._checksum)
+        self._offset += len(data)
+        with self._telling():
+            self._file.write(data)
+
+    def _flush(self) -> None:
+        with self._telling():
+            self._file.flush()
 
     def _finish(self) -> None:
-        delays = {
-            topic: f"{channel.smallest_delay_ns} {channel.largest_delay_ns}"
-            for topic, channel in self._channels.items()
-            if channel.messages
-        }
-        self._append_metadata(DELAYS_NAME, delays)
-        self._append_record(records.DataEnd(data_section_crc=self._crc))
-        summary_start = self._file.tell()
-        summary, summary_offset_start = self._summary_section(summary_start)
-        footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, summary_offset_start)
-        crc = zlib.crc32(footer, zlib.crc32(summary))
-        self._file.write(summary + footer + struct.pack("<I", crc) + MAGIC)
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
+        """Write what follows the last chunk, and give the file its name."""
+        self._append_metadata(PUBLISH_SPANS, self._publish_spans)
+        self._append_record(records.DataEnd(data_section_crc=self._checksum))
+        self._append(self._summary_section())
+        self._append(MAGIC)
+        with self._telling():
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._part.replace(self.path)
 
-    def _summary_section(self, start: int) -> tuple[bytes, int]:
-        """The summary's bytes, and where in the file its offset group starts."""
-        counts = {channel.identifier: channel.messages for channel in self._channels.values()}
-        total = sum(counts.values())
-        statistics = records.Statistics(
-            attachment_count=0,
-            channel_count=len(counts),
-            channel_message_counts=counts,
-            chunk_count=len(self._summary.chunks),
-            message_count=total,
-            message_end_time=self._last_log_time_ns,
-            message_start_time=self._first_log_time_ns if total else 0,
-            metadata_count=len(self._summary.metadata),
-            schema_count=len(self._summary.schemas),
-        )
-        groups: list[tuple[Opcode, list]] = [
-            (Opcode.SCHEMA, self._summary.schemas),
-            (Opcode.CHANNEL, self._summary.channels),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._summary.chunks),
-            (Opcode.METADATA_INDEX, self._summary.metadata),
-        ]
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Tell errors of the disk as BadInput; once there was one, the log can no more be finished."""
+        if self._failure is not None:
+            raise self._failure
+        try:
+            yield
+        except OSError as error:
+            self._failure = BadInput(f"{self.path}: cannot be written ({error.strerror})")
+            raise self._failure from error
+
+    def _summary_section(self) -> bytes:
+        """The summary, the offsets of its groups, and the footer."""
+        channels = [channel.record for channel in self._channels.values()]
+        groups: dict[Opcode, Sequence[records.McapRecord]] = {
+            Opcode.SCHEMA: list(self._schemas.values()),
+            Opcode.CHANNEL: channels,
+            Opcode.STATISTICS: [self._statistics()],
+            Opcode.CHUNK_INDEX: self._chunks,
+            Opcode.METADATA_INDEX: self._metadata,
+        }
         builder = RecordBuilder()
         offsets: list[records.SummaryOffset] = []
-        for opcode, members in groups:
+        for opcode, members in groups.items():
             before = builder.count
             for member in members:
                 member.write(builder)
             if members:
+                start, length = self._offset + before, builder.count - before
                 offsets.append(
-                    records.SummaryOffset(
-                        group_opcode=opcode,
-                        group_start=start + before,
-                        group_length=builder.count - before,
-                    )
+                    records.SummaryOffset(group_opcode=opcode, group_start=start, group_length=length)
                 )
-        offset_start = start + builder.count
+        offset_start = self._offset + builder.count
         for offset in offsets:
             offset.write(builder)
-        return builder.end(), offset_start
+        section = builder.end() + struct.pack("<BQQQ", Opcode.FOOTER, 20, self._offset, offset_start)
+        return section + struct.pack("<I", zlib.crc32(section))
 
-    def _discard(self) -> None:
-        self._file.close()
-        self._part.unlink(missing_ok=True)
+    def _statistics(self) -> records.Statistics:
+        counts = {channel.record.id: channel.messages for channel in self._channels.values()}
+        return records.Statistics(
+            attachment_count=0,
+            channel_count=len(counts),
+            channel_message_counts=counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(counts.values()),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
 
 
 def write_log(
@@ -362,22 +319,3 @@ def _in_log_time_order(stream: Stream) -> Stream:
     if np.all(stream.log_time_ns[1:] >= stream.log_time_ns[:-1]):
         return stream
     return stream.take(np.argsort(stream.log_time_ns, kind="stable"))
-
-
-def _merge(packed: list[NDArray[np.void]]) -> list[NDArray[np.int64]]:
-    """The byte offset of every record of every stream when all are merged in log-time order."""
-    times = np.concatenate([part["log_time_ns"] for part in packed])
-    owners = np.repeat(np.arange(len(packed)), [len(part) for part in packed])
-    owners = owners[np.argsort(times, kind="stable")]
-    sizes = np.array([part.dtype.itemsize for part in packed])[owners]
-    starts = np.cumsum(sizes) - sizes
-    return [starts[owners == owner] for owner in range(len(packed))]
-
-
-def _scatter(packed: list[NDArray[np.void]], offsets: list[NDArray[np.int64]]) -> NDArray[np.uint8]:
-    """The block's bytes: every record at its offset."""
-    data = np.empty(sum(part.nbytes for part in packed), np.uint8)
-    for part, each in zip(packed, offsets, strict=True):
-        size = part.dtype.itemsize
-        windows(data, size)[each] = part.view(np.dtype((np.void, size)))
-    return data

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Topic, make_stream, schemas
 from replay.blocks import Block, Events, Ragged, of_runs
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Recursive

@@ -16,8 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Schema, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.planar import (
     drive,
     drive_jacobians,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pydantic import NonNegativeInt
 
 from recorders.errors import BadInput
-from recorders.log.reader import Topic
+from recorders.log import Topic
 from recorders.parameters import Parameters
 from replay.engine import Bound, Estimator
 from replay.estimators.discrete import bind_system

@@ -20,6 +20,7 @@ from replay.timeline.canvas import (
     Canvas,
     Colour,
     Times,
+    escaped,
     gap_limit_ns,
     nice,
     thin,
@@ -160,9 +161,9 @@ def _until_stale(
 
 
 def plane_view(
-    canvas: Canvas, root: str, contents: list[str], paths: list[str], places: Floats
+    canvas: Canvas, root: str, others: list[str], paths: list[str], places: Floats
 ) -> rrb.Spatial2DView:
-    """A view of all below `root` and of `contents` that shows at least the places (n, 2), on a grid.
+    """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
 
     Of the `paths` it shows what lies up to a minute before the cursor.
     """
@@ -183,9 +184,9 @@ def plane_view(
     )
     return rrb.Spatial2DView(
         origin="/",
-        contents=[f"{root}/**", *contents],
+        contents=[f"{escaped(each)}/**" for each in (root, *others)],
         name=f"Map, grid {step_m:g} m",
-        overrides={path: [trail] for path in paths},
+        overrides={escaped(path): [trail] for path in paths},
         # the bounds are outside the transform that turns y up
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )
