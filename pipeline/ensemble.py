@@ -62,6 +62,21 @@ class Replayed:
         ]
         return [*self.errors, *self.innovations, *outputs]
 
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for every run that an estimator could not follow to the end."""
+        sentences = []
+        for topic, rows in self.outputs.items():
+            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
+                reasons = rows.stream.metadata.get("reasons", "").split("; ")
+                for run in np.flatnonzero(np.diff(rows.offsets)):
+                    failure, source = rows.of_run(int(run)), self.sources[run]
+                    elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
+                    reason = reasons[int(failure["reason"][0])]
+                    what = " ".join(filter(None, split_topic(topic)))
+                    sentences.append(f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}")
+        return sentences
+
 
 def record_ensemble(
     scenario: str,

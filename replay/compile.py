@@ -23,6 +23,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+from numba.core.errors import NumbaError
 
 from recorders.errors import BadInput
 
@@ -69,14 +70,15 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
             "",
         ]
     )
-    return partial(_over_runs, _load(text).loop)
+    return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
 
 
 def _over_runs(
-    loop: Callable[..., None],
     runs: int,
     *arguments: Any,
     scratch: Callable[[], Any] | None = None,
+    name: str,
+    loop: Callable[..., None],
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
@@ -84,12 +86,20 @@ def _over_runs(
         loop(first, end, *arguments, *([scratch()] if scratch else []))
 
     cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    if cores <= 1:
-        work(0, runs)
-        return
-    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
-    with ThreadPoolExecutor(cores) as pool:
-        list(pool.map(work, cuts[:-1], cuts[1:]))
+    try:
+        if cores > 1:
+            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+            with ThreadPoolExecutor(cores) as pool:
+                list(pool.map(work, cuts[:-1], cuts[1:]))
+        else:
+            work(0, runs)
+    except NumbaError as error:
+        reason = str(error).splitlines()[-1]
+        raise BadInput(
+            f"kernel '{name}' does not compile: {reason} "
+            "(a kernel that makes arrays is compiled with allocates=True)"
+        ) from error
 
 
 class _Bundle:

@@ -80,14 +80,21 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
-    result = np.full(len(error), np.nan)
-    if error.shape[1] == 0 or len(error) == 0:
-        return result
-    good = np.linalg.eigvalsh(covariance)[:, 0] > 0
-    solved = np.linalg.solve(covariance[good], error[good, :, None])[..., 0]
-    result[good] = np.sum(error[good] * solved, axis=1)
-    return result
+    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite.
+
+    By the Cholesky factor L of all P at once: it is |L^-1 e|^2.
+    """
+    factor, whitened = np.empty_like(covariance), np.empty_like(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for row in range(error.shape[1]):
+            for column in range(row + 1):
+                known = np.sum(factor[:, row, :column] * factor[:, column, :column], axis=1)
+                entry = covariance[:, row, column] - known
+                diagonal = np.sqrt(np.where(entry > 0, entry, np.nan))
+                factor[:, row, column] = entry / factor[:, column, column] if column < row else diagonal
+            known = np.sum(factor[:, row, :row] * whitened[:, :row], axis=1)
+            whitened[:, row] = (error[:, row] - known) / factor[:, row, row]
+    return np.sum(whitened**2, axis=1)
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:

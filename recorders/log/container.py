@@ -49,11 +49,6 @@ class Region:
         """Where it is in the file, for `read_bytes`."""
         return self.offset, self.length
 
-    @property
-    def key(self) -> str:
-        """What tells this region from others, even after another tool has rewritten the file."""
-        return f"{self.offset}+{self.length}"
-
 
 @dataclass
 class Container:

@@ -270,7 +270,8 @@ def _compiled(kind: str) -> tuple[Function, Function]:
 def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
     """The state at every run's prior, and the maps.
 
-    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance.
+    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance,
+    or the map is not planar.
     """
     prior = whole[prior_topic]
     rows = prior.offsets[:-1]
@@ -293,11 +294,13 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
 
 
 def _landmarks(landmarks: Ragged) -> Landmarks:
+    positions = landmarks["position_m"]
+    if len(landmarks) and positions.shape[1] < 2:
+        raise BadInput("topic /landmarks: positions in the plane need two coordinates")
     run = np.repeat(np.arange(landmarks.runs), np.diff(landmarks.offsets))
     keys = (run << 32) + landmarks["landmark_id"]
     order = np.argsort(keys, kind="stable")
-    positions = landmarks["position_m"].reshape(len(keys), -1)[:, :2]
-    return Landmarks(keys[order], np.ascontiguousarray(positions[order]))
+    return Landmarks(keys[order], np.ascontiguousarray(positions[order, :2]))
 
 
 def run(
