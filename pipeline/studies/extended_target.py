@@ -237,4 +237,6 @@ def error_figure(steps: pd.DataFrame) -> Figure:
     return figure
 
 
-EXTENDED_TARGET = Study("LRKFs of an extended target: its position and area", study, Options)
+EXTENDED_TARGET = Study(
+    "sampling filters against exact moments: updates by points of an extended target", study, Options
+)

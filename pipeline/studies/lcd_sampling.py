@@ -190,4 +190,6 @@ def _write(experiment: Experiment, setting: Setting, drawn: dict[str, Samples]) 
     return digest.hexdigest()
 
 
-LCD_SAMPLING = Study("samplings of N(0, I): distances, moments, claims", study, LcdOptions)
+LCD_SAMPLING = Study(
+    "samplings of N(0, I): how near they are to it, and what LCD sets cost", study, LcdOptions
+)

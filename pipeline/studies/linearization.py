@@ -62,11 +62,13 @@ def ensembles(
     setting: Setting,
     options: Options,
     extra: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    written: bool = True,
 ) -> Iterator[Ensemble]:
     """Record and replay the experiment for every seed; the first runs' logs are those of the first.
 
-    `extra` estimators are replayed too, but not written. Raises BadInput where the reference is not
-    among the estimators.
+    `extra` estimators are replayed too, but not written, nor is anything unless `written`. Raises
+    BadInput where the reference is not among the estimators.
     """
     if REFERENCE not in experiment.estimators:
         raise BadInput(f"this study compares with the estimator '{REFERENCE}'; add it to the experiment")
@@ -74,7 +76,7 @@ def ensembles(
         again = experiment.model_copy(update={"seed": experiment.seed + number})
         sources = obtain(again, setting)
         outputs = replay_in_memory(sources, experiment.estimators, progress=setting.progress)
-        if number == 0:
+        if number == 0 and written:
             write_logs(again, setting, sources, Replayed(sources, outputs, [], []))
             _draw_first_run(again, setting, sources, outputs)
         outputs |= replay_in_memory(sources, extra or {}, progress=setting.progress)
