@@ -14,8 +14,8 @@ from recorders.log import Clock, Stream
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import bind, collect, replay
-from replay.estimators.gaussian import unscented_points
 from replay.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.sampling.samplers import unscented
 from replay.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
@@ -379,5 +379,5 @@ def test_what_no_run_can_use_is_bad_input():
     for topic in ("/landmarks", "/robot1/range_bearing", "/robot1/prior", "/robot1/odometry"):
         with pytest.raises(BadInput, match="does not fit this log: it needs /landmarks"):
             replayed("ekf", [without(source, topic)])
-    with pytest.raises(BadInput, match="must be positive"):
-        unscented_points(3, -3.0)
+    with pytest.raises(BadInput, match="leaves no spread"):
+        unscented(3, -3.0)
