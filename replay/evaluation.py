@@ -114,7 +114,7 @@ def truth_at(
     times = truth.publish_time_ns
     state = truth["state"]
     if len(times) == 0:
-        return np.full((len(time_ns), state.shape[1]), np.nan)
+        return np.full((len(time_ns), len(kinds)), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
@@ -129,7 +129,7 @@ def truth_at(
 
 
 def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float = 0.2) -> Errors | None:
-    """Errors of a Gaussian estimate stream of an ensemble; None where no run has its truth.
+    """Errors of a Gaussian estimate stream of an ensemble; None unless every run has its truth topic.
 
     Raises BadInput where the stream does not say what its components are, or the truth lacks them.
     """

@@ -3,7 +3,7 @@
 There are two ways to pass a Gaussian through a function: linearisation (extended Kalman filter) and
 sampling (linear regression Kalman filters, the UKF first). A filter is made by `linearised` or `sampled`
 from a family's models and compiled with that family's loop. All of it is scalar loops over small arrays
-that are changed in place and allocated once per run; covariances stay symmetric by construction.
+that are changed in place, in memory made once per core; covariances stay symmetric by construction.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ class Models(NamedTuple):
     """A family's component-first models, and their Jacobians as functions that fill arrays.
 
     Attributes:
-        motion: (state, control, duration_s) -> the next state, a tuple.
+        motion: (state, control, duration_s) -> the next state, a tuple; it does not wrap angles.
         motion_jacobians: (state, control, duration_s, transition, gain) fills the Jacobians by the
             state (n, n) and by the control (n, controls).
         sensor: (state, target) -> all m components that the sensor can measure, a tuple.
@@ -389,11 +389,11 @@ def unscented_points(dimension: int, kappa: float) -> tuple[Floats, Floats]:
     Julier and Uhlmann: radius sqrt(n + kappa), centre weight kappa / (n + kappa).
     Raises BadInput unless n + kappa is positive.
     """
-    spread = dimension + kappa
-    if not spread > 0:
+    scale = dimension + kappa
+    if not scale > 0:
         raise BadInput(f"kappa = {kappa}: dimension + kappa must be positive, here above {-dimension}")
-    axes = np.sqrt(spread) * np.eye(dimension)
+    axes = np.sqrt(scale) * np.eye(dimension)
     points = np.concatenate([np.zeros((1, dimension)), axes, -axes])
-    weights = np.full(2 * dimension + 1, 0.5 / spread)
-    weights[0] = kappa / spread
+    weights = np.full(2 * dimension + 1, 0.5 / scale)
+    weights[0] = kappa / scale
     return points, weights

@@ -163,6 +163,23 @@ def test_equal_stamps_keep_the_order_of_the_log_in_memory_too(tmp_path: Path):
     assert_equal(log.read(["/bearing"]), source.read(["/bearing"]))
 
 
+def test_streams_without_messages_are_an_answer_too(tmp_path: Path):
+    """No odometry, no sightings, no landmarks: no estimates, in memory as from a log, and no error."""
+    source = record(0)
+    empty = {
+        topic: stream if topic.endswith("prior") else stream.take(slice(0, 0))
+        for topic, stream in source.streams.items()
+    }
+    with LogWriter(tmp_path / "empty.mcap", source.run) as writer:
+        writer.write(empty.values())
+    silent = MemorySource(empty, source.run, "silent")
+    assert all(len(ragged) == 0 for ragged in replayed([silent]).values())
+    log = LogSource(open_log(tmp_path / "empty.mcap"))
+    assert all(len(ragged) == 0 for ragged in replayed([log]).values())
+    together = replayed([log, source, silent])
+    assert_equal(of_run(together, 1), of_run(replayed([source]), 0))
+
+
 def test_runs_with_other_topics_are_no_ensemble():
     first, second = record(0), record(1, robots=1, range_bearing={"rate_hz": 0.0})
     with pytest.raises(BadInput, match="topic /robot1/range_bearing is not as in run 0"):
