@@ -9,7 +9,7 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
-# Eigenvalues of a correlation matrix below this are rounding.
+# A share of a variance below this is rounding.
 ROUNDING = 1e-14
 
 
@@ -19,23 +19,26 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     A component of infinite variance counts nothing. NaN where there are no components, where an error or
     a covariance is NaN, or where a covariance is not positive definite.
     """
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    known = ~np.isinf(variance)
-    positive = variance > 0.0
-    inverse_sigma = np.where(known & positive, 1.0 / np.sqrt(np.where(positive, variance, 1.0)), 0.0)
-    both = known[..., :, None] & known[..., None, :]
-    correlation = (
-        inverse_sigma[..., :, None] * np.where(both, covariance, 0.0) * inverse_sigma[..., None, :]
-    )
-    identity = np.eye(error.shape[-1])
-    correlation = np.where(both, correlation, identity)
-    sound = np.asarray((positive & np.isfinite(correlation).all(axis=-1)).all(axis=-1))
-    correlation = np.where(sound[..., None, None], correlation, identity)
-    sound &= (np.linalg.eigvalsh(correlation) > ROUNDING).all(axis=-1) & (error.shape[-1] > 0)
-    correlation = np.where(sound[..., None, None], correlation, identity)
-    scaled = (inverse_sigma * error)[..., None]
-    squared = (np.swapaxes(scaled, -1, -2) @ np.linalg.solve(correlation, scaled))[..., 0, 0]
-    return np.where(sound, squared, np.nan)
+    size = error.shape[-1]
+    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
+    both = finite[..., :, None] & finite[..., None, :]
+    covariance = np.where(both, covariance, np.eye(size))
+    error = np.where(finite, error, 0.0)
+    # |L^-1 e|^2 by the Cholesky factors L of all P at once
+    factor, whitened = np.empty_like(covariance), np.empty_like(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for row in range(size):
+            for column in range(row + 1):
+                reached = np.sum(factor[..., row, :column] * factor[..., column, :column], axis=-1)
+                entry = covariance[..., row, column] - reached
+                if column < row:
+                    factor[..., row, column] = entry / factor[..., column, column]
+                else:
+                    is_sound = entry > ROUNDING * covariance[..., row, row]
+                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
+            reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
+            whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
+    return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:

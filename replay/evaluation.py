@@ -96,6 +96,8 @@ def truth_at(
     """
     times = truth.publish_time_ns
     state = truth["state"]
+    if len(times) == 0:
+        return np.full((len(time_ns), len(kinds)), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
