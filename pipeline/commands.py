@@ -5,20 +5,21 @@ Rerun and matplotlib take long to import: only what draws imports them.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.experiment import run_experiment
 from pipeline.results import plain, result_folder, write_outcome
+from pipeline.settings import load_experiment, settings_of_estimators
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput
 from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
-from replay.engine import configure, find_estimator
 from replay.metrics import find_metrics, measure
 from replay.sources import LogSource, log_span_ns
 
@@ -40,7 +41,7 @@ def replay_logs(
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
-    estimators = _estimator_settings(names, settings)
+    estimators = settings_of_estimators(names, parse_settings(settings))
     sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
     order: Clock = "log_time" if arrival_order else "publish_time"
     replay_to_logs(sources, estimators, paths, order=order, progress=progress)
@@ -70,34 +71,6 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
         if places.count(place) > 1:
             raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
     return paths
-
-
-def _estimator_settings(names: Sequence[str], settings: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label.
-
-    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
-    BadInput where none has.
-    """
-    given = parse_settings(settings)
-    chosen: dict[str, dict[str, Any]] = {}
-    known: dict[str, set[str]] = {}
-    for name in names:
-        own = given.get(name, {})
-        if not isinstance(own, dict):
-            raise BadInput(f"--set {name}={own}: expected {name}.PARAMETER=VALUE")
-        chosen[name] = dict(own)
-        estimator, _ = find_estimator(str(own.get("kind", name)))
-        known[name] = set(estimator.parameters.model_fields)
-    for key, value in given.items():
-        takers = [name for name in chosen if key in known[name]]
-        if key not in chosen and not takers:
-            everything = sorted({*chosen, *(each for fields in known.values() for each in fields)})
-            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, everything)}")
-        for name in takers:
-            chosen[name].setdefault(key, value)
-    for name, values in chosen.items():
-        configure(name, values)
-    return chosen
 
 
 def _span(source: LogSource, start_s: float | None, end_s: float | None) -> LogSource:
@@ -176,12 +149,7 @@ def _source_path(estimates: Log) -> Path:
 def _check_same_run(estimates: Log, log: Log) -> None:
     """Raise BadInput where estimates are of another run than the log's."""
     of, run = estimates.run, log.run
-    if (
-        of
-        and run
-        and (of.scenario, of.parameters, of.seed, of.run)
-        != (run.scenario, run.parameters, run.seed, run.run)
-    ):
+    if of and run and replace(of, notes={}) != replace(run, notes={}):
         raise BadInput(
             f"{estimates.path}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
             f"{log.path} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
@@ -190,10 +158,12 @@ def _check_same_run(estimates: Log, log: Log) -> None:
 
 def _read_outputs(logs: Sequence[Log]) -> dict[str, Ragged]:
     """The streams of an ensemble's estimates logs."""
-    topics = list(logs[0].topics)
-    for log in logs[1:]:
-        if list(log.topics) != topics:
-            raise BadInput(f"{log.path}: holds other topics than {logs[0].path}; judge it on its own")
+    topics, *others = (
+        [topic for topic in log.topics if topic.startswith("/estimates/")] for log in logs
+    )
+    for log, theirs in zip(logs[1:], others, strict=True):
+        if theirs != topics:
+            raise BadInput(f"{log.path}: other estimates than in {logs[0].path}; judge it on its own")
     read = [LogSource(log).read(topics) for log in logs]
     return {topic: gather([streams[topic] for streams in read]) for topic in topics}
 
