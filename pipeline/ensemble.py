@@ -107,11 +107,23 @@ def replay_ensemble(
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
+    outputs = replay_in_memory(sources, estimators, order=order, progress=progress)
+    return judge(sources, outputs, gap_limit_s)
+
+
+def replay_in_memory(
+    sources: Sequence[Source],
+    estimators: Settings,
+    *,
+    order: Clock = "publish_time",
+    progress: Progress = no_progress,
+) -> dict[str, Ragged]:
+    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
         outputs |= collect(replay(sources, bound, order=order))
-    return judge(sources, outputs, gap_limit_s)
+    return outputs
 
 
 def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:

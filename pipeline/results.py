@@ -38,6 +38,11 @@ class Claim:
     why: str = ""
 
 
+def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
+    """A claim that a measured condition confirms or refutes."""
+    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
+
+
 @dataclass
 class Outcome:
     """What a study found. Metric keys are `estimator.quantity_unit[.case]`.

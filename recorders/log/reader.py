@@ -3,6 +3,7 @@
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import BinaryIO, NamedTuple
@@ -93,7 +94,7 @@ def read_blocks(
     pending: dict[str, list[Stream]] = {}
     counts: Counter[str] = Counter()
     waiting, threshold = 0, block_messages
-    with _open(log) as file:
+    with _reading(log) as file:
         chosen = _chosen(log, file, topics, window)
         reads = ((ranked, read_bytes(file, *ranked.region.extent)) for ranked in chosen)
         work = partial(_decoded, log, decoders, window)
@@ -115,9 +116,11 @@ def read_blocks(
         _check_counts(log, topics, counts)
 
 
-def _open(log: Log) -> BinaryIO:
+@contextmanager
+def _reading(log: Log) -> Iterator[BinaryIO]:
     try:
-        return log.path.open("rb")
+        with log.path.open("rb") as file:
+            yield file
     except OSError as error:
         raise BadInput(f"{log.path}: cannot be read ({error.strerror})") from error
 

@@ -1,7 +1,7 @@
 """How fast logs are read and written beside the ready-made ways, measured side by side in one run.
 
-`python -m tests.bench log` prints the ratios. `python tests/bench/bench_log.py` writes and reads a log of ten
-million messages, and prints how much memory that took.
+`python -m tests.bench log` prints the ratios. `python tests/bench/bench_log.py` writes and reads ten
+million messages block by block, and prints how much memory that took.
 """
 
 import resource

@@ -153,11 +153,40 @@ def scaled_by(scale: float) -> Callable[[float], float]:
 
 
 def test_numbers_that_a_kernel_closes_over_are_part_of_it():
-    """The same source around another number is another kernel."""
-    found = np.zeros((2, 3))
-    for row, scale in enumerate((2.0, 3.0)):
-        compile_over_runs(kernel_of(scaled_by(scale)), allocates=False)(3, found[row])
-    assert_array_equal(found, [[0, 4, 8], [0, 6, 12]])
+    """The same source around another number is another kernel; infinity and NumPy's numbers are fine."""
+    scales = (2.0, 3.0, np.float64(0.5), -np.inf)
+    found = np.zeros((len(scales), 2))
+    for row, scale in enumerate(scales):
+        compile_over_runs(kernel_of(scaled_by(scale)), allocates=False)(2, found[row])
+    assert_array_equal(found[:, 1], [4, 6, 1, -np.inf])
+
+
+def offset_by(scale: float) -> Callable[[float], float]:
+    def offset(value: float) -> float:
+        return scale + value
+
+    return offset
+
+
+@pytest.mark.parametrize("second", [1.5, 2.5])
+def test_numbers_of_one_name_are_each_models_own(second: float):
+    """Two models may each close over a `scale`, equal or not, and each keeps its own."""
+    found = np.zeros(2)
+    compile_over_runs(kernel_of(scaled_by(1.5), offset_by(second)), allocates=False)(2, found)
+    assert_array_equal(found, [second, 1.5 + (second + 1)])
+
+
+def test_what_numba_has_compiled_already_is_compiled_with_the_rest():
+    found = np.zeros(2)
+    compile_over_runs(kernel_of(numba.njit(twice)), allocates=False)(2, found)
+    assert_array_equal(found, [0, 4])
+
+
+def test_two_closures_of_one_function_stay_two():
+    """A filter regresses its motion and its sensor by one function: the names must not run together."""
+    found = np.zeros(3)
+    compile_over_runs(kernel_of(scaled_by(2.0), scaled_by(3.0)), allocates=False)(3, found)
+    assert_array_equal(found, [0, 5, 10])
 
 
 def test_what_cannot_be_compiled_is_told_in_one_sentence():
@@ -167,7 +196,7 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
         compile_over_runs(kernel_of(typed["typed"]))
     with pytest.raises(BadInput, match="is no `def` function; kernels are made of these"):
         compile_over_runs(kernel_of(lambda value: value))
-    with pytest.raises(BadInput, match="two different things called 'scaled'"):
-        compile_over_runs(kernel_of(scaled_by(2.0), scaled_by(3.0)))
-    with pytest.raises(BadInput, match="kernel 'one' does not compile: "):
+    with pytest.raises(BadInput, match=r"uses 'scale', a ndarray, .* hand it in as an argument"):
+        compile_over_runs(kernel_of(scaled_by(np.ones(3))))
+    with pytest.raises(BadInput, match="kernel 'one' does not compile: No implementation of function"):
         compile_over_runs(kernel_of(twice))(1, "text")

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording, record_run
 from replay.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
 from replay.engine import Bound, bind, collect, replay
@@ -48,7 +47,7 @@ def bound(sources: list[Source]) -> list[Bound]:
     return [each for name in ESTIMATORS for each in bind(name, sources, {})]
 
 
-def replayed(sources: list[Source], order: Order = "publish_time", **options: int) -> dict[str, Ragged]:
+def replayed(sources: list[Source], order: Clock = "publish_time", **options: int) -> dict[str, Ragged]:
     return collect(replay(sources, bound(sources), order=order, **options))
 
 
@@ -100,7 +99,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[MemorySource, Path]:
 
 
 @pytest.mark.parametrize("order", ["publish_time", "log_time"])
-def test_a_log_in_small_blocks_is_the_recording_in_memory(order: Order, late: tuple[MemorySource, Path]):
+def test_a_log_in_small_blocks_is_the_recording_in_memory(order: Clock, late: tuple[MemorySource, Path]):
     """State carried over block boundaries, and reading, change nothing; small blocks are small."""
     source, path = late
     whole = replayed([source], order)
