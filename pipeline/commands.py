@@ -11,15 +11,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
-from pipeline.experiment import run_experiment
+from pipeline.experiment import load_experiment, run_experiment
 from pipeline.results import plain, result_folder, write_outcome
-from pipeline.settings import load_experiment, settings_of_estimators
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
+from replay.engine import configure, find_estimator
 from replay.metrics import find_metrics, measure
 from replay.sources import LogSource, log_span_ns
 
@@ -41,7 +41,7 @@ def replay_logs(
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
-    estimators = settings_of_estimators(names, parse_settings(settings))
+    estimators = _settings_of_estimators(names, parse_settings(settings))
     sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
     order: Clock = "log_time" if arrival_order else "publish_time"
     replay_to_logs(sources, estimators, paths, order=order, progress=progress)
@@ -71,6 +71,35 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
         if places.count(place) > 1:
             raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
     return paths
+
+
+def _settings_of_estimators(
+    labels: Sequence[str], settings: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label.
+
+    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
+    BadInput where none has, or an estimator refuses it.
+    """
+    chosen: dict[str, dict[str, Any]] = {}
+    known: dict[str, set[str]] = {}
+    for label in labels:
+        own = settings.get(label, {})
+        if not isinstance(own, dict):
+            raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
+        chosen[label] = dict(own)
+        estimator, _ = find_estimator(str(own.get("kind", label)))
+        known[label] = set(estimator.parameters.model_fields)
+    for key in [each for each in settings if each not in chosen]:
+        takers = [label for label in chosen if key in known[label]]
+        if not takers:
+            names = sorted(set(chosen).union(*known.values()))
+            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
+        for label in takers:
+            chosen[label].setdefault(key, settings[key])
+    for label, values in chosen.items():
+        configure(label, values)
+    return chosen
 
 
 def _span(source: LogSource, start_s: float | None, end_s: float | None) -> LogSource:

@@ -1,7 +1,7 @@
 """Experiments: scenario (or real data) x estimators x metrics, one TOML file each."""
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -12,7 +12,8 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from pipeline.ensemble import Progress, no_progress
 from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build
+from recorders.parameters import Parameters, build, describe, merge
+from recorders.recording import Recorder
 from recorders.registry import available, load
 from replay.engine import configure
 from replay.metrics import find_metrics
@@ -98,6 +99,58 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise BadInput(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"{path}: is not readable as TOML ({error})") from None
+
+
+def load_experiment(
+    name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
+) -> tuple[str, Experiment]:
+    """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
+
+    A setting goes to the entry of the experiment or to the estimator that its first word names, else to
+    the scenario's or importer's parameters: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`.
+    """
+    known = shipped("experiments")
+    if not name.endswith(".toml") and name not in known:
+        raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = known.get(name, Path(name))
+    values = read_toml(path)
+    where = f"experiment {name}"
+    own = _settings_of_experiment(build(Experiment, values, where), settings)
+    return path.stem, build(Experiment, {**merge(values, own), **over}, where)
+
+
+def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings where they belong; raises BadInput where one belongs nowhere."""
+    entries = {each.alias or name for name, each in Experiment.model_fields.items()}
+    part, names = _parameters_of_source(experiment)
+    placed: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in entries:
+            place: dict[str, Any] = {key: value}
+        elif key in experiment.estimators:
+            place = {"estimators": {key: value}}
+        elif key in names:
+            place = {part: {"parameters": {key: value}}}
+        else:
+            known = sorted(names | entries | experiment.estimators.keys())
+            raise BadInput(
+                f"--set {key}: no such entry of the experiment, parameter of what it records, "
+                f"or estimator; {choices(key, known)}"
+            )
+        placed = merge(placed, place)
+    return placed
+
+
+def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
+    """Which part of an experiment says where its data come from, and the parameters that this has."""
+    if experiment.import_:
+        part, recorder = "import", experiment.import_.source
+    elif experiment.record:
+        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
+    else:
+        return "", set()
+    described = describe(load("recorders", recorder, Recorder).parameters)
+    return part, {each.name.partition(".")[0] for each in described}
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
