@@ -238,20 +238,22 @@ def test_a_field_left_out_because_it_is_zero_is_zero(tmp_path_factory, rows):
         assert column.tobytes() == np.array([row[name] for row in rows], column.dtype).tobytes()
 
 
-def test_swapped_field_numbers_are_followed(tmp_path):
-    """The description in the file says what a number means, not ours; the bytes have the same layout."""
+@pytest.mark.parametrize("declared", [("range_m", "bearing_rad"), ("bearing_rad", "range_m")], ids=str)
+@pytest.mark.parametrize("numbers", [(3, 4), (4, 3)], ids=str)
+def test_the_description_in_the_file_says_what_a_number_means(tmp_path, declared, numbers):
+    """Fields 3 and 4 are both doubles: every message has our layout, whatever they stand for."""
     description = described(
         "fuselog.RangeBearing",
         ("sensor_time_ns", 1, SFIXED64, "optional"),
         ("target_id", 2, FIXED32, "optional"),
-        ("bearing_rad", 3, DOUBLE, "optional"),
-        ("range_m", 4, DOUBLE, "optional"),
+        (declared[0], numbers[0], DOUBLE, "optional"),
+        (declared[1], numbers[1], DOUBLE, "optional"),
     )
-    payload = CLOCK + TARGET + b"\x19" + struct.pack("<d", 1.0) + b"\x21" + struct.pack("<d", 20.0)
+    payload = CLOCK + TARGET + b"\x19" + struct.pack("<d", 3.0) + b"\x21" + struct.pack("<d", 4.0)
     write_payloads(tmp_path / "run.mcap", "fuselog.RangeBearing", description, [payload] * 3)
     found = read(tmp_path / "run.mcap")
-    assert found["bearing_rad"].tolist() == [1.0] * 3
-    assert found["range_m"].tolist() == [20.0] * 3
+    assert found[declared[0]].tolist() == [numbers[0]] * 3
+    assert found[declared[1]].tolist() == [numbers[1]] * 3
 
 
 def test_unpacked_and_split_vectors_are_whole_vectors(tmp_path):

@@ -18,6 +18,7 @@ from recorders.log import (
     schemas,
     write_log,
 )
+from recorders.log.ahead import THREADS, ahead
 from recorders.log.schemas import SCHEMAS
 from tests.recorders.log_samples import LARGEST_TIME, assert_same, rows_read, some_streams, streams
 
@@ -141,6 +142,22 @@ def test_memory_is_bounded_by_the_block_and_not_by_the_log(path):
     sizes = [len(block["/a"]) for block in read_blocks(open_log(path), ["/a"], block_messages=200)]
     assert sum(sizes) == count
     assert max(sizes) < 500
+
+
+def test_threads_work_a_few_items_ahead_and_no_more():
+    """Else a long log would be in memory as a whole before its first block is used."""
+    begun = []
+
+    def items():
+        for item in range(50):
+            begun.append(item)
+            yield item
+
+    results = ahead(lambda item: -item, items())
+    for item in range(40):
+        assert next(results) == -item
+        assert len(begun) <= item + THREADS + 2
+    assert list(results) == [-item for item in range(40, 50)]
 
 
 def test_an_unknown_topic_is_told_with_those_there_are(path):

@@ -184,6 +184,15 @@ def test_nan_is_refused_where_the_schema_does_not_allow_it():
     assert np.isnan(fix["covariance_m2"]).sum() == 3
 
 
+def test_a_stream_changed_after_it_was_made_is_checked_again(tmp_path):
+    """A filter may put NaN into a column that it did not make; the log is the last place to notice."""
+    stream = make_stream("/r", schemas.RANGE, [1, 2], target_id=[1, 1], range_m=[0.5, 1.5])
+    stream.columns["range_m"][1] = np.nan
+    with pytest.raises(BadInput, match=r"run\.mcap: topic /r: field range_m is NaN in message 1"):
+        write_log(tmp_path / "run.mcap", [stream])
+    assert names_in(tmp_path) == []
+
+
 @pytest.mark.parametrize(
     ("later", "sentence"),
     [
