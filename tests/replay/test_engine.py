@@ -188,7 +188,7 @@ def test_runs_with_other_topics_are_no_ensemble():
 
 def test_names_and_variants_are_checked():
     source = record(0)
-    for name, words in (("ekv", "did you mean ekf"), ("ekf:fast", "has no variants")):
+    for name, words in (("ekv", "did you mean 'ekf'"), ("ekf:fast", "has no variants")):
         with pytest.raises(BadInput, match=words):
             bind(name, [source], {})
     with pytest.raises(BadInput, match="no parameter 'gate'"):
