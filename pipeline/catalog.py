@@ -47,7 +47,8 @@ def metrics() -> list[Entry]:
 
 def experiments() -> list[Entry]:
     """Shipped experiments."""
-    return [_experiment(name, read_toml(path)) for name, path in shipped("experiments").items()]
+    files = shipped("experiments").items()
+    return [_entry(name, partial(_experiment, name, path)) for name, path in files]
 
 
 def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) -> None:
@@ -107,8 +108,8 @@ def _metric(name: str, metric: Metric[Any]) -> Entry:
     return Entry(name, metric.summary, {"judges": metric.judges.__name__})
 
 
-def _experiment(name: str, values: Mapping[str, Any]) -> Entry:
-    experiment = build(Experiment, values, f"experiment {name}")
+def _experiment(name: str, path: Path) -> Entry:
+    experiment = build(Experiment, read_toml(path), f"experiment {name}")
     facts = {"study": experiment.study, "estimators": ", ".join(experiment.estimators)}
     if experiment.record:
         facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"

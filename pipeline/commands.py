@@ -5,6 +5,7 @@ Rerun and matplotlib take long to import: only what draws imports them.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -40,7 +41,7 @@ def replay_logs(
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
-    estimators = _estimator_settings(names, settings)
+    estimators = _settings_of_estimators(names, parse_settings(settings))
     sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
     order: Clock = "log_time" if arrival_order else "publish_time"
     replay_to_logs(sources, estimators, paths, order=order, progress=progress)
@@ -72,31 +73,32 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     return paths
 
 
-def _estimator_settings(names: Sequence[str], settings: Sequence[str]) -> dict[str, dict[str, Any]]:
+def _settings_of_estimators(
+    labels: Sequence[str], settings: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
     """Parameters by estimator label.
 
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
-    BadInput where none has.
+    BadInput where none has, or an estimator refuses it.
     """
-    given = parse_settings(settings)
     chosen: dict[str, dict[str, Any]] = {}
     known: dict[str, set[str]] = {}
-    for name in names:
-        own = given.get(name, {})
+    for label in labels:
+        own = settings.get(label, {})
         if not isinstance(own, dict):
-            raise BadInput(f"--set {name}={own}: expected {name}.PARAMETER=VALUE")
-        chosen[name] = dict(own)
-        estimator, _ = find_estimator(str(own.get("kind", name)))
-        known[name] = set(estimator.parameters.model_fields)
-    for key, value in given.items():
-        takers = [name for name in chosen if key in known[name]]
-        if key not in chosen and not takers:
-            everything = sorted({*chosen, *(each for fields in known.values() for each in fields)})
-            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, everything)}")
-        for name in takers:
-            chosen[name].setdefault(key, value)
-    for name, values in chosen.items():
-        configure(name, values)
+            raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
+        chosen[label] = dict(own)
+        estimator, _ = find_estimator(str(own.get("kind", label)))
+        known[label] = set(estimator.parameters.model_fields)
+    for key in [each for each in settings if each not in chosen]:
+        takers = [label for label in chosen if key in known[label]]
+        if not takers:
+            names = sorted(set(chosen).union(*known.values()))
+            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
+        for label in takers:
+            chosen[label].setdefault(key, settings[key])
+    for label, values in chosen.items():
+        configure(label, values)
     return chosen
 
 
@@ -176,12 +178,7 @@ def _source_path(estimates: Log) -> Path:
 def _check_same_run(estimates: Log, log: Log) -> None:
     """Raise BadInput where estimates are of another run than the log's."""
     of, run = estimates.run, log.run
-    if (
-        of
-        and run
-        and (of.scenario, of.parameters, of.seed, of.run)
-        != (run.scenario, run.parameters, run.seed, run.run)
-    ):
+    if of and run and replace(of, notes={}) != replace(run, notes={}):
         raise BadInput(
             f"{estimates.path}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
             f"{log.path} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
@@ -190,10 +187,12 @@ def _check_same_run(estimates: Log, log: Log) -> None:
 
 def _read_outputs(logs: Sequence[Log]) -> dict[str, Ragged]:
     """The streams of an ensemble's estimates logs."""
-    topics = list(logs[0].topics)
-    for log in logs[1:]:
-        if list(log.topics) != topics:
-            raise BadInput(f"{log.path}: holds other topics than {logs[0].path}; judge it on its own")
+    topics, *others = (
+        [topic for topic in log.topics if topic.startswith("/estimates/")] for log in logs
+    )
+    for log, theirs in zip(logs[1:], others, strict=True):
+        if theirs != topics:
+            raise BadInput(f"{log.path}: other estimates than in {logs[0].path}; judge it on its own")
     read = [LogSource(log).read(topics) for log in logs]
     return {topic: gather([streams[topic] for streams in read]) for topic in topics}
 

@@ -68,13 +68,13 @@ class Replayed:
         sentences = []
         for topic, rows in self.outputs.items():
             if rows.stream.schema.full_name == schemas.FAILURE.full_name:
-                reasons = rows.stream.metadata.get("reasons", "").split("; ")
+                reasons = dict(enumerate(rows.stream.metadata.get("reasons", "").split("; ")))
                 for run, source in enumerate(self.sources):
                     failure = rows.of_run(run)
                     if len(failure) == 0:
                         continue
                     elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
-                    reason = reasons[int(failure["reason"][0])]
+                    reason = reasons.get(int(failure["reason"][0]), "no reason given")
                     what = " ".join(filter(None, split_topic(topic)))
                     sentences.append(f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}")
         return sentences

@@ -115,22 +115,15 @@ def load_experiment(
     path = known.get(name, Path(name))
     values = read_toml(path)
     where = f"experiment {name}"
-    stated = build(Experiment, values, where)
-    return path.stem, build(Experiment, {**merge(values, _assigned(stated, settings)), **over}, where)
+    own = _settings_of_experiment(build(Experiment, values, where), settings)
+    return path.stem, build(Experiment, {**merge(values, own), **over}, where)
 
 
-def _assigned(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings where they belong in an experiment; raises BadInput where one belongs nowhere."""
+def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings where they belong; raises BadInput where one belongs nowhere."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
-    part, recorder, names = "import", "", set()
-    if experiment.import_:
-        recorder = experiment.import_.source
-    elif experiment.record:
-        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
-    if recorder:
-        described = describe(load("recorders", recorder, Recorder).parameters)
-        names = {each.name.partition(".")[0] for each in described}
-    assigned: dict[str, Any] = {}
+    part, names = _parameters_of_source(experiment)
+    placed: dict[str, Any] = {}
     for key, value in settings.items():
         if key in entries:
             place: dict[str, Any] = {key: value}
@@ -144,8 +137,20 @@ def _assigned(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, 
                 f"--set {key}: no such entry of the experiment, parameter of what it records, "
                 f"or estimator; {choices(key, known)}"
             )
-        assigned = merge(assigned, place)
-    return assigned
+        placed = merge(placed, place)
+    return placed
+
+
+def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
+    """Which part of an experiment says where its data come from, and the parameters that this has."""
+    if experiment.import_:
+        part, recorder = "import", experiment.import_.source
+    elif experiment.record:
+        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
+    else:
+        return "", set()
+    described = describe(load("recorders", recorder, Recorder).parameters)
+    return part, {each.name.partition(".")[0] for each in described}
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:

@@ -25,8 +25,8 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
     first_ns, last_ns = log_span_ns(log)
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
-    size_mb = path.stat().st_size / 1e6
-    say(f"{path}: {size_mb:.1f} MB, {duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC")
+    span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
+    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}")
     if log.run:
         _say_run(log.run)
     rows = [
@@ -59,8 +59,8 @@ def _as_json(log: Log) -> dict[str, Any]:
     }
 
 
-def _rate(messages: int | None, duration_s: float) -> float | None:
-    return messages / duration_s if messages is not None and messages > 1 and duration_s > 0 else None
+def _rate(messages: int, duration_s: float) -> float | None:
+    return messages / duration_s if messages > 1 and duration_s > 0 else None
 
 
 def _say_run(run: RunMetadata) -> None:

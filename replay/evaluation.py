@@ -112,7 +112,7 @@ def truth_at(
 
 
 def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float = 0.2) -> Errors | None:
-    """Errors of a Gaussian estimate stream of an ensemble; None where no run has its truth.
+    """Errors of a Gaussian estimate stream of an ensemble; None unless every run has its truth topic.
 
     Raises BadInput where the stream does not say what its components are, or the truth lacks them.
     """

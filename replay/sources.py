@@ -140,10 +140,10 @@ class MemorySource:
     def _in_order(self, topic: str, order: Clock) -> Stream:
         stream = self.streams[topic]
         clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
-        later, after = np.diff(clock), np.diff(stream.position)
-        if np.all((later > 0) | ((later == 0) & (after > 0))):
+        position = stream.position
+        if np.all(clock[1:] >= clock[:-1]) and np.all(position[1:] > position[:-1]):
             return stream
-        return stream.take(np.lexsort((stream.position, clock)))
+        return stream.take(np.lexsort((position, clock)))
 
 
 def log_span_ns(log: Log) -> tuple[int, int]:

@@ -59,6 +59,7 @@ def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
             case.multiplier,
             label,
             mode.mean_nees,
+            float(np.nanmedian(mode.nees)),
             low,
             high,
             mode.rmse_m,
@@ -69,7 +70,17 @@ def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
         for case in cases
         for label, mode in case.modes.items()
     ]
-    columns = ["scenario", "multiplier", "mode", "nees", "nees_low", "nees_high", "rmse_m", "bound_m"]
+    columns = [
+        "scenario",
+        "multiplier",
+        "mode",
+        "nees",
+        "median_nees",
+        "nees_low",
+        "nees_high",
+        "rmse_m",
+        "bound_m",
+    ]
     return pd.DataFrame(rows, columns=[*columns, "far_per_1000", "converged_share"])
 
 

@@ -30,9 +30,13 @@ EFFICIENT = {
     NATIVE: ("efficient", "efficient", "efficient"),
 }
 HEARING = ({1, 4, 5}, {2, 3}, {1, 2, 3})
-# Ellipses "closely match", ranges carry "very little", where areas differ by less.
+# Ellipses "closely match" where their areas differ by less: 100 estimates tell them to 10 %.
+MATCH = 0.15
+# Other measurements add "very little" where they make areas smaller by less.
 CLOSE = 0.2
 NEGLIGIBLE = 0.05
+# A mean NEES beyond this is that of single stray solutions.
+STRAY = 10.0
 
 
 def claims(cases: list[Case], options: AcousticOptions) -> list[Claim]:
@@ -87,10 +91,17 @@ def _efficiency(by_scenario: list[list[Case]], multipliers: list[float]) -> Iter
             yield Claim(
                 f"{label}, scenario {cases[0].number}: NEES in [{low:.2f}, {high:.2f}] at all noises",
                 paper,
-                f"{inside.sum()} of {len(nees)} noises; {nees.min():.2f} to {nees.max():.2f}",
+                f"{inside.sum()} of {len(nees)} noises; {nees.min():.2f} to {nees.max():.2f}"
+                f"{_medians(cases, label) if nees.max() > STRAY else ''}",
                 verdict(_as_said(paper, inside)),
                 "" if inside.all() else f"outside at {_noises(multipliers, ~inside)}",
             )
+
+
+def _medians(cases: list[Case], label: str) -> str:
+    """Means hang on single stray solutions where there are some; medians do not (1.39 if efficient)."""
+    medians = [float(np.nanmedian(case.modes[label].nees)) for case in cases]
+    return f" (medians {min(medians):.2f} to {max(medians):.2f})"
 
 
 def _as_said(paper: str, inside: np.ndarray) -> bool:
@@ -113,7 +124,7 @@ def _ellipses(nominal: list[Case]) -> Iterator[Claim]:
             label: float(ellipse_area(case.modes[label].covariance) / case.modes[label].area_m2)
             for label in EFFICIENT
         }
-        expected = {label: abs(value - 1.0) < CLOSE for label, value in ratio.items()}
+        expected = {label: abs(value - 1.0) < MATCH for label, value in ratio.items()}
         scenario_3 = case.number == 3
         holds = not expected[BEARINGS] and expected[NATIVE] if scenario_3 else all(expected.values())
         yield Claim(

@@ -71,7 +71,7 @@ class Case:
         scene, truth, bound: of scheme 3: what it knows, the true parameters (n,), CRLB (n, n) there.
         error: scheme -> errors (repetitions, runs, its parameters).
         nees, nees_at_estimate: of scheme 3, (repetitions, runs).
-        metrics: of all schemes, as the registered metrics have them.
+        iterations, converged: scheme -> the most iterations of a search, the share that converged.
     """
 
     number: int

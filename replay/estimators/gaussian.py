@@ -3,7 +3,7 @@
 There are two ways to pass a Gaussian through a function: linearisation (extended Kalman filter) and
 sampling (linear regression Kalman filters, the UKF first). A filter is made by `linearised` or `sampled`
 from a family's models and compiled with that family's loop. All of it is scalar loops over small arrays
-that are changed in place and allocated once per run; covariances stay symmetric by construction.
+that are changed in place, in memory made once per core; covariances stay symmetric by construction.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Models(NamedTuple):
 
     Attributes:
         states: n, how many components the state has.
-        motion: (state, control, duration_s) -> the next state, a tuple.
+        motion: (state, control, duration_s) -> the next state, a tuple; it does not wrap angles.
         motion_jacobians: (state, control, duration_s, transition, gain) fills the Jacobians by the
             state (n, n) and by the control (n, controls).
         sensor: (state, target) -> all m components that the sensor can measure, a tuple.

@@ -50,7 +50,11 @@ from replay.sampling.samplers import no_samples
 from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
 USES = 2  # of samples per event: prediction and update
-SENSORS = ("range_bearing", "range", "bearing")
+SENSORS = {
+    "range_bearing": schemas.RANGE_BEARING,
+    "range": schemas.RANGE,
+    "bearing": schemas.BEARING,
+}
 
 
 class DeadReckoningParameters(Parameters):
@@ -109,21 +113,26 @@ class Settings(NamedTuple):
 class Sightings(NamedTuple):
     """The events of all runs in order.
 
-    Odometry has sensor -1 and value (forward, turn); a sighting has value (range, bearing) and, as
-    target, the row of its target on the map, -1 if it is not there.
+    Odometry has sensor -1 and value (forward, turn); a sighting has value (range, bearing), less bias
+    and NaN where the sensor has none. `target` is the row of its target on the map, -1 for none.
     """
 
     offsets: NDArray[np.int64]
     time_ns: NDArray[np.int64]
     sensor: NDArray[np.int64]
     value: Floats
+    target_id: NDArray[np.int64]
     target: NDArray[np.int64]
     is_last: NDArray[np.bool_]
 
 
 class Poses(NamedTuple):
-    """The estimates, as the kernel notes them: run r fills the rows from `end[r]` on, and moves it."""
+    """The estimates, as the kernel notes them; run r has room for rows offsets[r]:offsets[r + 1].
 
+    It has filled those before `end[r]`. `event` says which event a row is of.
+    """
+
+    offsets: NDArray[np.int64]
     end: NDArray[np.int64]
     event: NDArray[np.int64]
     mean: Floats
@@ -133,6 +142,7 @@ class Poses(NamedTuple):
 class Looks(NamedTuple):
     """The innovations, as the kernel notes them; see `Poses`."""
 
+    offsets: NDArray[np.int64]
     end: NDArray[np.int64]
     event: NDArray[np.int64]
     difference: Floats
@@ -290,10 +300,12 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
         prior.stream.publish_time_ns[rows],
         np.full(prior.runs, -1),
     )
-    return carried, _landmarks(whole["/landmarks"]), (None,) * prior.runs
+    return carried, _landmarks(whole.get("/landmarks")), (None,) * prior.runs
 
 
-def _landmarks(landmarks: Ragged) -> Landmarks:
+def _landmarks(landmarks: Ragged | None) -> Landmarks:
+    if landmarks is None:
+        return Landmarks(np.empty(0, np.int64), np.empty((0, 2)))
     positions = landmarks["position_m"]
     if len(landmarks) and positions.shape[1] < 2:
         raise BadInput("topic /landmarks: positions in the plane need two coordinates")
@@ -316,27 +328,17 @@ def run(
     """Filter a block; see `replay.engine.Recursive`."""
     before, landmarks, generators = state
     carried = copy.deepcopy(before)
-    order = block.events
-    run_of = np.repeat(np.arange(len(before.failure)), np.diff(order.offsets))
-    target_id = block.column("target_id", missing=0).astype(np.int64)
-    target = _rows_on_map(landmarks, (run_of << 32) + target_id)
-    sensor = order.topic - 1
-    value = np.stack(
-        [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
-    )
-    value[sensor >= 0] -= settings.bias
-    events = Sightings(order.offsets, order.time_ns, sensor, value, target, order.is_last)
-    started = order.time_ns >= before.time_ns[run_of]
-    pose_rows = ragged_rows(order.is_last & started, order.offsets)
-    look_rows = ragged_rows((target >= 0) & started, order.offsets)
-    poses, looks = _no_poses(pose_rows), _no_looks(look_rows)
+    events = _sightings(block, landmarks, settings.bias)
+    started = events.time_ns >= np.repeat(before.time_ns, np.diff(events.offsets))
+    poses = _no_poses(ragged_rows(events.is_last & started, events.offsets))
+    looks = _no_looks(ragged_rows((events.target >= 0) & started, events.offsets))
     loop, memory = _compiled(kind)
     if sampler.redrawn:
         generators = seeded_by_data(generators, before.mean, np.arange(len(before.mean) + 1), seed)
-    for runs, sets in sets_by_runs(sampler, generators, USES * order.offsets):
+    for runs, sets in sets_by_runs(sampler, generators, USES * events.offsets):
         loop(
             runs.stop - runs.start,
-            events._replace(offsets=order.offsets[runs.start : runs.stop + 1]),
+            events._replace(offsets=events.offsets[runs.start : runs.stop + 1]),
             landmarks.positions,
             settings,
             of_runs(carried, runs),
@@ -345,14 +347,28 @@ def run(
             scratch=partial(_scratch, memory, sets),
         )
     return (carried, landmarks, generators), [
-        outputs.poses(poses, pose_rows, events),
-        outputs.innovations(looks, look_rows, events, target_id),
+        outputs.poses(poses, events),
+        outputs.innovations(looks, events),
         outputs.failures(before, carried),
     ]
 
 
 def _scratch(memory: Function, sets: SampleSets) -> tuple[Innovation, Any]:
     return no_innovation(3, 2), memory(3, 2, 2, sets)
+
+
+def _sightings(block: Block, landmarks: Landmarks, bias: Floats) -> Sightings:
+    offsets, time_ns, topic, _, is_last = block.events
+    sensor = topic - 1
+    value = np.stack(
+        [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
+    )
+    value -= np.where(sensor[:, None] >= 0, bias, 0.0)
+    target_id = block.column("target_id", missing=0).astype(np.int64)
+    run_of = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    target = _rows_on_map(landmarks, (run_of << 32) + target_id)
+    target[sensor < 0] = -1
+    return Sightings(offsets, time_ns, sensor, value, target_id, target, is_last)
 
 
 def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -365,19 +381,24 @@ def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.in
 def _no_poses(offsets: NDArray[np.int64]) -> Poses:
     rows = offsets[-1]
     return Poses(
-        offsets[:-1].copy(), np.empty(rows, np.int64), np.empty((rows, 3)), np.empty((rows, 3, 3))
+        offsets,
+        offsets[:-1].copy(),
+        event=np.empty(rows, np.int64),
+        mean=np.empty((rows, 3)),
+        covariance=np.empty((rows, 3, 3)),
     )
 
 
 def _no_looks(offsets: NDArray[np.int64]) -> Looks:
     rows = offsets[-1]
     return Looks(
+        offsets,
         offsets[:-1].copy(),
-        np.empty(rows, np.int64),
-        np.empty((rows, 2)),
-        np.empty((rows, 2, 2)),
-        np.empty(rows),
-        np.empty(rows, np.int64),
+        event=np.empty(rows, np.int64),
+        difference=np.empty((rows, 2)),
+        covariance=np.empty((rows, 2, 2)),
+        squared=np.empty(rows),
+        accepted=np.empty(rows, np.int64),
     )
 
 
@@ -387,9 +408,9 @@ class Outputs(NamedTuple):
     name: str
     truth: str
 
-    def poses(self, poses: Poses, offsets: NDArray[np.int64], events: Sightings) -> Ragged:
+    def poses(self, poses: Poses, events: Sightings) -> Ragged:
         """The estimates at every distinct stamp."""
-        rows, offsets = filled_rows(offsets, poses.end)
+        rows, offsets = filled_rows(poses.offsets, poses.end)
         mean = poses.mean[rows]
         mean[:, 2] = wrap_angle(mean[:, 2])
         return self._ragged(
@@ -402,22 +423,17 @@ class Outputs(NamedTuple):
             covariance=poses.covariance[rows].reshape(-1, 9),
         )
 
-    def innovations(
-        self,
-        looks: Looks,
-        offsets: NDArray[np.int64],
-        events: Sightings,
-        target_id: NDArray[np.int64],
-    ) -> Ragged:
+    def innovations(self, looks: Looks, events: Sightings) -> Ragged:
         """How every sighting of the map fitted."""
-        rows, offsets = filled_rows(offsets, looks.end)
+        rows, offsets = filled_rows(looks.offsets, looks.end)
+        event = looks.event[rows]
         return self._ragged(
             "innovation",
             schemas.INNOVATION,
             offsets,
-            events.time_ns[looks.event[rows]],
+            events.time_ns[event],
             {"components": "range_m,bearing_rad", "kinds": "linear,angle"},
-            target_id=target_id[looks.event[rows]],
+            target_id=events.target_id[event],
             accepted=looks.accepted[rows],
             innovation=looks.difference[rows],
             covariance=looks.covariance[rows].reshape(-1, 4),
@@ -450,18 +466,6 @@ class Outputs(NamedTuple):
         return Ragged(make_stream(topic, schema, time_ns, metadata=metadata, **columns), offsets)
 
 
-def _stated(topic: Topic, name: str, given: float | None) -> float:
-    """A parameter as given, else as the channel's metadata states it."""
-    if given is not None:
-        return given
-    try:
-        return float(topic.metadata[name])
-    except (KeyError, ValueError):
-        raise BadInput(
-            f"topic {topic.name} does not state {name}; give it with --set {name}=..."
-        ) from None
-
-
 def _bind(
     name: str,
     topics: Mapping[str, Topic],
@@ -472,60 +476,71 @@ def _bind(
     seed: int = 0,
 ) -> list[Bound]:
     """One filter for every robot that has odometry, a prior and, unless it only reckons, a sensor."""
+
+    def has(topic: str, schema: Schema) -> bool:
+        return topic in topics and topics[topic].schema_name == schema.full_name
+
     bound: list[Bound] = []
-    for topic in topics.values():
-        prefix, _, leaf = topic.name.rpartition("/")
-        if leaf != "odometry" or topic.schema_name != schemas.ODOMETRY.full_name:
+    for topic in topics:
+        robot, _, leaf = topic.rpartition("/")
+        whole, sensed = [f"{robot}/prior"], []
+        if leaf != "odometry" or not (
+            has(topic, schemas.ODOMETRY) and has(whole[0], schemas.GAUSSIAN_ESTIMATE)
+        ):
             continue
-        sensed: list[str] = []
         if isinstance(parameters, LocalizationParameters):
-            sensed = [f"{prefix}/{sensor}" for sensor in SENSORS if f"{prefix}/{sensor}" in topics]
-        if f"{prefix}/prior" not in topics or "/landmarks" not in topics:
-            continue
-        if isinstance(parameters, LocalizationParameters) and not sensed:
-            continue
-        settings = _settings(topics, topic, sensed, parameters)
+            sensed = [
+                f"{robot}/{leaf}" for leaf, schema in SENSORS.items() if has(f"{robot}/{leaf}", schema)
+            ]
+            whole.append("/landmarks")
+            if not sensed or not has("/landmarks", schemas.LANDMARK):
+                continue
+        settings = _settings(topics[topic], [topics[each] for each in sensed], parameters)
+        outputs = Outputs(f"{name}{robot}", f"{robot}/truth")
         bound.append(
             Recursive(
-                f"{name}{prefix}",
-                (topic.name, *sensed),
-                (f"{prefix}/prior", "/landmarks"),
-                partial(start, prior_topic=f"{prefix}/prior"),
+                outputs.name,
+                (topic, *sensed),
+                tuple(whole),
+                partial(start, prior_topic=whole[0]),
                 partial(
                     run,
                     kind=kind,
                     sampler=sampler_at(3),
                     seed=seed,
                     settings=settings,
-                    outputs=Outputs(f"{name}{prefix}", f"{prefix}/truth"),
+                    outputs=outputs,
                 ),
             )
         )
     return bound
 
 
-def _settings(
-    topics: Mapping[str, Topic],
-    odometry: Topic,
-    sensed: list[str],
-    parameters: DeadReckoningParameters,
-) -> Settings:
-    density = [
-        _stated(odometry, "forward_noise_density", parameters.forward_noise_density),
-        _stated(odometry, "turn_noise_density", parameters.turn_noise_density),
-    ]
-    variance = np.full((len(sensed), 2), np.nan)
-    bias = np.zeros(2)
-    gate = np.full(3, np.inf)
+def _settings(odometry: Topic, sensors: list[Topic], parameters: DeadReckoningParameters) -> Settings:
+    """What the parameters say and, where they do not, the channels' metadata."""
+
+    def stated(topic: Topic, name: str) -> float:
+        value = getattr(parameters, name)
+        try:
+            value = float(topic.metadata[name]) if value is None else value
+        except (KeyError, ValueError):
+            raise BadInput(
+                f"topic {topic.name} does not state {name}; give it with --set {name}=..."
+            ) from None
+        if not 0 <= value < np.inf:
+            raise BadInput(f"topic {topic.name} states {name} = {value}; it is zero or positive")
+        return value
+
+    density = [stated(odometry, "forward_noise_density"), stated(odometry, "turn_noise_density")]
+    variance = np.full((len(sensors), 2), np.nan)
+    for row, topic in enumerate(sensors):
+        measured = [field.name for field in schemas.SCHEMAS[topic.schema_name]]
+        for column, name in enumerate(("range_m", "bearing_rad")):
+            if name in measured:
+                variance[row, column] = stated(topic, f"sigma_{name}") ** 2
+    bias, gate = np.zeros(2), np.full(3, np.inf)
     if isinstance(parameters, LocalizationParameters):
-        for row, topic in enumerate(sensed):
-            if not topic.endswith("/bearing"):
-                sigma = _stated(topics[topic], "sigma_range_m", parameters.sigma_range_m)
-                variance[row, 0] = sigma**2
-            if not topic.endswith("/range"):
-                sigma = _stated(topics[topic], "sigma_bearing_rad", parameters.sigma_bearing_rad)
-                variance[row, 1] = sigma**2
-        bias = np.array([parameters.bias_range_m, parameters.bias_bearing_rad])
+        bias[:] = parameters.bias_range_m, parameters.bias_bearing_rad
         gate[1:] = chi2.ppf(parameters.gate_probability, [1, 2])
     return Settings(np.array(density), bias, variance, gate)
 
@@ -556,7 +571,7 @@ def bind_robots(
 
 DEAD_RECKONING = Estimator(
     "robot pose from odometry alone",
-    "/landmarks and, per robot, .../odometry and .../prior",
+    "per robot, .../odometry and .../prior",
     DeadReckoningParameters,
     _bind_linearised,
 )

@@ -162,6 +162,24 @@ def test_equal_stamps_keep_the_order_of_the_log_in_memory_too(tmp_path: Path):
     assert_equal(log.read(["/bearing"]), source.read(["/bearing"]))
 
 
+def test_streams_without_messages_are_told_and_stop_no_other_run(tmp_path: Path):
+    """No run with messages is bad input, in memory as from a log; one without beside others is empty."""
+    source = record(0)
+    empty = {
+        topic: stream if topic.endswith("prior") else stream.take(slice(0, 0))
+        for topic, stream in source.streams.items()
+    }
+    with LogWriter(tmp_path / "empty.mcap", source.run) as writer:
+        writer.write(empty.values())
+    silent = MemorySource(empty, source.run, "silent")
+    log = LogSource(open_log(tmp_path / "empty.mcap"))
+    for nothing in (silent, log):
+        with pytest.raises(BadInput, match="no messages on /robot1/odometry"):
+            replayed([nothing])
+    together = replayed([log, source, silent])
+    assert_equal(of_run(together, 1), of_run(replayed([source]), 0))
+
+
 def test_runs_with_other_topics_are_no_ensemble():
     first, second = record(0), record(1, robots=1, range_bearing={"rate_hz": 0.0})
     with pytest.raises(BadInput, match="topic /robot1/range_bearing is not as in run 0"):
@@ -170,7 +188,7 @@ def test_runs_with_other_topics_are_no_ensemble():
 
 def test_names_and_variants_are_checked():
     source = record(0)
-    for name, words in (("ekv", "did you mean ekf"), ("ekf:fast", "has no variants")):
+    for name, words in (("ekv", "did you mean 'ekf'"), ("ekf:fast", "has no variants")):
         with pytest.raises(BadInput, match=words):
             bind(name, [source], {})
     with pytest.raises(BadInput, match="no parameter 'gate'"):

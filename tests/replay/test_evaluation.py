@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.log.streams import empty_stream
 from recorders.recording import Recording
 from replay.blocks import Ragged, gather
 from replay.consistency import normalized_error_squared
@@ -85,7 +86,13 @@ def test_an_exact_stamp_needs_no_neighbour():
 
 
 def test_empty_truth_is_unknown_everywhere():
-    assert np.isnan(at(truth([], []), [1.0, 2.0])).all()
+    """As a log gives it back: its vectors have no width."""
+    none = empty_stream("/truth", schemas.TRUTH_STATE, POSE)
+    assert np.isnan(at(none, [1.0, 2.0])).all()
+    errors = errors_of(gather([estimates([1], [[0, 0, 0]], np.eye(3))]), [source(none)])
+    assert errors is not None
+    assert errors.without_truth == 1
+    assert len(errors.nees) == 0
 
 
 def test_equal_stamps_in_the_truth_divide_nothing_by_zero():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, t
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Stream
+from recorders.log import Clock, Stream, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import bind, collect, replay
@@ -364,6 +364,11 @@ def without(source: MemorySource, topic: str) -> MemorySource:
     return replace(source, streams={k: v for k, v in source.streams.items() if k != topic})
 
 
+def test_dead_reckoning_needs_no_map():
+    source = record(duration_s=2.0)
+    assert len(replayed("dead-reckoning", [without(source, "/landmarks")])["pose"]) == 40
+
+
 def test_what_no_run_can_use_is_bad_input():
     source = record(duration_s=2.0)
     prior = source.streams["/robot1/prior"]
@@ -373,11 +378,24 @@ def test_what_no_run_can_use_is_bad_input():
         with pytest.raises(BadInput, match=words):
             replayed("ekf", [replace(source, streams={**source.streams, "/robot1/prior": stream})])
     odometry = source.streams["/robot1/odometry"]
-    silent = {**source.streams, "/robot1/odometry": replace(odometry, metadata={})}
-    with pytest.raises(BadInput, match="forward_noise_density; give it with --set"):
-        replayed("ekf", [replace(source, streams=silent)])
+    for stated, words in (
+        ({}, "does not state forward_noise_density; give it with --set"),
+        ({"forward_noise_density": "nan"}, "forward_noise_density = nan; it is zero or positive"),
+    ):
+        silent = {**source.streams, "/robot1/odometry": replace(odometry, metadata=stated)}
+        with pytest.raises(BadInput, match=words):
+            replayed("ekf", [replace(source, streams=silent)])
+    landmarks = source.streams["/landmarks"]
+    line = replace(
+        landmarks, columns={**landmarks.columns, "position_m": landmarks["position_m"][:, :1]}
+    )
+    with pytest.raises(BadInput, match="need two coordinates"):
+        replayed("ekf", [replace(source, streams={**source.streams, "/landmarks": line})])
     for topic in ("/landmarks", "/robot1/range_bearing", "/robot1/prior", "/robot1/odometry"):
         with pytest.raises(BadInput, match="does not fit this log: it needs /landmarks"):
             replayed("ekf", [without(source, topic)])
+        foreign = replace(source.streams[topic], schema=schemas.SCAN)
+        with pytest.raises(BadInput, match="does not fit this log"):
+            replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])
     with pytest.raises(BadInput, match="leaves no spread"):
         unscented(3, -3.0)
