@@ -18,6 +18,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
+from replay.consistency import normalized_error_squared
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
@@ -77,24 +78,6 @@ def split_topic(topic: str) -> tuple[str, str]:
     """Estimator and case of an estimate topic: /estimates/ESTIMATOR/CASE.../LEAF."""
     parts = topic.removeprefix("/estimates/").split("/")
     return parts[0], "/".join(parts[1:-1])
-
-
-def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite.
-
-    By the Cholesky factor L of all P at once: it is |L^-1 e|^2.
-    """
-    factor, whitened = np.empty_like(covariance), np.empty_like(error)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        for row in range(error.shape[1]):
-            for column in range(row + 1):
-                known = np.sum(factor[:, row, :column] * factor[:, column, :column], axis=1)
-                entry = covariance[:, row, column] - known
-                diagonal = np.sqrt(np.where(entry > 0, entry, np.nan))
-                factor[:, row, column] = entry / factor[:, column, column] if column < row else diagonal
-            known = np.sum(factor[:, row, :row] * whitened[:, :row], axis=1)
-            whitened[:, row] = (error[:, row] - known) / factor[:, row, row]
-    return np.sum(whitened**2, axis=1)
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
@@ -157,7 +140,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
-    epochs = np.array([source.run.epoch_ns if source.run else 0 for source in sources])
+    epochs = np.array([source.epoch_ns for source in sources])
     covariance = stream["covariance"].reshape(len(stream), size, size)[known]
     return Errors(
         estimator,
@@ -170,7 +153,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         (stream.publish_time_ns - epochs[run])[known] * 1e-9,
         error[known],
         covariance,
-        squared_mahalanobis(error[known], covariance),
+        normalized_error_squared(error[known], covariance),
         int((~known).sum()),
     )
 
@@ -184,6 +167,8 @@ def _reference(
     gap_limit_s: float,
 ) -> Floats:
     truth = source.read([topic])[topic]
+    if len(truth) == 0:
+        return np.full((len(estimates), len(components)), np.nan)
     there = truth.components
     missing = [name for name in components if name not in there]
     if missing:
@@ -251,43 +236,6 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
     table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
     return table
-
-
-def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of the position and of every component over all runs and steps."""
-    values: dict[str, float] = {}
-    if errors.position:
-        squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
-        values["position_rmse_m"] = float(np.sqrt(squared.mean()))
-    for column, name in enumerate(errors.components):
-        if column not in errors.position:
-            quantity, _, unit = name.rpartition("_")
-            rmse = float(np.sqrt(np.mean(errors.error[:, column] ** 2)))
-            values[f"{quantity}_rmse_{unit}"] = rmse
-    return values
-
-
-def consistency(errors: Errors) -> dict[str, float]:
-    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
-    values = {"nees": float(np.nanmean(errors.nees))}
-    if errors.position and len(errors.position) < len(errors.components):
-        block = errors.covariance[:, errors.position][:, :, errors.position]
-        nees = squared_mahalanobis(errors.error[:, errors.position], block)
-        values["position_nees"] = float(np.nanmean(nees))
-    table = step_table(errors)
-    inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
-    values["nees_steps_within_95"] = float(inside.mean())
-    return values
-
-
-def innovation_metrics(innovations: Innovations) -> dict[str, float]:
-    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
-    if len(innovations.squared) == 0:
-        return {}
-    return {
-        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
-        "gated_share": float(1 - innovations.accepted.mean()),
-    }
 
 
 def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:

@@ -6,7 +6,7 @@ whose missing component is NaN.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
@@ -16,8 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Schema, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.planar import (
     drive,
     drive_jacobians,
@@ -26,10 +25,14 @@ from recorders.models.planar import (
     wrap_angle,
 )
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged, filled_rows, ragged_rows
+from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.gaussian import (
+    ALL_WELL,
+    FAILURES,
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
     Filter,
     Floats,
     Function,
@@ -40,16 +43,18 @@ from replay.estimators.gaussian import (
     linearised,
     no_innovation,
     sampled,
-    unscented_points,
 )
+from replay.sampling import Sampler, Sampling
+from replay.sampling.names import Unscented
+from replay.sampling.samplers import no_samples
+from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
+USES = 2  # of samples per event: prediction and update
 SENSORS = {
     "range_bearing": schemas.RANGE_BEARING,
     "range": schemas.RANGE,
     "bearing": schemas.BEARING,
 }
-FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
-ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
 
 
 class DeadReckoningParameters(Parameters):
@@ -170,7 +175,7 @@ def fill_sensor_jacobian(pose: Floats, target: Floats, rows: Floats) -> None:
         rows[1, column] = by_bearing[column]
 
 
-MODELS = Models(drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
+MODELS = Models(3, drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
 
 
 def note_pose(poses: Poses, run: int, event: int, mean: Floats, covariance: Floats) -> None:
@@ -217,13 +222,17 @@ def localization(steps: Filter) -> Function:
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             carried.time_ns[run] = events.time_ns[event]
-            if not predict(mean, covariance, velocity, settings.velocity_density, duration_s, memory):
+            if not predict(
+                mean, covariance, velocity, settings.velocity_density, duration_s, event, memory
+            ):
                 return NOT_POSITIVE_DEFINITE
         if sensor < 0:
             velocity[0], velocity[1] = value[0], value[1]
         elif target >= 0 and duration_s >= 0.0:
             variance = settings.variance[sensor]
-            if not innovate(mean, covariance, positions[target], value, variance, innovation, memory):
+            if not innovate(
+                mean, covariance, positions[target], value, variance, innovation, event, memory
+            ):
                 return NOT_POSITIVE_DEFINITE
             row = note_look(looks, run, event, innovation)
             squared, accepted = correct(mean, covariance, innovation, settings.gate)
@@ -258,6 +267,9 @@ def localization(steps: Filter) -> Function:
     return localize
 
 
+State = tuple[Carried, Landmarks, Generators]
+
+
 @lru_cache(maxsize=8)
 def _compiled(kind: str) -> tuple[Function, Function]:
     """The loop over the runs, and what makes the filter's memory."""
@@ -265,7 +277,7 @@ def _compiled(kind: str) -> tuple[Function, Function]:
     return compile_over_runs(localization(steps), allocates=False), steps.memory
 
 
-def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landmarks]:
+def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
     """The state at every run's prior, and the maps.
 
     Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance,
@@ -288,7 +300,7 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landm
         prior.stream.publish_time_ns[rows],
         np.full(prior.runs, -1),
     )
-    return carried, _landmarks(whole.get("/landmarks"))
+    return carried, _landmarks(whole.get("/landmarks")), (None,) * prior.runs
 
 
 def _landmarks(landmarks: Ragged | None) -> Landmarks:
@@ -304,37 +316,45 @@ def _landmarks(landmarks: Ragged | None) -> Landmarks:
 
 
 def run(
-    state: tuple[Carried, Landmarks],
+    state: State,
     block: Block,
     *,
     kind: str,
-    samples: tuple[Floats, ...],
+    sampler: Sampler,
+    seed: int,
     settings: Settings,
     outputs: "Outputs",
-) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
+) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
-    before, landmarks = state
+    before, landmarks, generators = state
     carried = copy.deepcopy(before)
     events = _sightings(block, landmarks, settings.bias)
     started = events.time_ns >= np.repeat(before.time_ns, np.diff(events.offsets))
     poses = _no_poses(ragged_rows(events.is_last & started, events.offsets))
     looks = _no_looks(ragged_rows((events.target >= 0) & started, events.offsets))
     loop, memory = _compiled(kind)
-    loop(
-        len(before.failure),
-        events,
-        landmarks.positions,
-        settings,
-        carried,
-        poses,
-        looks,
-        scratch=lambda: (no_innovation(3, 2), memory(3, 2, 2, *samples)),
-    )
-    return (carried, landmarks), [
+    if sampler.redrawn:
+        generators = seeded_by_data(generators, before.mean, np.arange(len(before.mean) + 1), seed)
+    for runs, sets in sets_by_runs(sampler, generators, USES * events.offsets):
+        loop(
+            runs.stop - runs.start,
+            events._replace(offsets=events.offsets[runs.start : runs.stop + 1]),
+            landmarks.positions,
+            settings,
+            of_runs(carried, runs),
+            poses._replace(end=poses.end[runs]),
+            looks._replace(end=looks.end[runs]),
+            scratch=partial(_scratch, memory, sets),
+        )
+    return (carried, landmarks, generators), [
         outputs.poses(poses, events),
         outputs.innovations(looks, events),
         outputs.failures(before, carried),
     ]
+
+
+def _scratch(memory: Function, sets: SampleSets) -> tuple[Innovation, Any]:
+    return no_innovation(3, 2), memory(3, 2, 2, sets)
 
 
 def _sightings(block: Block, landmarks: Landmarks, bias: Floats) -> Sightings:
@@ -452,7 +472,8 @@ def _bind(
     parameters: DeadReckoningParameters,
     *,
     kind: str,
-    samples: tuple[Floats, ...] = (),
+    sampler_at: Callable[[int], Sampler],
+    seed: int = 0,
 ) -> list[Bound]:
     """One filter for every robot that has odometry, a prior and, unless it only reckons, a sensor."""
 
@@ -482,7 +503,14 @@ def _bind(
                 (topic, *sensed),
                 tuple(whole),
                 partial(start, prior_topic=whole[0]),
-                partial(run, kind=kind, samples=samples, settings=settings, outputs=outputs),
+                partial(
+                    run,
+                    kind=kind,
+                    sampler=sampler_at(3),
+                    seed=seed,
+                    settings=settings,
+                    outputs=outputs,
+                ),
             )
         )
     return bound
@@ -520,14 +548,25 @@ def _settings(odometry: Topic, sensors: list[Topic], parameters: DeadReckoningPa
 def _bind_linearised(
     name: str, topics: Mapping[str, Topic], parameters: DeadReckoningParameters
 ) -> list[Bound]:
-    return _bind(name, topics, parameters, kind="linearised")
+    return _bind(name, topics, parameters, kind="linearised", sampler_at=no_samples)
 
 
 def _bind_unscented(
     name: str, topics: Mapping[str, Topic], parameters: UnscentedParameters
 ) -> list[Bound]:
-    samples = unscented_points(3, parameters.kappa)
-    return _bind(name, topics, parameters, kind="sampled", samples=samples)
+    sampling = Unscented(kappa=parameters.kappa)
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at)
+
+
+def bind_robots(
+    name: str,
+    topics: Mapping[str, Topic],
+    parameters: LocalizationParameters,
+    sampling: Sampling,
+    seed: int,
+) -> list[Bound]:
+    """Bind the filter with this sampling to every robot of the log; the seed is for randomised ones."""
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at, seed=seed)
 
 
 DEAD_RECKONING = Estimator(

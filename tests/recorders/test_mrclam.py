@@ -12,7 +12,8 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.recording import Recording, import_run
 from replay.engine import bind, collect, replay
-from replay.evaluation import accuracy, consistency, errors_of
+from replay.evaluation import errors_of
+from replay.metrics import accuracy, consistency
 from replay.sources import MemorySource, memory_source
 
 # A set of one robot: two barcodes known, one not; times out of order; comments as in the real files.

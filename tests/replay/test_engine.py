@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording, record_run
 from replay.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
 from replay.engine import Bound, bind, collect, replay
@@ -48,7 +47,7 @@ def bound(sources: list[Source]) -> list[Bound]:
     return [each for name in ESTIMATORS for each in bind(name, sources, {})]
 
 
-def replayed(sources: list[Source], order: Order = "publish_time", **options: int) -> dict[str, Ragged]:
+def replayed(sources: list[Source], order: Clock = "publish_time", **options: int) -> dict[str, Ragged]:
     return collect(replay(sources, bound(sources), order=order, **options))
 
 
@@ -100,7 +99,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[MemorySource, Path]:
 
 
 @pytest.mark.parametrize("order", ["publish_time", "log_time"])
-def test_a_log_in_small_blocks_is_the_recording_in_memory(order: Order, late: tuple[MemorySource, Path]):
+def test_a_log_in_small_blocks_is_the_recording_in_memory(order: Clock, late: tuple[MemorySource, Path]):
     """State carried over block boundaries, and reading, change nothing; small blocks are small."""
     source, path = late
     whole = replayed([source], order)
@@ -163,8 +162,8 @@ def test_equal_stamps_keep_the_order_of_the_log_in_memory_too(tmp_path: Path):
     assert_equal(log.read(["/bearing"]), source.read(["/bearing"]))
 
 
-def test_streams_without_messages_are_an_answer_too(tmp_path: Path):
-    """No odometry, no sightings, no landmarks: no estimates, in memory as from a log, and no error."""
+def test_streams_without_messages_are_told_and_stop_no_other_run(tmp_path: Path):
+    """No run with messages is bad input, in memory as from a log; one without beside others is empty."""
     source = record(0)
     empty = {
         topic: stream if topic.endswith("prior") else stream.take(slice(0, 0))
@@ -173,9 +172,10 @@ def test_streams_without_messages_are_an_answer_too(tmp_path: Path):
     with LogWriter(tmp_path / "empty.mcap", source.run) as writer:
         writer.write(empty.values())
     silent = MemorySource(empty, source.run, "silent")
-    assert all(len(ragged) == 0 for ragged in replayed([silent]).values())
     log = LogSource(open_log(tmp_path / "empty.mcap"))
-    assert all(len(ragged) == 0 for ragged in replayed([log]).values())
+    for nothing in (silent, log):
+        with pytest.raises(BadInput, match="no messages on /robot1/odometry"):
+            replayed([nothing])
     together = replayed([log, source, silent])
     assert_equal(of_run(together, 1), of_run(replayed([source]), 0))
 
@@ -188,7 +188,7 @@ def test_runs_with_other_topics_are_no_ensemble():
 
 def test_names_and_variants_are_checked():
     source = record(0)
-    for name, words in (("ekv", "did you mean ekf"), ("ekf:fast", "has no variants")):
+    for name, words in (("ekv", "did you mean 'ekf'"), ("ekf:fast", "has no variants")):
         with pytest.raises(BadInput, match=words):
             bind(name, [source], {})
     with pytest.raises(BadInput, match="no parameter 'gate'"):

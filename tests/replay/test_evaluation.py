@@ -15,18 +15,16 @@ from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.log.streams import empty_stream
 from recorders.recording import Recording
 from replay.blocks import Ragged, gather
+from replay.consistency import normalized_error_squared
 from replay.evaluation import (
-    accuracy,
     chi_square_interval,
-    consistency,
     error_table,
     errors_of,
-    innovation_metrics,
     innovations_of,
-    squared_mahalanobis,
     step_table,
     truth_at,
 )
+from replay.metrics import accuracy, consistency, innovation
 from replay.sources import MemorySource, memory_source
 
 SECOND = 1_000_000_000
@@ -139,7 +137,11 @@ def test_errors_of_a_known_case():
     assert_array_equal(errors.run, [0, 0, 1])
     assert_array_equal(errors.step, [0, 1, 0])
     assert_allclose(errors.elapsed_s, [0, 5, 12])
-    expected = {"position_rmse_m": np.sqrt(5 / 3), "heading_rmse_rad": np.sqrt((turn**2 + 0.01) / 3)}
+    expected = {
+        "estimates_without_truth": 0,
+        "position_rmse_m": np.sqrt(5 / 3),
+        "heading_rmse_rad": np.sqrt((turn**2 + 0.01) / 3),
+    }
     assert accuracy(errors) == pytest.approx(expected)
     assert consistency(errors)["position_nees"] == pytest.approx((2 / 7 + 16 / 7) / 3)
 
@@ -175,16 +177,16 @@ def test_components_are_matched_by_name():
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
-def test_squared_mahalanobis_is_the_quadratic_form(size: int, seed: int):
+def test_normalized_error_squared_is_the_quadratic_form(size: int, seed: int):
     generator = np.random.default_rng(seed)
     roots = generator.normal(size=(20, size, size)) + 3 * np.eye(size)
     covariance, error = roots @ roots.transpose(0, 2, 1), generator.normal(size=(20, size))
     expected = [e @ np.linalg.inv(p) @ e for e, p in zip(error, covariance, strict=True)]
-    assert_allclose(squared_mahalanobis(error, covariance), expected, rtol=1e-6)
+    assert_allclose(normalized_error_squared(error, covariance), expected, rtol=1e-6)
 
 
 def test_covariances_that_are_none_give_nan_alone():
-    """Singular, indefinite, infinite or NaN: the others are not touched."""
+    """Singular, indefinite or NaN, and none at all where all is unknown: the others are not touched."""
     eye = np.eye(2)
     odd = [
         eye,
@@ -194,8 +196,8 @@ def test_covariances_that_are_none_give_nan_alone():
         np.inf * np.ones((2, 2)),
         np.nan * eye,
     ]
-    found = squared_mahalanobis(np.ones((7, 2)), np.array([*odd, 0.5 * eye]))
-    assert_allclose(found, [2, *[np.nan] * 5, 4], rtol=1e-15)
+    found = normalized_error_squared(np.ones((7, 2)), np.array([*odd, 0.5 * eye]))
+    assert_allclose(found, [2, *[np.nan] * 3, 0, np.nan, 4], rtol=1e-15)
 
 
 # Intervals, tables, innovations.
@@ -265,7 +267,7 @@ def test_innovations_count_the_components_that_were_measured():
     )
     innovations = innovations_of(gather([stream]))
     assert innovations.degrees.tolist() == [2, 1, 2]
-    assert innovation_metrics(innovations) == pytest.approx(
+    assert innovation(innovations) == pytest.approx(
         {"nis_per_component": 53.5 / 5, "gated_share": 1 / 3}
     )
-    assert innovation_metrics(innovations_of(gather([stream.take(slice(0, 0))]))) == {}
+    assert innovation(innovations_of(gather([stream.take(slice(0, 0))]))) == {}

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, t
 
 from recorders.errors import BadInput
-from recorders.log import Stream, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, Stream, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import bind, collect, replay
-from replay.estimators.gaussian import unscented_points
 from replay.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.sampling.samplers import unscented
 from replay.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
@@ -27,7 +26,7 @@ def record(run: int = 0, **parameters: object) -> MemorySource:
 
 
 def replayed(
-    name: str, sources: list[MemorySource], order: Order = "publish_time", **settings: object
+    name: str, sources: list[MemorySource], order: Clock = "publish_time", **settings: object
 ) -> dict[str, Ragged]:
     """The outputs by the last part of their topic: pose, innovation, failure."""
     outputs = collect(replay(sources, bind(name, sources, settings), order=order))
@@ -126,7 +125,7 @@ SENSES = {"range_bearing": [0, 1], "range": [0], "bearing": [1]}
 
 
 def textbook(
-    source: MemorySource, steps: Ekf | Ukf, bias: Floats, gate: float, order: Order
+    source: MemorySource, steps: Ekf | Ukf, bias: Floats, gate: float, order: Clock
 ) -> Textbook:
     robot = {topic.rpartition("/")[2]: stream for topic, stream in source.streams.items()}
     places = dict(zip(robot["landmarks"]["landmark_id"], robot["landmarks"]["position_m"], strict=True))
@@ -177,7 +176,7 @@ def textbook(
     return result
 
 
-def clock(stream: Stream, order: Order) -> NDArray[np.int64]:
+def clock(stream: Stream, order: Clock) -> NDArray[np.int64]:
     return stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
 
 
@@ -191,7 +190,7 @@ RICH = {
 
 @pytest.mark.parametrize("order", ["publish_time", "log_time"])
 @pytest.mark.parametrize(("name", "steps"), [("ekf", Ekf()), ("ukf", Ukf(0.0)), ("ukf", Ukf(0.7))])
-def test_filters_equal_the_textbook(name: str, steps: Ekf | Ukf, order: Order):
+def test_filters_equal_the_textbook(name: str, steps: Ekf | Ukf, order: Clock):
     """All sensors at once with outliers, biases, a gate and a latency, in either order of messages."""
     source = record(**RICH)
     settings = {"kappa": steps.kappa} if isinstance(steps, Ukf) else {}
@@ -398,5 +397,5 @@ def test_what_no_run_can_use_is_bad_input():
         foreign = replace(source.streams[topic], schema=schemas.SCAN)
         with pytest.raises(BadInput, match="does not fit this log"):
             replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])
-    with pytest.raises(BadInput, match="must be positive"):
-        unscented_points(3, -3.0)
+    with pytest.raises(BadInput, match="leaves no spread"):
+        unscented(3, -3.0)

@@ -1,0 +1,119 @@
+"""Where a timeline goes: a file, a live viewer, or both from one pass.
+
+A file appears under its name only when it is whole. A live receiver is asked before anything is sent,
+because Rerun itself waits many seconds for one that is not there, and forever for one that is silent.
+"""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import rerun as rr
+
+from recorders.errors import BadInput
+
+# The first bytes of an HTTP/2 client: its preface and empty settings. A server answers with its own.
+_HTTP2_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
+_SETTINGS = 4
+_ANSWER_S = 2.0
+_FLUSH_S = 60.0
+
+
+@contextmanager
+def open_recording(
+    application_id: str, recording_id: str, *, save: Path | None = None, connect: str | None = None
+) -> Iterator[rr.RecordingStream]:
+    """Open a recording whose rows carry no clock of this machine: the same input is the same content.
+
+    Args:
+        application_id: what the viewer keeps one layout for.
+        recording_id: recordings of one id are one recording to a viewer.
+        save: the .rrd file to write; `SAVE.part` until it is whole.
+        connect: a receiver, `rerun+http://HOST:PORT/proxy`.
+
+    Raises BadInput where neither is given, the file cannot be written, or the receiver is not there or
+    goes away; then no file is left.
+    """
+    sinks: list[rr.GrpcSink | rr.FileSink] = []
+    if connect is not None:
+        _require_receiver(connect)
+        sinks.append(rr.GrpcSink(connect))
+    part = None
+    if save is not None:
+        part = save.with_name(save.name + ".part")
+        _require_writable(part)
+        sinks.append(rr.FileSink(part))
+    if not sinks:
+        raise BadInput("a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both")
+    recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+    try:
+        recording.set_sinks(*sinks)
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        yield recording
+        _finish(recording, save, connect)
+        if part is not None and save is not None:
+            part.replace(save)
+    finally:
+        recording.disconnect()
+        if part is not None:
+            part.unlink(missing_ok=True)
+
+
+def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:
+    """Hand over everything that is still queued, and close."""
+    failure = None
+    try:
+        recording.flush(timeout_sec=_FLUSH_S)
+    except RuntimeError as error:
+        failure = error
+    recording.disconnect()
+    if connect is not None and not _answers(connect):  # which a flush does not always notice
+        raise BadInput(f"--connect {connect}: the receiver went away; start it again") from failure
+    if failure is not None:
+        raise BadInput(f"{save or connect}: the timeline could not be written ({failure})") from failure
+
+
+def _require_writable(part: Path) -> None:
+    try:
+        part.touch()
+    except OSError as error:
+        raise BadInput(
+            f"{part}: cannot be written ({error.strerror}); --save a file in a folder that exists"
+        ) from None
+
+
+def _require_receiver(url: str) -> None:
+    """Raises BadInput unless a receiver answers there."""
+    host, port = _address(url)
+    if host is None or port is None:
+        raise BadInput(
+            f"--connect {url}: expected rerun+http://HOST:PORT/proxy, as a running Rerun viewer shows it"
+        )
+    if not _answers(url):
+        raise BadInput(
+            f"--connect {url}: no Rerun receiver answers there; start one: rerun --port {port}"
+        )
+
+
+def _address(url: str) -> tuple[str | None, int | None]:
+    """Host and port; None where the URL is not that of a receiver."""
+    try:
+        parts = urlsplit(url)
+        is_receiver = parts.scheme == "rerun+http" and parts.path == "/proxy"
+        return (parts.hostname, parts.port) if is_receiver else (None, None)
+    except ValueError:
+        return None, None
+
+
+def _answers(url: str) -> bool:
+    """Whether an HTTP/2 server, as Rerun's receivers are, greets back."""
+    try:
+        with socket.create_connection(_address(url), timeout=_ANSWER_S) as connection:
+            connection.sendall(_HTTP2_GREETING)
+            answer = connection.recv(9)
+    except OSError:
+        return False
+    return len(answer) > 3 and answer[3] == _SETTINGS

@@ -1,0 +1,100 @@
+"""Parameters: what is refused is named; settings nest; descriptions tell what is accepted."""
+
+from typing import Annotated
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field, PositiveFloat, model_validator
+
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters, build, describe, merge, parse_settings
+
+
+class Inner(Parameters):
+    """A table of its own."""
+
+    rate_hz: Annotated[float, Field(ge=0, lt=100)] = 5.0
+    name: str = "a"
+
+
+class Outer(Parameters):
+    """Parameters with a table and what is optional."""
+
+    count: int
+    sigma_m: PositiveFloat | None = None
+    inner: Inner = Inner(rate_hz=7.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> "Outer":
+        if self.count == 13:
+            raise ValueError("count 13 brings bad luck")
+        return self
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({}, "x: parameter 'count' is missing"),
+        ({"count": "many"}, "x: parameter 'count' is 'many'; it should be a valid integer"),
+        ({"count": 1, "cuont": 2}, "x: no parameter 'cuont'; did you mean 'count'?"),
+        ({"count": 1, "zzz": 2}, "x: no parameter 'zzz'; there are: count, sigma_m, inner"),
+        ({"count": 1, "inner": {"rate": 2}}, "x: no parameter 'inner.rate'; did you mean 'rate_hz'?"),
+        ({"count": 1, "inner": {"rate_hz": 100}}, "'inner.rate_hz' is 100; it should be less than 100"),
+        ({"count": 1, "sigma_m": 0}, "'sigma_m' is 0; it should be greater than 0"),
+        ({"count": 1, "sigma_m": float("inf")}, "'sigma_m' is inf; it should be a finite number"),
+        ({"count": 13}, "x: count 13 brings bad luck"),
+    ],
+)
+def test_what_is_wrong_is_named(values: dict[str, object], sentence: str) -> None:
+    with pytest.raises(BadInput) as error:
+        build(Outer, values, "x")
+    assert sentence in str(error.value)
+
+
+def test_a_setting_of_a_table_keeps_its_other_defaults() -> None:
+    """The scenario's own default of the table counts, not the table's."""
+    assert build(Outer, {"count": 1, "inner": {"name": "b"}}, "x").inner == Inner(rate_hz=7.0, name="b")
+
+
+def test_descriptions_have_full_names_defaults_and_bounds() -> None:
+    described = {
+        each.name: (each.default, each.accepts) for each in describe(Outer, {"inner": {"name": "c"}})
+    }
+    assert described == {
+        "count": (None, "integer"),
+        "sigma_m": (None, "number > 0 or none"),
+        "inner.rate_hz": (7.0, "number >= 0 < 100"),
+        "inner.name": ("c", "string"),
+    }
+
+
+def test_settings_are_toml_and_else_text() -> None:
+    given_settings = ["a.b=1", "a.c=[1.5, 2]", "d=true", "e=some text", "f=2026=1", "a.b=3"]
+    assert parse_settings(given_settings) == {
+        "a": {"b": 3, "c": [1.5, 2]},
+        "d": True,
+        "e": "some text",
+        "f": "2026=1",
+    }
+
+
+Tables = st.recursive(
+    st.integers(), lambda inner: st.dictionaries(st.sampled_from("abc"), inner), max_leaves=8
+)
+
+
+@given(st.dictionaries(st.sampled_from("abc"), Tables), st.dictionaries(st.sampled_from("abc"), Tables))
+def test_merging_is_settled_after_one_time(base: dict[str, object], over: dict[str, object]) -> None:
+    """What was laid over stays; laying it over again changes nothing."""
+    merged = merge(base, over)
+    assert merge(merged, over) == merged
+    assert merge(merged, {}) == merged
+    assert set(merged) == set(base) | set(over)
+
+
+def test_the_nearest_name_is_offered_else_all() -> None:
+    assert choices("efk", ["ekf", "ukf"]) == "did you mean 'ekf'?"
+    assert choices("gate", ["gate_probability", "kappa"]) == "did you mean 'gate_probability'?"
+    assert choices("zzz", ["ekf", "ukf"]) == "there are: ekf, ukf"
+    assert choices("zzz", []) == "there are: none"
