@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
 from replay.estimators.gaussian import (
     Filter,
     Innovation,
@@ -21,8 +20,9 @@ from replay.estimators.gaussian import (
     linearised,
     no_innovation,
     sampled,
-    unscented_points,
 )
+from replay.sampling.samplers import unscented
+from replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)
@@ -90,21 +90,6 @@ def test_is_finite_finds_every_entry(bad: float):
     assert not is_finite(np.ones(2), np.array([[1.0, 0.0], [bad, 1.0]]))
 
 
-@given(st.integers(1, 6), st.floats(-0.9, 3))
-def test_unscented_points_have_the_moments_of_a_standard_gaussian(dimension: int, kappa: float):
-    points, weights = unscented_points(dimension, kappa)
-    assert_allclose(weights.sum(), 1)
-    assert_allclose(weights @ points, 0, atol=1e-12)
-    assert_allclose((weights * points.T) @ points, np.eye(dimension), atol=1e-12)
-
-
-def test_kappa_three_minus_n_has_the_fourth_moment_too():
-    points, weights = unscented_points(2, 1.0)
-    assert_allclose(weights @ points**4, 3)
-    with pytest.raises(BadInput, match="dimension \\+ kappa must be positive, here above -2"):
-        unscented_points(2, -2.0)
-
-
 # Linear models: every filter is exact, whatever its samples.
 
 
@@ -131,7 +116,13 @@ class Linear(NamedTuple):
             rows[:] = self.look
 
         angular = tuple(row == len(self.look) - 1 for row in range(len(self.look)))
-        return Models(motion, motion_jacobians, sensor, sensor_jacobian, angular)
+        return Models(len(self.transition), motion, motion_jacobians, sensor, sensor_jacobian, angular)
+
+
+def one_set(dimension: int, kappa: float) -> SampleSets:
+    """The unscented samples, for every step."""
+    samples = unscented(dimension, kappa)
+    return SampleSets(samples.points[None], samples.weights[None], 0, 0)
 
 
 @pytest.mark.parametrize(("make", "kappa"), [(linearised, None), (sampled, 0.0), (sampled, 1.7)])
@@ -152,12 +143,11 @@ def test_filters_are_exact_for_linear_models_of_any_size(
         0.1 * generator.normal(size=(components, states)),
     )
     memory, predict, innovate = make(linear.models())
-    samples = () if kappa is None else unscented_points(states, kappa)
-    work = memory(states, controls, components, *samples)
+    work = memory(states, controls, components, one_set(states, kappa or 0.0))
     x, p = generator.normal(size=states), positive_definite(generator, states)
     u, density = generator.normal(size=controls), generator.uniform(size=controls)
     mean, covariance = x.copy(), p.copy()
-    assert predict(mean, covariance, u, density, 0.5, work)
+    assert predict(mean, covariance, u, density, 0.5, 0, work)
     gain = 0.5 * linear.control
     p = linear.transition @ p @ linear.transition.T + gain @ np.diag(density**2 / 0.5) @ gain.T
     x = linear.transition @ x + gain @ u
@@ -167,7 +157,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
     measured = linear.look @ (x - target) + 0.1
     measured[-1] += 2 * np.pi  # a turn more is the same angle
     innovation = no_innovation(states, components)
-    assert innovate(mean, covariance, target, measured, variance, innovation, work)
+    assert innovate(mean, covariance, target, measured, variance, innovation, 0, work)
     assert_allclose(innovation.difference, 0.1, atol=1e-9)
     assert_allclose(
         innovation.covariance, linear.look @ p @ linear.look.T + np.diag(variance), atol=1e-9
@@ -178,7 +168,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
 def test_sampling_says_where_the_covariance_is_none():
     linear = Linear(np.eye(2), np.eye(2), np.eye(2))
     memory, predict, innovate = sampled(linear.models())
-    work = memory(2, 2, 2, *unscented_points(2, 0.0))
+    work = memory(2, 2, 2, one_set(2, 0.0))
     one = np.ones(2)
-    assert not predict(np.zeros(2), -np.eye(2), one, one, 1.0, work)
-    assert not innovate(np.zeros(2), -np.eye(2), one, one, one, no_innovation(2, 2), work)
+    assert not predict(np.zeros(2), -np.eye(2), one, one, 1.0, 0, work)
+    assert not innovate(np.zeros(2), -np.eye(2), one, one, one, no_innovation(2, 2), 0, work)
