@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -29,23 +31,18 @@ class Entry:
 
 def scenarios() -> list[Entry]:
     """Recorders, and the scenario files that ship."""
-    entries = _registered("recorders", _recorder)
-    for name, path in shipped("scenarios").items():
-        recorder, values, _ = load_scenario(name)
-        kind = load("recorders", recorder, Recorder).parameters
-        what = read_toml(path).get("title", "")
-        entries.append(Entry(name, what, {"record with": f"fuselog record {name}"}, kind, values))
-    return entries
+    files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
+    return _registered("recorders", Recorder, _recorder) + files
 
 
 def estimators() -> list[Entry]:
     """Estimators with what they need of a log."""
-    return _registered("estimators", _estimator)
+    return _registered("estimators", Estimator, _estimator)
 
 
 def metrics() -> list[Entry]:
     """Metrics that judge estimates."""
-    return _registered("metrics", _metric)
+    return _registered("metrics", Metric, _metric)
 
 
 def experiments() -> list[Entry]:
@@ -69,15 +66,28 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         _print_details(entries[0])
 
 
-def _registered(kind: str, entry: Callable[[str, Any], Entry]) -> list[Entry]:
-    """An entry for every registered name; one that cannot be loaded says why."""
-    entries = []
-    for name in available(kind):
-        try:
-            entries.append(entry(name, load(kind, name)))
-        except BadInput as error:
-            entries.append(Entry(name, str(error)))
-    return entries
+def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
+    """An entry for every registered name."""
+
+    def make(name: str) -> Entry:
+        return described(name, load(kind, name, expected))
+
+    return [_entry(name, partial(make, name)) for name in available(kind)]
+
+
+def _entry(name: str, make: Callable[[], Entry]) -> Entry:
+    """An entry, or where it cannot be had, why."""
+    try:
+        return make()
+    except BadInput as error:
+        return Entry(name, str(error))
+
+
+def _scenario(name: str, path: Path) -> Entry:
+    recorder, values, _ = load_scenario(name)
+    kind = load("recorders", recorder, Recorder).parameters
+    facts = {"record with": f"fuselog record {name}"}
+    return Entry(name, read_toml(path).get("title", ""), facts, kind, values)
 
 
 def _recorder(name: str, recorder: Recorder[Any]) -> Entry:

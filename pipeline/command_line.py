@@ -273,14 +273,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
     try:
-        fuselog(arguments, standalone_mode=False)
+        fuselog(arguments, prog_name="fuselog", standalone_mode=False)
         print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         return 2
     except click.ClickException as error:
-        where = getattr(error, "ctx", None)
-        hint = f"; see {where.command_path} --help" if where else ""
+        context = getattr(error, "ctx", None)
+        hint = f" (see {context.command_path} --help)" if context else ""
         return _fail(error.format_message().rstrip(".") + hint)
     except (click.Abort, KeyboardInterrupt):
         click.echo("fuselog: stopped", err=True)
@@ -306,7 +306,8 @@ def _sentence(error: Exception) -> str:
 
 
 def _fail(sentence: str) -> int:
-    click.echo(f"fuselog: {sentence}", err=True)
+    line = sentence.strip().replace("\n", " ")
+    click.echo(f"fuselog: {line}", err=True)
     return 2
 
 

@@ -1,4 +1,7 @@
-"""What the commands do: the work between the command line and the library."""
+"""What the commands do: the work between the command line and the library.
+
+Rerun and matplotlib take long to import: only what draws imports them.
+"""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,8 +21,6 @@ from replay.blocks import Ragged, gather
 from replay.engine import configure, find_estimator
 from replay.metrics import find_metrics, measure
 from replay.sources import LogSource, log_span_ns
-from replay.timeline import viewer
-from replay.timeline.show import recorded_outputs, show
 
 
 def replay_logs(
@@ -45,9 +46,9 @@ def replay_logs(
     replay_to_logs(sources, estimators, paths, order=order, progress=progress)
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
+    _print_outcome(replayed, (), as_json=as_json, written=paths)
     if save is not None or connect is not None:
         _show(replayed, save, connect)
-    _print_outcome(replayed, (), as_json=as_json, written=paths)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -209,8 +210,13 @@ def _print_outcome(
     replayed: Replayed, metrics: Sequence[str], *, as_json: bool, written: Sequence[Path]
 ) -> None:
     values = plain(measure(replayed.judged, find_metrics(metrics)))
+    failures = replayed.failures
+    for sentence in failures[:5]:
+        warn(sentence)
+    if len(failures) > 5:
+        warn(f"{len(failures)} failures in all")
     if as_json:
-        print_json({"metrics": values, "written": [str(path) for path in written]})
+        print_json({"metrics": values, "failures": failures, "written": [str(path) for path in written]})
         return
     print_metrics(values)
     for path in written:
@@ -219,6 +225,8 @@ def _print_outcome(
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
     """Draw the first run."""
+    from replay.timeline.show import show
+
     show(replayed.sources[0], replayed.outputs, replayed.errors, save=save, connect=connect)
 
 
@@ -234,6 +242,8 @@ def view_path(
     recover: bool,
 ) -> None:
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    from replay.timeline import viewer
+
     with TemporaryDirectory(prefix="fuselog-view-") as folder:
         rrd = path / "timeline.rrd" if path.is_dir() else path
         if rrd.suffix != ".rrd":
@@ -252,6 +262,8 @@ def _draw_log(
     path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
 ) -> None:
     """Draw a log, or an estimates log together with the log that it is of."""
+    from replay.timeline.show import recorded_outputs, show
+
     log = open_log(path, recover=recover)
     source = LogSource(log)
     outputs = recorded_outputs(source)

@@ -62,6 +62,23 @@ class Replayed:
         ]
         return [*self.errors, *self.innovations, *outputs]
 
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for every run that an estimator could not follow to the end."""
+        sentences = []
+        for topic, rows in self.outputs.items():
+            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
+                reasons = rows.stream.metadata.get("reasons", "").split("; ")
+                for run, source in enumerate(self.sources):
+                    failure = rows.of_run(run)
+                    if len(failure) == 0:
+                        continue
+                    elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
+                    reason = reasons[int(failure["reason"][0])]
+                    what = " ".join(filter(None, split_topic(topic)))
+                    sentences.append(f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}")
+        return sentences
+
 
 def record_ensemble(
     scenario: str,
@@ -90,11 +107,23 @@ def replay_ensemble(
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
+    outputs = replay_in_memory(sources, estimators, order=order, progress=progress)
+    return judge(sources, outputs, gap_limit_s)
+
+
+def replay_in_memory(
+    sources: Sequence[Source],
+    estimators: Settings,
+    *,
+    order: Clock = "publish_time",
+    progress: Progress = no_progress,
+) -> dict[str, Ragged]:
+    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
         outputs |= collect(replay(sources, bound, order=order))
-    return judge(sources, outputs, gap_limit_s)
+    return outputs
 
 
 def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:

@@ -9,7 +9,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -36,6 +36,11 @@ class Claim:
     ours: str
     verdict: Verdict
     why: str = ""
+
+
+def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
+    """A claim that a measured condition confirms or refutes."""
+    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
 
 
 @dataclass
@@ -130,6 +135,7 @@ def _held(folder: Path) -> Iterator[None]:
 
     The lock goes with the process, however that ends, and what it left is cleared here.
     """
+    new_parents = [parent for parent in folder.parents if not parent.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -140,6 +146,9 @@ def _held(folder: Path) -> Iterator[None]:
             yield
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
+            for parent in new_parents:
+                with suppress(OSError):
+                    parent.rmdir()
             raise
     finally:
         os.close(handle)

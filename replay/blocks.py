@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,9 @@ class Events(NamedTuple):
     is_last: NDArray[np.bool_]
 
 
+CarriedType = TypeVar("CarriedType", bound=NamedTuple)
+
+
 class Block(NamedTuple):
     """What an estimator gets at once: a span of its topics, in all runs."""
 
@@ -64,6 +67,12 @@ class Block(NamedTuple):
             found = [name for name in names if name in ragged.stream.columns]
             parts.append(ragged[found[0]] if found else np.full(len(ragged), missing))
         return np.concatenate(parts)[self.events.source]
+
+
+def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
+    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs."""
+    columns: Any = carried
+    return type(carried)(*(column[runs] for column in columns))
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:

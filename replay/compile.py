@@ -23,6 +23,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+from numba.core.errors import NumbaError
 
 from recorders.errors import BadInput
 
@@ -54,29 +55,30 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     # a division by zero gives infinity, which is a failure of its run, and no exception
     inner = "error_model='numpy', forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True"
     bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates})")
-    bundle.add("run_once", run_once)
+    kernel = bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
     text = "\n".join(
         [
             "from __future__ import annotations",
             "import numba",
-            *sorted(bundle.imports - {"import numba as numba"}),
+            *sorted(bundle.imports),
             *bundle.definitions,
             f"@numba.njit(cache=True, nogil=True, _nrt={allocates})",
             f"def loop(first, end, {names}):",
             "    for run in range(first, end):",
-            f"        run_once(run, {names})",
+            f"        {kernel}(run, {names})",
             "",
         ]
     )
-    return partial(_over_runs, _load(text).loop)
+    return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
 
 
 def _over_runs(
-    loop: Callable[..., None],
     runs: int,
     *arguments: Any,
     scratch: Callable[[], Any] | None = None,
+    name: str,
+    loop: Callable[..., None],
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
@@ -84,53 +86,81 @@ def _over_runs(
         loop(first, end, *arguments, *([scratch()] if scratch else []))
 
     cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    if cores <= 1:
-        work(0, runs)
-        return
-    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
-    with ThreadPoolExecutor(cores) as pool:
-        list(pool.map(work, cuts[:-1], cuts[1:]))
+    try:
+        if cores > 1:
+            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+            with ThreadPoolExecutor(cores) as pool:
+                list(pool.map(work, cuts[:-1], cuts[1:]))
+        else:
+            work(0, runs)
+    except NumbaError as error:
+        reason = next(line for line in str(error).splitlines() if not line.startswith("Failed in"))
+        raise BadInput(
+            f"kernel '{name}' does not compile: {reason} "
+            "(a kernel that makes arrays is compiled with allocates=True)"
+        ) from error
 
 
 class _Bundle:
-    """Sources in the order they are needed, and the imports above them."""
+    """Sources in the order they are needed, and the imports above them.
+
+    Everything gets a name of its own: two closures of one function, over different models, are two.
+    """
 
     def __init__(self, decorator: str) -> None:
         self._decorator = decorator
         self.imports: set[str] = set()
         self.definitions: list[str] = []
-        self._values: dict[str, Any] = {}
+        self._names: dict[Any, str] = {}
 
-    def add(self, name: str, value: Any) -> None:
-        """Define `name`, and before it what it needs."""
-        if name in self._values:
-            if self._values[name] is not value:
-                raise BadInput(
-                    f"a kernel reaches two different things called '{name}'; rename one of them"
-                )
-            return
-        self._values[name] = value
+    def add(self, name: str, value: Any) -> str:
+        """Define a value, called `name` where it is used, and before it what it needs; its own name."""
+        value = getattr(value, "py_func", value)  # what numba has compiled is compiled with the rest
+        literal = _literal(value)
+        origin = getattr(value, "__qualname__", "<locals>")
+        if literal is None and "<locals>" in origin and not isinstance(value, FunctionType | ModuleType):
+            raise BadInput(
+                f"a kernel uses '{name}', a {type(value).__name__}, which is neither function, number "
+                "nor tuple, nor can be imported by name: hand it in as an argument"
+            )
+        key = value if literal is None else (name, literal)
+        if key in self._names:
+            return self._names[key]
+        own = self._names[key] = f"{name}_{len(self._names)}"
         if isinstance(value, FunctionType):
-            self._add_function(name, value)
+            self.definitions.append(f"{self._decorator}\n{self._source(own, value)}")
         elif isinstance(value, ModuleType):
-            self.imports.add(f"import {value.__name__} as {name}")
-        elif isinstance(value, bool | int | float | str | tuple):
-            self.definitions.append(f"{name} = {value!r}")
+            self.imports.add(f"import {value.__name__} as {own}")
+        elif literal is not None:
+            self.definitions.append(f"{own} = {literal}")
         else:
-            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {name}")
+            self.imports.add(f"from {value.__module__} import {origin} as {own}")
+        return own
 
-    def _add_function(self, name: str, function: FunctionType) -> None:
-        if name != function.__name__:
-            self.add(function.__name__, function)
-            self.definitions.append(f"{name} = {function.__name__}")
-            return
+    def _source(self, own: str, function: FunctionType) -> str:
         closure = inspect.getclosurevars(function)
-        for needed, value in {**closure.globals, **closure.nonlocals}.items():
-            self.add(needed, value)
-        self.definitions.append(f"{self._decorator}\n{_source(function)}")
+        needed = {**closure.globals, **closure.nonlocals}
+        names = {name: self.add(name, value) for name, value in needed.items()}
+        definition = _definition(function)
+        definition.name = own
+        for node in ast.walk(definition):
+            if isinstance(node, ast.Name):
+                node.id = names.get(node.id, node.id)
+        return ast.unparse(definition)
 
 
-def _source(function: FunctionType) -> str:
+def _literal(value: Any) -> str | None:
+    """A number, text or tuple of these as source; None for anything else."""
+    if isinstance(value, float):
+        return f"float('{float(value)!r}')"  # infinity and NaN too
+    if isinstance(value, tuple):
+        entries = [_literal(entry) for entry in value]
+        return None if None in entries else f"({''.join(f'{entry}, ' for entry in entries)})"
+    return repr(value) if isinstance(value, bool | int | str) else None
+
+
+def _definition(function: FunctionType) -> ast.FunctionDef:
     """A function's source without its decorators and docstring."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
@@ -145,7 +175,7 @@ def _source(function: FunctionType) -> str:
     definition.decorator_list = []
     if ast.get_docstring(definition) is not None:
         definition.body = definition.body[1:]
-    return ast.unparse(definition)
+    return definition
 
 
 @lru_cache(maxsize=64)

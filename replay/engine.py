@@ -100,8 +100,8 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
 
     Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
     """
-    if not re.fullmatch(r"[\w:-]+", label):
-        raise BadInput(f"estimator '{label}': a label is made of letters, digits, '-', '_' and ':'")
+    if not re.fullmatch(r"[\w:=-]+", label):
+        raise BadInput(f"estimator '{label}': a label is made of letters, digits and '-', '_', ':', '='")
     values = dict(settings)
     estimator, variant = find_estimator(str(values.pop("kind", label)))
     return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")

@@ -18,6 +18,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
+from replay.consistency import normalized_error_squared
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
@@ -79,17 +80,6 @@ def split_topic(topic: str) -> tuple[str, str]:
     return parts[0], "/".join(parts[1:-1])
 
 
-def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
-    result = np.full(len(error), np.nan)
-    if error.shape[1] == 0 or len(error) == 0:
-        return result
-    good = np.linalg.eigvalsh(covariance)[:, 0] > 0
-    solved = np.linalg.solve(covariance[good], error[good, :, None])[..., 0]
-    result[good] = np.sum(error[good] * solved, axis=1)
-    return result
-
-
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
     """Where the mean of `runs` chi-square values lies with this probability if all is well."""
     tail = 0.5 * (1 - probability)
@@ -106,6 +96,8 @@ def truth_at(
     """
     times = truth.publish_time_ns
     state = truth["state"]
+    if len(times) == 0:
+        return np.full((len(time_ns), len(kinds)), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
@@ -161,7 +153,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         (stream.publish_time_ns - epochs[run])[known] * 1e-9,
         error[known],
         covariance,
-        squared_mahalanobis(error[known], covariance),
+        normalized_error_squared(error[known], covariance),
         int((~known).sum()),
     )
 

@@ -13,7 +13,8 @@ import numpy as np
 from recorders.log import schemas
 from recorders.registry import available, foreign_code, load
 from replay.blocks import Ragged
-from replay.evaluation import Errors, Floats, Innovations, squared_mahalanobis, step_table
+from replay.consistency import normalized_error_squared
+from replay.evaluation import Errors, Floats, Innovations, step_table
 from replay.sources import Source
 
 
@@ -90,7 +91,7 @@ def consistency(errors: Errors) -> dict[str, float]:
     values = {"nees": float(nees.mean())}
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
-        squared = squared_mahalanobis(errors.error[:, errors.position], block)
+        squared = normalized_error_squared(errors.error[:, errors.position], block)
         values["position_nees"] = float(np.nanmean(squared))
     table = step_table(errors)
     inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
@@ -115,7 +116,19 @@ def failures(output: Output) -> dict[str, float]:
     return {"failed_runs": float(np.count_nonzero(np.diff(output.rows.offsets)))}
 
 
+def solution(output: Output) -> dict[str, float]:
+    """How the batch solutions ended: the share that converged, and the most iterations of one."""
+    if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name or len(output.rows) == 0:
+        return {}
+    converged, iterations = output.rows["converged"] != 0, output.rows["iterations"]
+    values = {"converged_share": float(converged.mean())}
+    if converged.any():
+        values["most_iterations"] = float(iterations[converged].max())
+    return values
+
+
 ACCURACY = Metric("RMSE of position and other components against truth", Errors, accuracy)
 CONSISTENCY = Metric("NEES against its chi-square bounds", Errors, consistency)
 INNOVATION = Metric("NIS, and the share of measurements that a gate kept out", Innovations, innovation)
 FAILURES = Metric("how many runs an estimator could not follow to the end", Output, failures)
+SOLUTION = Metric("how many batch solutions converged, and how fast", Output, solution)

@@ -1,8 +1,8 @@
 """Estimators from plain functions: what is alike in all of them, written once.
 
 `recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
-`batch` of one that solves the streams of one run. Both find their topics, once for every robot or other
-prefix that has them, name the outputs, and tell of a run that failed while the others go on.
+`batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix
+that has them, name the outputs, and tell of a run that failed while the others go on.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import ParametersType
-from replay.blocks import Block, Ragged, gather
+from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Batch, Bound, Estimator, Recursive
 
@@ -111,12 +111,37 @@ class Results(NamedTuple):
     target: Integers
 
 
+class Solution(NamedTuple):
+    """How the solutions ended, (n,) each; the cost is what was minimised."""
+
+    iterations: Integers
+    converged: Integers
+    rank: Integers
+    cost: Floats
+
+
 class Estimates(NamedTuple):
-    """What the streams of one run were solved to: stamps (n,), means (n, d), covariances (n, d, d)."""
+    """What streams were solved to: stamps (n,), means (n, d), covariances (n, d, d), how it ended."""
 
     time_ns: Integers
     mean: Floats
     covariance: Floats
+    solution: Solution | None = None
+
+
+class Failure(NamedTuple):
+    """When and why a run failed."""
+
+    time_ns: int
+    reason: str
+
+
+class Solved(NamedTuple):
+    """The estimates of all runs end to end, run r owning offsets[r]:offsets[r + 1]; failures by run."""
+
+    offsets: Integers
+    estimates: Estimates
+    failures: Mapping[int, Failure]
 
 
 def recursive(
@@ -143,7 +168,7 @@ def recursive(
         truth: the topic with the truth of what is estimated.
         measured: the components of the innovations, where `follow` tells of them.
         start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
-            runs. A run has failed where its row in the first of them is NaN.
+            runs. A run has failed where its row in the first of them is not finite.
         follow: follow(run, settings, messages, state, results) takes one run through a block of its
             messages: it changes that run's rows of `state`, and fills `results`, in place.
         compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
@@ -167,7 +192,7 @@ def recursive(
             messages = _messages(block)
             results = outputs.blank(len(messages.time_ns))
             loop()(len(told), settings, messages, state, results)
-            is_lost = np.isnan(np.reshape(state[0], (len(told), -1)).sum(axis=1))
+            is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
             failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
             made = outputs.of_block(messages, results, np.flatnonzero(failing))
             return _Carried(settings, state, told | failing), made
@@ -185,35 +210,63 @@ def batch(
     whole: Mapping[str, Schema],
     components: Components,
     truth: str = "",
-    solve: Callable[[Mapping[str, Stream], ParametersType], Estimates],
+    solve: Callable[[Mapping[str, Ragged], ParametersType], Solved],
 ) -> Estimator[ParametersType]:
-    """An estimator that solves whole streams, run by run.
+    """An estimator that solves whole streams.
 
     Args as for `recursive`, and:
-        solve: solve(streams, parameters) gets one run's streams and whole topics, by the names asked
-            for. Where it raises BadInput or meets a singular matrix, that run has failed; where all
-            do, it is the input that is bad.
+        solve: solve(given, parameters) gets the streams and whole topics of all runs, by the names
+            asked for; `each_run` makes it of a function of one run.
     """
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         outputs = _Outputs(name, _resolved(truth, prefix), components, {})
 
         def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
-            solved: list[Estimates] = []
-            failures: dict[int, _Failure] = {}
-            for run in range(next(iter(given.values())).runs):
-                one = {each: given[found[each].name].of_run(run) for each in found}
-                try:
-                    solved.append(solve(one, values))
-                except (BadInput, np.linalg.LinAlgError) as error:
-                    end_ns = max(one[each].publish_time_ns.max(initial=0) for each in streams)
-                    failures[run] = _Failure(int(end_ns), str(error))
-                    solved.append(outputs.nothing())
-            return outputs.of_runs(solved, failures)
+            return outputs.of_solved(solve({each: given[found[each].name] for each in found}, values))
 
         return Batch(name, _topics(found, streams), _topics(found, whole), solve_all)
 
     return _estimator(summary, parameters, {**streams, **whole}, bind)
+
+
+def each_run(
+    solve: Callable[[Mapping[str, Stream], ParametersType], Estimates],
+) -> Callable[[Mapping[str, Ragged], ParametersType], Solved]:
+    """Solve run by run, for `batch`.
+
+    Where `solve` raises BadInput or meets a singular matrix, that run has failed; where all do, it is
+    the input that is bad.
+    """
+
+    def solve_all(given: Mapping[str, Ragged], parameters: ParametersType) -> Solved:
+        solved: list[Estimates] = []
+        failures: dict[int, Failure] = {}
+        counts = [0]
+        for run in range(next(iter(given.values())).runs):
+            streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+            try:
+                solved.append(solve(streams, parameters))
+                counts.append(len(solved[-1].time_ns))
+            except (BadInput, np.linalg.LinAlgError) as error:
+                end_ns = max(stream.publish_time_ns.max(initial=0) for stream in streams.values())
+                failures[run] = Failure(int(end_ns), str(error))
+                counts.append(0)
+        if not solved:
+            raise BadInput(failures[0].reason)
+        return Solved(np.cumsum(counts), _joined(solved), failures)
+
+    return solve_all
+
+
+def _joined(parts: Sequence[Estimates]) -> Estimates:
+    solutions = [part.solution for part in parts if part.solution]
+    return Estimates(
+        np.concatenate([part.time_ns for part in parts]),
+        np.concatenate([part.mean for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        Solution(*map(np.concatenate, zip(*solutions, strict=True))) if solutions else None,
+    )
 
 
 def bindings(
@@ -270,13 +323,6 @@ class _Carried(NamedTuple):
     told: NDArray[np.bool_]
 
 
-class _Failure(NamedTuple):
-    """When and why a run failed."""
-
-    time_ns: int
-    reason: str
-
-
 def _over_runs(follow: Callable[..., None], runs: int, *arguments: Any) -> None:
     """What `compile_over_runs` makes, in plain Python."""
     for run in range(runs):
@@ -324,14 +370,9 @@ class _Outputs:
             np.zeros(rows, np.int64),
         )
 
-    def nothing(self) -> Estimates:
-        """No estimates."""
-        blank = self.blank(0)
-        return Estimates(np.empty(0, np.int64), blank.mean, blank.covariance)
-
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
         """The outputs of one block; of several estimates at a stamp the last stands."""
-        said = np.isfinite(results.mean.sum(axis=1))
+        said = np.isfinite(results.mean.sum(axis=1) + results.covariance.sum(axis=(1, 2)))
         rows = np.flatnonzero(said)
         run = np.searchsorted(messages.offsets, rows, side="right")
         is_last = np.ones(len(rows), bool)
@@ -343,24 +384,28 @@ class _Outputs:
             begin, end = messages.offsets[run_number : run_number + 2]
             last = np.flatnonzero(said[begin:end]).max(initial=-1)
             ends[index] = min(begin + last + 1, end - 1)
-        failures = [_Failure(int(messages.time_ns[row]), DIVERGED) for row in ends]
+        failures = [Failure(int(messages.time_ns[row]), DIVERGED) for row in ends]
         made = [
             Ragged(self._state(estimates), np.searchsorted(rows, messages.offsets)),
             Ragged(self._failure(failures, [DIVERGED]), np.searchsorted(ends, messages.offsets)),
         ]
         return [*made, self._innovations(messages, results)] if self.measured else made
 
-    def of_runs(self, solved: Sequence[Estimates], failures: Mapping[int, _Failure]) -> list[Ragged]:
-        """The outputs of runs that were solved one by one; raises BadInput where none could be."""
+    def of_solved(self, solved: Solved) -> list[Ragged]:
+        """The outputs of a batch."""
+        offsets, estimates, failures = solved
+        failed = sorted(failures)
         reasons = sorted({failure.reason for failure in failures.values()})
-        if len(failures) == len(solved):
-            raise BadInput(f"estimator {self.name}: {reasons[0]}")
-        runs = range(len(solved))
-        failed = [[failures[run]] if run in failures else [] for run in runs]
-        return [
-            gather([self._state(each) for each in solved]),
-            gather([self._failure(each, reasons) for each in failed]),
+        failure = self._failure([failures[run] for run in failed], reasons)
+        made = [
+            Ragged(self._state(estimates), offsets),
+            Ragged(failure, np.searchsorted(failed, np.arange(len(offsets)))),
         ]
+        if estimates.solution:
+            columns = estimates.solution._asdict()
+            solution = self._stream("solution", schemas.SOLUTION, estimates.time_ns, {}, **columns)
+            made.append(Ragged(solution, offsets))
+        return made
 
     def _state(self, estimates: Estimates) -> Stream:
         mean = np.array(estimates.mean, dtype=float)
@@ -375,7 +420,7 @@ class _Outputs:
             covariance=np.reshape(estimates.covariance, (len(mean), len(self.components) ** 2)),
         )
 
-    def _failure(self, failures: Sequence[_Failure], reasons: Sequence[str]) -> Stream:
+    def _failure(self, failures: Sequence[Failure], reasons: Sequence[str]) -> Stream:
         return self._stream(
             "failure",
             schemas.FAILURE,

@@ -5,10 +5,10 @@ call `localize` and add their own tables, figures and claims.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from pipeline.ensemble import (
     Replayed,
@@ -26,7 +26,9 @@ from recorders.recording import import_run
 from replay.evaluation import Errors, chi_square_interval, error_table, step_table
 from replay.metrics import find_metrics, measure
 from replay.sources import MemorySource, memory_source
-from replay.timeline.show import show
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -39,6 +41,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         progress=setting.progress,
     )
     write_logs(experiment, setting, sources, replayed)
+    from replay.timeline.show import show
+
     show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
     outcome = summarise(replayed, experiment.metrics)
     outcome.input_sha256 = hash_streams(sources)
@@ -94,8 +98,10 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
-def error_figure(judged: list[Errors], case: str) -> Figure:
+def error_figure(judged: list[Errors], case: str) -> "Figure":
     """RMSE, and NEES with its 95 % interval, over time; all runs together."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     quantity, label = _main_quantity(judged[0])

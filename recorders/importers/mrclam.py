@@ -44,8 +44,8 @@ def read(folder: Path, parameters: MrclamParameters) -> Recording:
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: not a folder; give the folder that holds Barcodes.dat")
-    barcodes = _table(folder / "Barcodes.dat", 2)
-    landmarks = _table(folder / "Landmark_Groundtruth.dat", 5)
+    barcodes = _table(folder / "Barcodes.dat", 2, identifiers=(0, 1))
+    landmarks = _table(folder / "Landmark_Groundtruth.dat", 5, identifiers=(0,))
     robots = _robots(folder)
     subject_of = dict(zip(barcodes[:, 1].astype(int), barcodes[:, 0].astype(int), strict=True))
     truths = {robot: _timed(folder / f"Robot{robot}_Groundtruth.dat", 4) for robot in robots}
@@ -83,7 +83,7 @@ def _robot_streams(
 ) -> list[Stream]:
     truth_ns, poses = truth
     odometry_ns, odometry = _timed(folder / f"Robot{robot}_Odometry.dat", 3)
-    seen_ns, seen = _timed(folder / f"Robot{robot}_Measurement.dat", 4)
+    seen_ns, seen = _timed(folder / f"Robot{robot}_Measurement.dat", 4, identifiers=(1,))
     codes = seen[:, 0].astype(int)
     known = np.isin(codes, list(subject_of))
     for code, count in zip(*np.unique(codes[~known], return_counts=True), strict=True):
@@ -129,8 +129,8 @@ def _robot_streams(
     ]
 
 
-def _table(path: Path, columns: int) -> NDArray[np.float64]:
-    """The numbers of one file, (rows, columns)."""
+def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArray[np.float64]:
+    """The numbers of one file, (rows, columns); some columns hold whole numbers of 32 bits."""
     try:
         table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
     except FileNotFoundError:
@@ -142,24 +142,32 @@ def _table(path: Path, columns: int) -> NDArray[np.float64]:
     if table.shape[1] != columns:
         raise BadInput(f"{path}: expected {columns} columns, found {table.shape[1]}")
     numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
-    bad = ~np.isfinite(numbers)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise BadInput(
-            f"{path}: data row {row + 1}, column {column + 1} is {table.iloc[row, column]!r}, no number"
-        )
+    _refuse(~np.isfinite(numbers), path, table, "no number")
+    is_identifier = (numbers >= 0) & (numbers < 2**32) & (numbers == np.floor(numbers))
+    is_identifier[:, [column not in identifiers for column in range(columns)]] = True
+    _refuse(~is_identifier, path, table, "no whole number from zero up")
     return numbers
 
 
-def _timed(path: Path, columns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _refuse(bad: NDArray[np.bool_], path: Path, table: pd.DataFrame, what: str) -> None:
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise BadInput(
+            f"{path}: data row {row + 1}, column {column + 1} is {table.iloc[row, column]}, {what}"
+        )
+
+
+def _timed(
+    path: Path, columns: int, identifiers: tuple[int, ...] = ()
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (n,) in ns and the other columns (n, columns - 1), sorted by time.
 
-    The stamps are read to the millisecond they are printed in: as doubles they are not exact.
+    Stamps are printed to the millisecond, and are not exact as doubles: rounding makes them so again.
     """
-    table = _table(path, columns)
+    table = _table(path, columns, identifiers)
+    bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)
+    _refuse(bad, path, pd.DataFrame(table), "no time in seconds since 1970")
     times_ns = np.rint(table[:, 0] * 1e6).astype(np.int64) * 1000
-    if times_ns.min() < 0:
-        raise BadInput(f"{path}: a time is negative")
     order = np.argsort(times_ns, kind="stable")
     return times_ns[order], table[order, 1:]
 

@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from errno import EIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -48,11 +49,6 @@ class Region:
     def extent(self) -> tuple[int, int]:
         """Where it is in the file, for `read_bytes`."""
         return self.offset, self.length
-
-    @property
-    def key(self) -> str:
-        """What tells this region from others, even after another tool has rewritten the file."""
-        return f"{self.offset}+{self.length}"
 
 
 @dataclass
@@ -109,9 +105,12 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
 
 
 def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
-    """The `length` bytes of `file` from `offset` on."""
+    """The `length` bytes of `file` from `offset` on, which were there when it was opened."""
     file.seek(offset)
-    return file.read(length)
+    found = file.read(length)
+    if len(found) < length:
+        raise OSError(EIO, "it became shorter while it was read")
+    return found
 
 
 def _opened(file: BinaryIO, use_index: bool) -> Container:

@@ -44,9 +44,8 @@ class Layout:
 
     def build(self, stream: Stream, channel_id: int, first_sequence: int) -> NDArray[np.void]:
         """The stream's message records as a structured array (n,)."""
-        records = np.repeat(self.template.view(_opaque(self.dtype.itemsize)), len(stream)).view(
-            self.dtype
-        )
+        rows = np.repeat(self.template.view(_opaque(self.dtype.itemsize)), len(stream))
+        records = rows.view(self.dtype)
         records["mcap channel_id"] = channel_id
         records["mcap sequence"] = np.arange(first_sequence, first_sequence + len(records))
         records["mcap log_time"] = stream.log_time_ns

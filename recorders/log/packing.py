@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recorders.log.chunks import Span
 from recorders.log.layout import windows
 
-_INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
+INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
 
 
 class Chunk(NamedTuple):
@@ -77,7 +77,7 @@ def _indexes(
     found: list[dict[int, bytes]] = [{} for _ in borders[1:]]
     for part, each in zip(parts, offsets, strict=True):
         cuts = np.searchsorted(each, borders)
-        entries = np.empty(len(part), _INDEX_ENTRY)
+        entries = np.empty(len(part), INDEX_ENTRY)
         entries["log_time_ns"] = part["mcap log_time"]
         entries["offset"] = each - np.repeat(borders[:-1], np.diff(cuts))
         for index, begin, end in zip(found, cuts[:-1], cuts[1:], strict=True):

@@ -3,6 +3,7 @@
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import BinaryIO, NamedTuple
@@ -15,7 +16,7 @@ from recorders.log.chunks import Contents, Damaged, Span, open_region
 from recorders.log.container import Region, read_bytes
 from recorders.log.decoding import Decoder
 from recorders.log.opening import Log
-from recorders.log.sealed import PUBLISH_SPANS
+from recorders.log.sealed import PUBLISH_SPANS, noted_span
 from recorders.log.streams import Clock, Stream, check_stream, concatenate
 
 # Beyond every stamp that MCAP can state.
@@ -93,7 +94,7 @@ def read_blocks(
     pending: dict[str, list[Stream]] = {}
     counts: Counter[str] = Counter()
     waiting, threshold = 0, block_messages
-    with _open(log) as file:
+    with _reading(log) as file:
         chosen = _chosen(log, file, topics, window)
         reads = ((ranked, read_bytes(file, *ranked.region.extent)) for ranked in chosen)
         work = partial(_decoded, log, decoders, window)
@@ -115,9 +116,11 @@ def read_blocks(
         _check_counts(log, topics, counts)
 
 
-def _open(log: Log) -> BinaryIO:
+@contextmanager
+def _reading(log: Log) -> Iterator[BinaryIO]:
     try:
-        return log.path.open("rb")
+        with log.path.open("rb") as file:
+            yield file
     except OSError as error:
         raise BadInput(f"{log.path}: cannot be read ({error.strerror})") from error
 
@@ -128,23 +131,21 @@ def _chosen(log: Log, file: BinaryIO, topics: Sequence[str], window: _Window) ->
     chosen = []
     for rank, region in enumerate(log.container.regions):
         if region.channel_ids is None or not wanted.isdisjoint(region.channel_ids):
-            timed = _timed(log, file, region, window.clock)
+            timed = log.container.regions[rank] = _timed(log, file, region, window.clock)
             if window.clock in timed.spans and window.span.meets(timed.spans[window.clock]):
                 chosen.append(_Ranked(rank, timed))
     return sorted(chosen, key=lambda ranked: ranked.region.spans[window.clock].first_ns)
 
 
 def _timed(log: Log, file: BinaryIO, region: Region, clock: Clock) -> Region:
-    """The region with its span of the clock: known, noted by our writer, or found by opening it."""
+    """The region with its span of the clock: known, noted by our writer, or else found by opening it."""
     if clock in region.spans:
         return region
-    noted = log.container.metadata.get(PUBLISH_SPANS, {}).get(region.key)
-    if noted is None:
-        spans = _contents(log, region, read_bytes(file, *region.extent)).spans
-    else:
-        first_ns, last_ns = map(int, noted.split())
-        spans = {clock: Span(first_ns, last_ns)}
-    return replace(region, spans={**region.spans, **spans})
+    noted = noted_span(log.container.metadata.get(PUBLISH_SPANS, {}), *region.extent)
+    if noted is not None:
+        return replace(region, spans={**region.spans, "publish_time": noted})
+    contents = _contents(log, region, read_bytes(file, *region.extent))
+    return replace(region, spans=contents.spans)
 
 
 def _contents(log: Log, region: Region, raw: bytes) -> Contents:

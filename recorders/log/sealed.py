@@ -4,10 +4,10 @@ import json
 import zlib
 from collections.abc import Mapping
 
-from recorders.log.chunks import Damaged
+from recorders.log.chunks import Damaged, Span
 
 OWN_NAMES = "fuselog."
-# The span of publish time of every chunk, as "first last" in ns, by the region's key.
+# When the messages of each chunk were published: what MCAP's index has of log times only.
 PUBLISH_SPANS = f"{OWN_NAMES}publish_spans"
 _SEAL = "crc32"
 
@@ -18,14 +18,27 @@ def seal(pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
-    """The pairs without their checksum, which is compared where the record is ours.
+    """The pairs without their checksum, which is compared; a foreign record as it is.
 
-    Raises Damaged where it is wrong.
+    Raises Damaged where the checksum is wrong.
     """
+    if not name.startswith(OWN_NAMES):
+        return dict(pairs)
     bare = {key: value for key, value in pairs.items() if key != _SEAL}
-    if name.startswith(OWN_NAMES) and pairs.get(_SEAL) != _checksum(bare):
+    if pairs.get(_SEAL) != _checksum(bare):
         raise Damaged(f"its metadata record '{name}' is damaged (the checksum is wrong)")
-    return bare if name.startswith(OWN_NAMES) else dict(pairs)
+    return bare
+
+
+def note_span(offset: int, length: int, span: Span) -> tuple[str, str]:
+    """The pair of `PUBLISH_SPANS` that tells of the chunk at these bytes of the file."""
+    return f"{offset}+{length}", f"{span.first_ns} {span.last_ns}"
+
+
+def noted_span(pairs: Mapping[str, str], offset: int, length: int) -> Span | None:
+    """What `note_span` noted; None where it did not, as in a file that another tool has rewritten."""
+    noted = pairs.get(f"{offset}+{length}")
+    return None if noted is None else Span(*map(int, noted.split()))
 
 
 def _checksum(pairs: Mapping[str, str]) -> str:

@@ -125,7 +125,7 @@ def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generato
     """Drive around the arena on a wavering circle."""
     steps = max(1, round(parameters.duration_s * parameters.odometry_rate_hz))
     step_s = 1.0 / parameters.odometry_rate_hz
-    times_s: NDArray[np.float64] = np.arange(float(steps + 1)) * step_s
+    times_s = np.arange(steps + 1, dtype=np.float64) * step_s
     radius_m = parameters.arena_m * rng.uniform(0.25, 0.35)
     phase, period_s = rng.uniform(0, 2 * np.pi), rng.uniform(12, 20)
     forward = np.full(steps, parameters.speed_mps)

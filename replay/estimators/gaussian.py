@@ -12,17 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
+from replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
 Function = Callable[..., Any]
+
+FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
+ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
 
 
 class Models(NamedTuple):
     """A family's component-first models, and their Jacobians as functions that fill arrays.
 
     Attributes:
+        states: n, how many components the state has.
         motion: (state, control, duration_s) -> the next state, a tuple.
         motion_jacobians: (state, control, duration_s, transition, gain) fills the Jacobians by the
             state (n, n) and by the control (n, controls).
@@ -31,6 +35,7 @@ class Models(NamedTuple):
         angular: for every component of the sensor, whether it is an angle.
     """
 
+    states: int
     motion: Function
     motion_jacobians: Function
     sensor: Function
@@ -63,13 +68,14 @@ class Filter(NamedTuple):
     """The steps of a recursive Gaussian filter, before the Kalman update that `correct` does.
 
     Attributes:
-        memory: (states, controls, components, *samples) -> what the other two work in.
-        predict: (mean, covariance, control, control_density, duration_s, memory) moves mean (n,) and
-            covariance (n, n) in place; the control's noise density is per square root of a second.
-        innovate: (mean, covariance, target, measured, variance, innovation, memory) fills an
+        memory: (states, controls, components, sets) -> what the other two work in.
+        predict: (mean, covariance, control, control_density, duration_s, event, memory) moves mean (n,)
+            and covariance (n, n) in place; the control's noise density is per square root of a second.
+        innovate: (mean, covariance, target, measured, variance, innovation, event, memory) fills an
             `Innovation`; `measured` (m,) is NaN where it has no such component.
 
-    The steps return False where the covariance is not positive definite.
+    The event's number tells a randomised sampling which samples to take. The steps return False where
+    the covariance is not positive definite.
     """
 
     memory: Function
@@ -195,9 +201,14 @@ class LinearMemory(NamedTuple):
 
 def linearised(models: Models) -> Filter:
     """The extended Kalman filter: first-order Taylor expansion at the mean."""
-    motion, motion_jacobians, sensor, sensor_jacobian, angular = models
+    _, motion, motion_jacobians, sensor, sensor_jacobian, angular = models
 
-    def memory(states: int, controls: int, components: int) -> LinearMemory:
+    def memory(
+        states: int,
+        controls: int,
+        components: int,
+        sets: SampleSets,  # noqa: ARG001
+    ) -> LinearMemory:
         return LinearMemory(
             transition=np.empty((states, states)),
             product=np.empty((states, states)),
@@ -211,6 +222,7 @@ def linearised(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
+        event: int,  # noqa: ARG001
         memory: LinearMemory,
     ) -> bool:
         transition, product, gain = memory.transition, memory.product, memory.gain
@@ -239,6 +251,7 @@ def linearised(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
+        event: int,  # noqa: ARG001
         memory: LinearMemory,
     ) -> bool:
         difference, innovation_covariance, cross_covariance = innovation
@@ -261,69 +274,163 @@ def linearised(models: Models) -> Filter:
     return Filter(memory, predict, innovate)
 
 
-def spread(offsets: Floats, factor: Floats, covariance: Floats, points: Floats) -> bool:
-    """Fill the samples' offsets (L, n) from the mean; False where P is not positive definite."""
-    if not cholesky(factor, covariance, len(covariance)):
-        return False
-    for index in range(len(points)):
-        for row in range(len(covariance)):
-            offsets[index, row] = 0.0
-            for k in range(row + 1):
-                offsets[index, row] += factor[row, k] * points[index, k]
-    return True
-
-
-def moments(shift: Floats, covariance: Floats, values: Floats, weights: Floats) -> None:
-    """Fill mean and covariance (d, d) of the first d columns of the values, and centre these."""
-    for row in range(len(covariance)):
-        shift[row] = 0.0
-        for index in range(len(weights)):
-            shift[row] += weights[index] * values[index, row]
-        for index in range(len(weights)):
-            values[index, row] -= shift[row]
-        for column in range(row + 1):
-            entry = 0.0
-            for index in range(len(weights)):
-                entry += weights[index] * values[index, row] * values[index, column]
-            covariance[row, column] = covariance[column, row] = entry
-
-
 class SampleMemory(NamedTuple):
-    """What `sampled` works in, beside the samples (L, n) and their weights (L,)."""
+    """Samples of N(0, I), and what a regression at them works in.
+
+    Attributes:
+        points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
+        factor: (N, N) lower factor of the covariance of state (n) and noise (N - n): the state's block
+            is filled in, the noise's is given, the rest is zero.
+        gain: (n, controls), of control noise.
+        offsets: (N, L) the samples' distances from the mean.
+        sample: (N,).
+        values, shift: (m, L) and (m,), of the function's values.
+        cross: (n, m), for a covariance that is not needed.
+    """
 
     points: Floats
     weights: Floats
+    first: int
+    stride: int
     factor: Floats
     gain: Floats
     offsets: Floats
     sample: Floats
     values: Floats
     shift: Floats
+    cross: Floats
+
+
+def sample_memory(sets: SampleSets, states: int, values: int, controls: int = 0) -> SampleMemory:
+    """Memory for regressions with up to so many values; the noise's part of the factor is zero."""
+    _, count, dimension = sets.points.shape
+    return SampleMemory(
+        *sets,
+        factor=np.zeros((dimension, dimension)),
+        gain=np.empty((states, controls)),
+        offsets=np.empty((dimension, count)),
+        sample=np.empty(dimension),
+        values=np.empty((values, count)),
+        shift=np.empty(values),
+        cross=np.empty((states, values)),
+    )
+
+
+def regression(function: Function, angular: tuple[bool, ...], states: int, noises: int = 0) -> Function:
+    """Statistical linear regression of a component-first `function(z, *arguments)`.
+
+    Its z is the state (n,) and after it the noise, of zero mean, that enters other than by addition.
+    The kernel takes the samples of use number `use`, moves them by mean and covariance, and fills the
+    mean of the values, `memory.shift`, their covariance (m, m) and their covariance (n, m) with the
+    state; False where the state's covariance is not positive definite. Values that are `angular` need
+    no mean of their own: all count as differences from the value at the mean.
+
+    Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF
+    2014, (19)-(24); (24) prints y_{k,i} where the noise sample is meant.
+    """
+    size, values = states + noises, len(angular)  # constants, so that the loops over them are unrolled
+
+    def spread(covariance: Floats, points: Floats, memory: SampleMemory) -> bool:
+        factor, offsets = memory.factor, memory.offsets
+        if not cholesky(factor, covariance, states):
+            return False
+        for row in range(size):
+            for index in range(len(points)):
+                entry = 0.0
+                for k in range(row + 1):
+                    entry += factor[row, k] * points[index, k]
+                offsets[row, index] = entry
+        return True
+
+    def evaluate(mean: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
+        sample, offsets, changes = memory.sample, memory.offsets, memory.values
+        for row in range(size):
+            sample[row] = mean[row] if row < states else 0.0
+        centre = function(sample, *arguments)
+        for index in range(offsets.shape[1]):
+            for row in range(states):
+                sample[row] = mean[row] + offsets[row, index]
+            for row in range(states, size):
+                sample[row] = offsets[row, index]
+            value = function(sample, *arguments)
+            for i in range(values):
+                changes[i, index] = wrap(value[i] - centre[i], angular[i])
+        for i in range(values):
+            memory.shift[i] = centre[i]
+
+    def moments(
+        weights: Floats, memory: SampleMemory, covariance: Floats, cross_covariance: Floats
+    ) -> None:
+        changes, offsets = memory.values, memory.offsets
+        for i in range(values):
+            shift = weighted_sum(weights, changes[i])
+            memory.shift[i] += shift
+            for index in range(len(weights)):
+                changes[i, index] -= shift
+            for j in range(i + 1):
+                covariance[i, j] = covariance[j, i] = weighted_product(weights, changes[i], changes[j])
+            for row in range(states):
+                cross_covariance[row, i] = weighted_product(weights, offsets[row], changes[i])
+
+    def regress(
+        mean: Floats,
+        covariance: Floats,
+        arguments: tuple[Any, ...],
+        value_covariance: Floats,
+        cross_covariance: Floats,
+        use: int,
+        memory: SampleMemory,
+    ) -> bool:
+        chosen = (use - memory.first) * memory.stride
+        if not spread(covariance, memory.points[chosen], memory):
+            return False
+        evaluate(mean, arguments, memory)
+        moments(memory.weights[chosen], memory, value_covariance, cross_covariance)
+        return True
+
+    return regress
+
+
+def weighted_sum(weights: Floats, values: Floats) -> float:
+    """Sum of products, by four partial sums: one addition need not wait for the one before."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = len(weights) - len(weights) % 4
+    for k in range(0, whole, 4):
+        a += weights[k] * values[k]
+        b += weights[k + 1] * values[k + 1]
+        c += weights[k + 2] * values[k + 2]
+        d += weights[k + 3] * values[k + 3]
+    for k in range(whole, len(weights)):
+        a += weights[k] * values[k]
+    return (a + b) + (c + d)
+
+
+def weighted_product(weights: Floats, first: Floats, second: Floats) -> float:
+    """Sum of products of three; see `weighted_sum`."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = len(weights) - len(weights) % 4
+    for k in range(0, whole, 4):
+        a += weights[k] * first[k] * second[k]
+        b += weights[k + 1] * first[k + 1] * second[k + 1]
+        c += weights[k + 2] * first[k + 2] * second[k + 2]
+        d += weights[k + 3] * first[k + 3] * second[k + 3]
+    for k in range(whole, len(weights)):
+        a += weights[k] * first[k] * second[k]
+    return (a + b) + (c + d)
 
 
 def sampled(models: Models) -> Filter:
-    """A linear regression Kalman filter: moments of the function at samples of the Gaussian.
+    """A linear regression Kalman filter, with whatever samples; see `regression`.
 
-    The samples are `points` (L, n) with `weights` (L,), of zero mean and unit covariance, moved to mean
-    and covariance by its Cholesky factor. Values are taken as differences from the value at the mean,
-    so that angles need no mean of their own. The motion noise enters by the control's Jacobian.
+    An event has two uses of samples, prediction and update. The motion noise enters by the control's
+    Jacobian, the sensor's by addition.
     """
-    motion, motion_jacobians, sensor, _, angular = models
+    states, motion, motion_jacobians, sensor, _, angular = models
+    regress_motion = regression(motion, (False,) * states, states)
+    regress_sensor = regression(sensor, angular, states)
 
-    def memory(
-        states: int, controls: int, components: int, points: Floats, weights: Floats
-    ) -> SampleMemory:
-        columns = max(states, components)
-        return SampleMemory(
-            points=points,
-            weights=weights,
-            factor=np.empty((states, states)),
-            gain=np.empty((states, controls)),
-            offsets=np.empty((len(points), states)),
-            sample=np.empty(states),
-            values=np.empty((len(points), columns)),
-            shift=np.empty(columns),
-        )
+    def memory(states: int, controls: int, components: int, sets: SampleSets) -> SampleMemory:
+        return sample_memory(sets, states, max(states, components), controls)
 
     def predict(
         mean: Floats,
@@ -331,23 +438,16 @@ def sampled(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
+        event: int,
         memory: SampleMemory,
     ) -> bool:
-        points, weights, factor, gain, offsets, sample, values, shift = memory
-        if not spread(offsets, factor, covariance, points):
+        arguments, cross = (control, duration_s), memory.cross
+        if not regress_motion(mean, covariance, arguments, covariance, cross, 2 * event, memory):
             return False
-        motion_jacobians(mean, control, duration_s, factor, gain)  # the factor is used up
-        centre = motion(mean, control, duration_s)
-        for index in range(len(offsets)):
-            for row in range(len(mean)):
-                sample[row] = mean[row] + offsets[index, row]
-            moved = motion(sample, control, duration_s)
-            for row in range(len(mean)):
-                values[index, row] = moved[row] - centre[row]
-        moments(shift, covariance, values, weights)
-        add_control_noise(covariance, gain, control_density, duration_s)
+        motion_jacobians(mean, control, duration_s, memory.factor, memory.gain)  # the factor is used up
+        add_control_noise(covariance, memory.gain, control_density, duration_s)
         for row in range(len(mean)):
-            mean[row] = centre[row] + shift[row]
+            mean[row] = memory.shift[row]
         return True
 
     def innovate(
@@ -357,43 +457,15 @@ def sampled(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
+        event: int,
         memory: SampleMemory,
     ) -> bool:
-        points, weights, factor, _, offsets, sample, values, shift = memory
-        difference, innovation_covariance, cross_covariance = innovation
-        if not spread(offsets, factor, covariance, points):
+        _, spread, cross = innovation
+        if not regress_sensor(mean, covariance, (target,), spread, cross, 2 * event + 1, memory):
             return False
-        centre = sensor(mean, target)
-        for index in range(len(offsets)):
-            for row in range(len(mean)):
-                sample[row] = mean[row] + offsets[index, row]
-            seen = sensor(sample, target)
-            for i in range(len(measured)):
-                values[index, i] = wrap(seen[i] - centre[i], angular[i])
-        moments(shift, innovation_covariance, values, weights)
         for i in range(len(measured)):
-            difference[i] = wrap(measured[i] - centre[i] - shift[i], angular[i])
-            innovation_covariance[i, i] += variance[i]
-            for row in range(len(mean)):
-                cross_covariance[row, i] = 0.0
-                for index in range(len(weights)):
-                    cross_covariance[row, i] += weights[index] * offsets[index, row] * values[index, i]
+            innovation.difference[i] = wrap(measured[i] - memory.shift[i], angular[i])
+            innovation.covariance[i, i] += variance[i]
         return True
 
     return Filter(memory, predict, innovate)
-
-
-def unscented_points(dimension: int, kappa: float) -> tuple[Floats, Floats]:
-    """The unscented samples of N(0, I): points (2n + 1, n), the centre first, and weights (2n + 1,).
-
-    Julier and Uhlmann: radius sqrt(n + kappa), centre weight kappa / (n + kappa).
-    Raises BadInput unless n + kappa is positive.
-    """
-    spread = dimension + kappa
-    if not spread > 0:
-        raise BadInput(f"kappa = {kappa}: dimension + kappa must be positive, here above {-dimension}")
-    axes = np.sqrt(spread) * np.eye(dimension)
-    points = np.concatenate([np.zeros((1, dimension)), axes, -axes])
-    weights = np.full(2 * dimension + 1, 0.5 / spread)
-    weights[0] = kappa / spread
-    return points, weights

@@ -6,7 +6,7 @@ whose missing component is NaN.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
@@ -25,10 +25,14 @@ from recorders.models.planar import (
     wrap_angle,
 )
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged, filled_rows, ragged_rows
+from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.gaussian import (
+    ALL_WELL,
+    FAILURES,
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
     Filter,
     Floats,
     Function,
@@ -39,12 +43,14 @@ from replay.estimators.gaussian import (
     linearised,
     no_innovation,
     sampled,
-    unscented_points,
 )
+from replay.sampling import Sampler, Sampling
+from replay.sampling.names import Unscented
+from replay.sampling.samplers import no_samples
+from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
+USES = 2  # of samples per event: prediction and update
 SENSORS = ("range_bearing", "range", "bearing")
-FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
-ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
 
 
 class DeadReckoningParameters(Parameters):
@@ -159,7 +165,7 @@ def fill_sensor_jacobian(pose: Floats, target: Floats, rows: Floats) -> None:
         rows[1, column] = by_bearing[column]
 
 
-MODELS = Models(drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
+MODELS = Models(3, drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
 
 
 def note_pose(poses: Poses, run: int, event: int, mean: Floats, covariance: Floats) -> None:
@@ -206,13 +212,17 @@ def localization(steps: Filter) -> Function:
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             carried.time_ns[run] = events.time_ns[event]
-            if not predict(mean, covariance, velocity, settings.velocity_density, duration_s, memory):
+            if not predict(
+                mean, covariance, velocity, settings.velocity_density, duration_s, event, memory
+            ):
                 return NOT_POSITIVE_DEFINITE
         if sensor < 0:
             velocity[0], velocity[1] = value[0], value[1]
         elif target >= 0 and duration_s >= 0.0:
             variance = settings.variance[sensor]
-            if not innovate(mean, covariance, positions[target], value, variance, innovation, memory):
+            if not innovate(
+                mean, covariance, positions[target], value, variance, innovation, event, memory
+            ):
                 return NOT_POSITIVE_DEFINITE
             row = note_look(looks, run, event, innovation)
             squared, accepted = correct(mean, covariance, innovation, settings.gate)
@@ -247,6 +257,9 @@ def localization(steps: Filter) -> Function:
     return localize
 
 
+State = tuple[Carried, Landmarks, Generators]
+
+
 @lru_cache(maxsize=8)
 def _compiled(kind: str) -> tuple[Function, Function]:
     """The loop over the runs, and what makes the filter's memory."""
@@ -254,10 +267,11 @@ def _compiled(kind: str) -> tuple[Function, Function]:
     return compile_over_runs(localization(steps), allocates=False), steps.memory
 
 
-def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landmarks]:
+def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
     """The state at every run's prior, and the maps.
 
-    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance.
+    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance,
+    or the map is not planar.
     """
     prior = whole[prior_topic]
     rows = prior.offsets[:-1]
@@ -276,28 +290,31 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landm
         prior.stream.publish_time_ns[rows],
         np.full(prior.runs, -1),
     )
-    return carried, _landmarks(whole["/landmarks"])
+    return carried, _landmarks(whole["/landmarks"]), (None,) * prior.runs
 
 
 def _landmarks(landmarks: Ragged) -> Landmarks:
+    positions = landmarks["position_m"]
+    if len(landmarks) and positions.shape[1] < 2:
+        raise BadInput("topic /landmarks: positions in the plane need two coordinates")
     run = np.repeat(np.arange(landmarks.runs), np.diff(landmarks.offsets))
     keys = (run << 32) + landmarks["landmark_id"]
     order = np.argsort(keys, kind="stable")
-    positions = landmarks["position_m"].reshape(len(keys), -1)[:, :2]
-    return Landmarks(keys[order], np.ascontiguousarray(positions[order]))
+    return Landmarks(keys[order], np.ascontiguousarray(positions[order, :2]))
 
 
 def run(
-    state: tuple[Carried, Landmarks],
+    state: State,
     block: Block,
     *,
     kind: str,
-    samples: tuple[Floats, ...],
+    sampler: Sampler,
+    seed: int,
     settings: Settings,
     outputs: "Outputs",
-) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
+) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
-    before, landmarks = state
+    before, landmarks, generators = state
     carried = copy.deepcopy(before)
     order = block.events
     run_of = np.repeat(np.arange(len(before.failure)), np.diff(order.offsets))
@@ -314,21 +331,28 @@ def run(
     look_rows = ragged_rows((target >= 0) & started, order.offsets)
     poses, looks = _no_poses(pose_rows), _no_looks(look_rows)
     loop, memory = _compiled(kind)
-    loop(
-        len(before.failure),
-        events,
-        landmarks.positions,
-        settings,
-        carried,
-        poses,
-        looks,
-        scratch=lambda: (no_innovation(3, 2), memory(3, 2, 2, *samples)),
-    )
-    return (carried, landmarks), [
+    if sampler.redrawn:
+        generators = seeded_by_data(generators, before.mean, np.arange(len(before.mean) + 1), seed)
+    for runs, sets in sets_by_runs(sampler, generators, USES * order.offsets):
+        loop(
+            runs.stop - runs.start,
+            events._replace(offsets=order.offsets[runs.start : runs.stop + 1]),
+            landmarks.positions,
+            settings,
+            of_runs(carried, runs),
+            poses._replace(end=poses.end[runs]),
+            looks._replace(end=looks.end[runs]),
+            scratch=partial(_scratch, memory, sets),
+        )
+    return (carried, landmarks, generators), [
         outputs.poses(poses, pose_rows, events),
         outputs.innovations(looks, look_rows, events, target_id),
         outputs.failures(before, carried),
     ]
+
+
+def _scratch(memory: Function, sets: SampleSets) -> tuple[Innovation, Any]:
+    return no_innovation(3, 2), memory(3, 2, 2, sets)
 
 
 def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -444,7 +468,8 @@ def _bind(
     parameters: DeadReckoningParameters,
     *,
     kind: str,
-    samples: tuple[Floats, ...] = (),
+    sampler_at: Callable[[int], Sampler],
+    seed: int = 0,
 ) -> list[Bound]:
     """One filter for every robot that has odometry, a prior and, unless it only reckons, a sensor."""
     bound: list[Bound] = []
@@ -469,7 +494,8 @@ def _bind(
                 partial(
                     run,
                     kind=kind,
-                    samples=samples,
+                    sampler=sampler_at(3),
+                    seed=seed,
                     settings=settings,
                     outputs=Outputs(f"{name}{prefix}", f"{prefix}/truth"),
                 ),
@@ -507,14 +533,25 @@ def _settings(
 def _bind_linearised(
     name: str, topics: Mapping[str, Topic], parameters: DeadReckoningParameters
 ) -> list[Bound]:
-    return _bind(name, topics, parameters, kind="linearised")
+    return _bind(name, topics, parameters, kind="linearised", sampler_at=no_samples)
 
 
 def _bind_unscented(
     name: str, topics: Mapping[str, Topic], parameters: UnscentedParameters
 ) -> list[Bound]:
-    samples = unscented_points(3, parameters.kappa)
-    return _bind(name, topics, parameters, kind="sampled", samples=samples)
+    sampling = Unscented(kappa=parameters.kappa)
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at)
+
+
+def bind_robots(
+    name: str,
+    topics: Mapping[str, Topic],
+    parameters: LocalizationParameters,
+    sampling: Sampling,
+    seed: int,
+) -> list[Bound]:
+    """Bind the filter with this sampling to every robot of the log; the seed is for randomised ones."""
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at, seed=seed)
 
 
 DEAD_RECKONING = Estimator(

@@ -35,31 +35,38 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
     fusions = scene.outputs_of(case, schemas.SCORE_VECTOR)
-    rows = [rrb.Horizontal(*_draw_fusion(canvas, scene, case, *fusion)) for fusion in fusions]
+    rows = [_draw_fusion(canvas, case, *fusion) for fusion in fusions]
     matched = _draw_matchers(canvas, scene, case)
-    boards: list[rrb.Container] = [*rows, *([rrb.Horizontal(*matched)] if matched else [])]
+    boards: list[rrb.Container | rrb.View] = []
+    if rows:
+        boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), _draw_errors(canvas, scene, case)]
+    if matched:
+        boards.append(rrb.Horizontal(*matched))
     return rrb.Vertical(*boards, name=case or "run")
 
 
-def _draw_fusion(
-    canvas: Canvas, scene: Scene, case: str, estimator: str, stream: Stream
-) -> list[rrb.View]:
-    """Genuine score and greatest impostor score of each probe, score distributions, share of errors."""
+def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> rrb.Container:
+    """Genuine score and greatest impostor score of each probe, and how the scores so far are spread."""
     fused, time_ns = fused_of(stream), stream.publish_time_ns
     root = entity_path("fusion", case, estimator)
     _draw_probes(canvas, f"{root}/scores", fused, time_ns)
-    wrong = _errors_so_far(fused)
-    # a probe's comparisons share a stamp: the last one holds
-    last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
-    canvas.send(f"{root}/errors/share", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
-    canvas.fix(f"{root}/errors/share", LINE(names=["wrong decisions"], colors=[scene.colour(estimator)]))
-    return [
-        plot_view(f"{root}/scores", f"{estimator}: fused score of each probe"),
-        _draw_distribution(
-            canvas, f"{root}/distribution", f"{estimator}: scores so far", fused, time_ns
-        ),
-        plot_view(f"{root}/errors", f"{estimator}: wrong decisions so far (%)"),
-    ]
+    return rrb.Horizontal(
+        plot_view(f"{root}/scores", "Fused score of each probe"),
+        _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
+        name=estimator,
+    )
+
+
+def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
+    """The share of wrong decisions so far of every fusion of a case."""
+    plot = entity_path("errors", case)
+    for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
+        wrong, time_ns = _errors_so_far(fused_of(stream)), stream.publish_time_ns
+        # a probe's comparisons share a stamp: the last one holds
+        last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
+        canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
+        canvas.fix(f"{plot}/{estimator}", LINE(names=[estimator], colors=[scene.colour(estimator)]))
+    return plot_view(plot, "Wrong decisions so far (%)")
 
 
 def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> None:
@@ -87,7 +94,7 @@ def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
 def _errors_so_far(fused: Fused) -> Floats:
     """Per cent of the comparisons so far that were decided wrongly: the mean of both classes' rates.
 
-    A fusion without a threshold is judged at its equal error threshold's place: the midpoint of medians.
+    A fusion without a threshold is judged half-way between the medians of genuine and impostor scores.
     """
     threshold = fused.threshold
     if threshold is None:
@@ -101,11 +108,10 @@ def _errors_so_far(fused: Fused) -> Floats:
     return 50 * np.sum(rates, axis=0)
 
 
-def _draw_distribution(
-    canvas: Canvas, entity: str, name: str, fused: Fused, time_ns: Times
-) -> rrb.BarChartView:
-    """Two histograms of the scores so far, as densities: impostor to the left in each pair of bars."""
-    low, high = np.quantile(fused.score, [0.001, 0.999])
+def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
+    """Two histograms of the scores so far, each of sum 1; what is off the scale is in the end bars."""
+    low = np.quantile(fused.score[~fused.genuine], 0.001)
+    high = np.median(fused.score[fused.genuine])
     edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
     place = np.clip(np.searchsorted(edges, fused.score) - 1, 0, BINS - 1)
     moments = np.unique(np.linspace(0, len(time_ns) - 1, UPDATES).astype(int))
@@ -122,7 +128,9 @@ def _draw_distribution(
                 values=[share], abscissa=[0.5 * (edges[1:] + edges[:-1])], color=[(*colour, 150)]
             )
             canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
-    return rrb.BarChartView(origin=escaped(entity), name=name)
+    return rrb.BarChartView(
+        origin=escaped(entity), name="Scores so far", plot_legend=rrb.PlotLegend(visible=False)
+    )
 
 
 def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:

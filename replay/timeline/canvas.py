@@ -167,7 +167,7 @@ def draw_cases(
     return rrb.Tabs(*layouts, active_tab=scene.cases.index(scene.focus or scene.cases[0]))
 
 
-def beside(board: rrb.Container, plots: Sequence[rrb.View], case: str) -> rrb.Container:
+def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
     """A case's board, and to its right its plots if there are any."""
     columns = [board, rrb.Vertical(*plots)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")

@@ -76,6 +76,12 @@ def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(group == each) for each in np.unique(group)]
 
 
+def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
+    """A point (n, 2) at each time, such as a measurement."""
+    canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
+    canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
     """The way of a point (n, 2): each row the segment from the place before."""
     segments = np.stack([places[:-1], places[1:]], axis=1).astype(np.float32)
@@ -98,7 +104,11 @@ def draw_ellipses(
     canvas: Canvas, entity: str, time_ns: Times, means: Floats, covariances: Floats, stroke: Stroke
 ) -> None:
     """The 95 % ellipse of each Gaussian (n, 2), (n, 2, 2)."""
-    outlines = ellipses(means, covariances)
+    draw_outlines(canvas, entity, time_ns, ellipses(means, covariances), stroke)
+
+
+def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats, stroke: Stroke) -> None:
+    """The outline of a thing at each time, closed or not: (n, vertices, 2), left out where NaN."""
     good = np.isfinite(outlines).all(axis=(1, 2))
     times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
     columns = rr.LineStrips2D.columns(strips=outlines[good].astype(np.float32))

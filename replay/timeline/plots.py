@@ -52,6 +52,12 @@ def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeries
     return [view for part in parts for view in part(canvas, scene, case)]
 
 
+def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Tabs]:
+    """NEES and errors of a case of many components: of each kind of plot one at a time."""
+    kinds = (draw_nees(canvas, scene, case)[::-1], draw_errors(canvas, scene, case))
+    return [rrb.Tabs(*views) for views in kinds if views]
+
+
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """One plot per component of a case: each estimator's error inside its band of +-2 sigma."""
     found = scene.errors_of(case)

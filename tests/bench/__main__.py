@@ -16,7 +16,7 @@ def main() -> None:
         name = path.stem.removeprefix("bench_")
         if not chosen or name in chosen:
             module = importlib.import_module(f"tests.bench.{path.stem}")
-            print_table(name, COLUMNS, module.main())
+            print_table(COLUMNS, module.main(), name)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """How fast filters go through a log beside FilterPy and Stone Soup, measured side by side in one run.
 
-The same log, models and noise for all; that the estimates are equal is asserted. Ours starts from columns
-in memory and ends with the output streams, everything included; the peers get ready-made Python numbers.
+The same log, models and noise for all; that the estimates are equal is asserted. Ours starts from
+columns in memory and ends with the output streams, everything included; the peers get ready-made Python
+numbers.
 Needs the extra `bench`. Run it with `make bench`, or `python -m tests.bench filters`.
 """
 
@@ -10,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,11 +60,11 @@ def main() -> list[Row]:
     log = record(duration_s=300.0, run=0)
     messages, prior = as_messages(log)
     ways: dict[str, Callable[[], Any]] = {
-        "ukf": lambda: ours("ukf", [log]),
-        "ekf": lambda: ours("ekf", [log]),
-        "filterpy ukf": lambda: filterpy_ukf(messages, *prior),
-        "filterpy ekf": lambda: filterpy_ekf(messages, *prior),
-        "stonesoup ukf": lambda: stonesoup_ukf(messages, *prior),
+        "ukf": partial(ours, "ukf", [log]),
+        "ekf": partial(ours, "ekf", [log]),
+        "filterpy ukf": partial(filterpy_ukf, messages, *prior),
+        "filterpy ekf": partial(filterpy_ekf, messages, *prior),
+        "stonesoup ukf": partial(stonesoup_ukf, messages, *prior),
     }
     results = {name: way() for name, way in ways.items()}  # compiles ours as well
     for kind in ("ukf", "ekf"):
@@ -79,7 +81,7 @@ def main() -> list[Row]:
     for runs, duration_s in ((100, 60.0), (1000, 20.0)):
         logs = [record(duration_s, run) for run in range(runs)]
         count = sum(len(log.streams[topic]) for log in logs for topic in ODOMETRY_AND_SIGHTINGS)
-        taken = seconds({kind: lambda kind=kind: ours(kind, logs) for kind in ("ukf", "ekf")})
+        taken = seconds({kind: partial(ours, kind, logs) for kind in ("ukf", "ekf")})
         for kind in ("ukf", "ekf"):
             name = f"{kind.upper()}, {runs} runs together; FilterPy, one"
             rows.append(row(name, count / taken[kind], rate[f"filterpy {kind}"]))

@@ -1,7 +1,7 @@
 """How fast logs are read and written beside the ready-made ways, measured side by side in one run.
 
-It asserts nothing: the numbers of a shared machine move, their ratios within one run are what counts.
-`make bench` calls `main`; run it alone with `python tests/bench/bench_log.py [--memory]`.
+`python -m tests.bench log` prints the ratios. `python tests/bench/bench_log.py` writes and reads ten
+million messages block by block, and prints how much memory that took.
 """
 
 import resource
@@ -143,7 +143,7 @@ def write_with_mcap(path: Path, streams: list[Stream], payloads: list[list[bytes
 
 
 def main() -> list[Row]:
-    """Compare with the mcap library, with Rerun's reader, and the default compression with others."""
+    """Ours beside the mcap library and Rerun's reader, and our default compression beside the others."""
     streams = noisy_streams(MESSAGES, seed=1)
     topics = [stream.topic for stream in streams]
     payloads = serialised(streams)
@@ -177,9 +177,6 @@ def main() -> list[Row]:
             _speeds(f"read: zstd, {name}", reading[0], reading[place]),
             Row(f"bytes per message: zstd, {name}", sizes[0], sizes[place], sizes[0] / sizes[place]),
         ]
-    print(f"{'ten interleaved topics':44}{'ours':>12}{'theirs':>12}{'ratio':>8}")
-    for row in rows:
-        print(f"{row.name:44}{row.ours:12,.0f}{row.theirs:12,.0f}{row.ratio:8.2f}")
     return rows
 
 
@@ -190,7 +187,7 @@ def _speeds(name: str, ours_s: float, theirs_s: float) -> Row:
 
 def memory() -> None:
     """Write and read ten million messages block by block, and print the peak memory of doing so."""
-    subprocess.run([sys.executable, __file__, "in-a-process-of-its-own"], check=True)
+    subprocess.run([sys.executable, __file__], check=True)
 
 
 def _write_and_read_ten_million() -> None:
@@ -221,9 +218,4 @@ def _report(what: str, begin: float) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["in-a-process-of-its-own"]:
-        _write_and_read_ten_million()
-    elif sys.argv[1:] == ["--memory"]:
-        memory()
-    else:
-        main()
+    _write_and_read_ten_million()

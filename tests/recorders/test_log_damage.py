@@ -1,5 +1,6 @@
 """A damaged log is refused with one sentence, or read exactly as far as it is whole; never wrongly."""
 
+import struct
 from collections import Counter
 from io import BytesIO
 
@@ -8,9 +9,10 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
 from mcap.stream_reader import breakup_chunk
+from mcap.writer import CompressionType, Writer
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, open_log, read_streams
+from recorders.log import LogWriter, RunMetadata, open_log, read_streams, schemas
 from tests.recorders.log_samples import assert_same, some_streams
 
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
@@ -64,6 +66,21 @@ def test_what_is_no_log_is_refused(tmp_path):
         assert refusal(tmp_path / name, lambda path: open_log(path, recover=True)).endswith(sentence)
 
 
+def test_a_log_that_vanishes_or_changes_after_it_was_opened_is_told(whole):
+    """Another program may remove or replace a log while it is read."""
+    raw, _, path = whole
+    path.write_bytes(raw)
+    log = open_log(path)
+    path.unlink()
+    assert refusal(log, lambda log: read_streams(log, TOPICS)).endswith("(No such file or directory)")
+    path.write_bytes(raw[:100])
+    assert refusal(log, lambda log: read_streams(log, TOPICS)).endswith(
+        "(it became shorter while it was read)"
+    )
+    path.write_bytes(raw[:20] + raw)
+    assert "is damaged" in refusal(log, lambda log: read_streams(log, TOPICS))
+
+
 def messages_by_chunk(raw: bytes) -> list[tuple[int, Counter]]:
     """Where each chunk ends, and how many messages each topic has up to there, as mcap reads it."""
     ends, topics, counts = [], {}, Counter()
@@ -84,7 +101,7 @@ def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole
     raw, honest, path = whole
     chunks = messages_by_chunk(raw)
     assert len(chunks) > 3
-    for cut in range(len(raw) - 1, 8, -7):
+    for cut in range(len(raw) - 1, 8, -11):
         path.write_bytes(raw[:cut])
         readable = [counts for end, counts in chunks if end <= cut]
         assert f"{len(readable)} whole chunk" in refusal(path)
@@ -101,7 +118,7 @@ def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole
 def test_a_flipped_bit_is_told_or_changes_nothing(whole):
     """Either a sentence, or exactly the log as it was written; with recover no message is another."""
     raw, honest, path = whole
-    for place in range(len(raw) % 7, len(raw), 7):
+    for place in range(len(raw) % 11, len(raw), 11):
         damaged = bytearray(raw)
         damaged[place] ^= 1 << place % 8
         path.write_bytes(damaged)
@@ -158,3 +175,64 @@ def test_many_damages_are_told_in_one_short_sentence(tmp_path):
     statement = open_log(path, recover=True).loss_statement
     assert statement.count("is damaged") == 3
     assert statement.endswith(", and 10 more damages")
+
+
+def without_checksums(path, times=(1, 2, 3)) -> bytearray:
+    """A log of one uncompressed chunk by the mcap library, in which no checksum tells of a damage."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start()
+        schema = writer.register_schema("fuselog.Scan", "protobuf", schemas.SCAN.descriptor_set)
+        channel = writer.register_channel("/scan", "protobuf", schema, {"frame": "map"})
+        for time in times:
+            content = schemas.SCAN.message_class(sensor_time_ns=time, scan_id=time, detections=time)
+            writer.add_message(channel, time, content.SerializeToString(), time)
+        writer.finish()
+    return bytearray(path.read_bytes())
+
+
+def test_what_does_not_fit_together_is_told_without_a_checksum(tmp_path):
+    """Sizes and lengths are compared with what is there, in the chunk and in the records around it."""
+    path = tmp_path / "run.mcap"
+    raw = without_checksums(path)
+    assert everything(path)[2]["/scan"]["scan_id"].tolist() == [1, 2, 3]
+    chunk = raw.index(b"\x06", 40)
+    last_message = raw.rindex(struct.pack("<QQ", 3, 3)) - 15
+    for place, sentence in {
+        chunk + 25: "its size is wrong",  # the chunk's size when uncompressed
+        chunk + 45: "its length is wrong",  # the length of the chunk's data
+        last_message + 1: "a record inside it is not whole",
+        raw.index(b"fuselog.Scan") - 4: "it is not whole",  # the length of the schema's name
+        raw.index(b"frame") - 8: "it is not whole",  # the length of the channel's metadata
+    }.items():
+        damaged = bytearray(raw)
+        damaged[place] += 1
+        path.write_bytes(damaged)
+        assert sentence in refusal(path, everything)
+        log, _, found = everything(path, recover=True)
+        assert sentence in log.loss_statement
+        assert sum(map(len, found.values())) == 0
+
+
+def test_a_number_that_means_two_channels_is_told(tmp_path):
+    """Two logs in one file, say; without a summary nothing else would tell."""
+    path = tmp_path / "run.mcap"
+    raw = without_checksums(path)
+    data = slice(raw.index(b"\x06", 40), raw.index(b"\x0f" + struct.pack("<Q", 4)))
+    other = bytearray(raw[data]).replace(b"/scan", b"/scam")
+    path.write_bytes(raw[: data.stop] + other)
+    assert "it declares channel 1 twice, differently" in refusal(path)
+    log, _, found = everything(path, recover=True)
+    assert "it declares channel 1 twice, differently" in log.loss_statement
+    assert found["/scan"]["scan_id"].tolist() == [1, 2, 3]
+
+
+def test_a_tail_of_zeros_is_lost_and_counted(tmp_path):
+    """What a file system leaves of a file that was growing when the power went."""
+    path = written(tmp_path, "zstd")
+    raw = path.read_bytes()
+    end = messages_by_chunk(raw)[1][0]
+    path.write_bytes(raw[:end] + bytes(5000))
+    assert "it was cut off: its last 5000 bytes hold no whole record; 2 whole chunks are" in refusal(
+        path
+    )

@@ -97,6 +97,26 @@ def test_every_message_index_points_at_its_messages(written):
     assert list(found.values()) == [list(range(len(stream))) for stream in streams.values()]
 
 
+def test_the_chunk_index_tells_where_the_message_indexes_are(written):
+    """Each chunk is followed by its message indexes, one per channel, and these by the next chunk."""
+    path, _ = written
+    raw = path.read_bytes()
+    summary = make_reader(BytesIO(raw)).get_summary()
+    (spans,) = [each for each in summary.metadata_indexes if each.name == "fuselog.publish_spans"]
+    followers = [each.chunk_start_offset for each in summary.chunk_indexes[1:]] + [spans.offset]
+    for entry, follower in zip(summary.chunk_indexes, followers, strict=True):
+        place = entry.chunk_start_offset + entry.chunk_length
+        for channel_id, offset in entry.message_index_offsets.items():
+            opcode, length, found = struct.unpack_from("<BQH", raw, offset)
+            assert (opcode, found, offset) == (Opcode.MESSAGE_INDEX, channel_id, place)
+            place += 9 + length
+        assert (
+            place
+            == follower
+            == entry.chunk_start_offset + entry.chunk_length + entry.message_index_length
+        )
+
+
 def test_plain_protobuf_decodes_the_payload_from_the_description_in_the_file(written):
     """No fuselog, no mcap_protobuf: the FileDescriptorSet in the file is enough."""
     path, streams = written

@@ -116,7 +116,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         from recorders.log import LogWriter
         with LogWriter(sys.argv[1]) as log:
             log.write(some_streams(1, count=20_000))
-            log.write(some_streams(2, count=20_000))
+            log.write(some_streams(2, count=10))
             print("written", flush=True)
             time.sleep(60)
     """
@@ -135,7 +135,7 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
         open_log(part)
     log = open_log(part, recover=True)
     assert "it was cut off" in log.loss_statement
-    first, second = some_streams(1, count=20_000), some_streams(2, count=20_000)
+    first, second = some_streams(1, count=20_000), some_streams(2, count=10)
     found = read_streams(log, [stream.topic for stream in first])
     for one, two in zip(first, second, strict=True):
         both = concatenate([one, two])

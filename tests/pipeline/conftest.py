@@ -1,0 +1,223 @@
+"""What the tests of the command line share: ways to run it, and a folder of good and of broken input."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from pipeline.command_line import main
+from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
+from recorders.recording import record_run
+
+SHORT = ["--set", "duration_s=2"]
+
+
+class Said(NamedTuple):
+    """What a command did: its exit code and its two streams."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """Standard output as JSON."""
+        return json.loads(self.out)
+
+
+def run_here(*arguments: str) -> Said:
+    """The command line in this process: quick, and no warning goes unseen."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main(arguments)
+    return Said(code, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(scope="session")
+def fuselog() -> Callable[..., Said]:
+    """Run a command in this process."""
+    return run_here
+
+
+@pytest.fixture(scope="session")
+def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
+    """Start a command as a process of its own."""
+
+    def start(*arguments: str, **options: Any) -> subprocess.Popen[str]:
+        command = [str(Path(sys.executable).with_name("fuselog")), *arguments]
+        return subprocess.Popen(
+            command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+        )
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of good and of broken input; tests read it and write nothing there."""
+    folder = tmp_path_factory.mktemp("world")
+    with chdir(folder):
+        for command in (
+            ["record", "landmarks", *SHORT, "-o", "log.mcap"],
+            ["record", "landmarks", *SHORT, "--seed", "1", "-o", "other.mcap"],
+            ["record", "landmarks", *SHORT, "--set", "robots=2", "-o", "two-robots.mcap"],
+            [
+                "record",
+                "landmarks",
+                *SHORT,
+                "--set",
+                "range_bearing.sigma_range_m=1",
+                "-o",
+                "noisy.mcap",
+            ],
+            ["replay", "log.mcap", "-e", "ekf"],
+            ["run", "landmarks", *SHORT, "--runs", "2", "--out", "result"],
+        ):
+            assert run_here(*command).code == 0
+        _break_files()
+        _break_streams()
+        _break_results()
+        _write_experiments()
+        _write_mrclam()
+    return folder
+
+
+def _break_files() -> None:
+    whole = Path("log.mcap").read_bytes()
+    Path("empty.mcap").touch()
+    Path("text.mcap").write_text("no log\n")
+    Path("cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    damaged = bytearray(whole)
+    damaged[len(whole) // 3] ^= 0xFF
+    Path("damaged.mcap").write_bytes(damaged)
+    Path("folder").mkdir()
+    Path("moved").mkdir()
+    shutil.copy("log.estimates.mcap", "moved")
+
+
+def _break_streams() -> None:
+    recording, run = record_run("landmarks", {"duration_s": 2.0}, 0)
+    streams = {stream.topic: stream for stream in recording.streams}
+
+    def write(path: str, changes: dict[str, Stream | None]) -> None:
+        changed = {**streams, **changes}
+        write_log(path, [stream for stream in changed.values() if stream is not None], run)
+
+    for topic in (
+        "/robot1/odometry",
+        "/robot1/prior",
+        "/robot1/range_bearing",
+        "/landmarks",
+        "/robot1/truth",
+    ):
+        name = topic.rpartition("/")[2]
+        write(f"no-{name}.mcap", {topic: None})
+        write(f"empty-{name}.mcap", {topic: streams[topic].take(slice(0, 0))})
+    still = [streams["/robot1/odometry"], streams["/robot1/range_bearing"]]
+    write("still.mcap", {stream.topic: stream.take(slice(0, 0)) for stream in still})
+    covariance = -np.eye(3).reshape(1, 9)
+    bad_prior = replace(
+        streams["/robot1/prior"], columns={**streams["/robot1/prior"].columns, "covariance": covariance}
+    )
+    write("bad-prior.mcap", {"/robot1/prior": bad_prior})
+    odometry = streams["/robot1/odometry"]
+    times_ns, noise = odometry.publish_time_ns, odometry.metadata
+    zeros = np.zeros(len(odometry))
+    fields = (Field("sensor_time_ns", "time_ns"), Field("knots", "real"))
+    knots = make_stream(
+        odometry.topic, Schema("Odometry", "", fields), times_ns, metadata=noise, knots=zeros
+    )
+    write("other-fields.mcap", {odometry.topic: knots})
+    bearing = make_stream(odometry.topic, schemas.BEARING, times_ns, target_id=zeros, bearing_rad=zeros)
+    write("other-schema.mcap", {odometry.topic: bearing})
+    _write_elsewhere("nan.mcap", "protobuf")
+    _write_elsewhere("json.mcap", "json")
+
+
+def _write_elsewhere(path: str, encoding: str) -> None:
+    """A log by the official writer, which checks nothing: its odometry is NaN, or JSON."""
+    log = open_log("log.mcap")
+    with Path(path).open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, stream in read_streams(log, list(log.topics)).items():
+            is_odometry = topic == "/robot1/odometry"
+            schema = stream.schema
+            own = encoding if is_odometry else "protobuf"
+            schema_id = writer.register_schema(schema.full_name, own, schema.descriptor_set)
+            channel = writer.register_channel(topic, own, schema_id, dict(stream.metadata))
+            for row, time_ns in enumerate(stream.publish_time_ns.tolist()):
+                values = {name: column[row].tolist() for name, column in stream.columns.items()}
+                if is_odometry:
+                    values["turn_radps"] = float("nan")
+                message = schema.message_class(**values).SerializeToString()
+                data = message if own == "protobuf" else json.dumps(values).encode()
+                writer.add_message(channel, time_ns, data, time_ns)
+        writer.finish()
+
+
+def _break_results() -> None:
+    for name, text in {
+        "garbled": "{",
+        "list": "[]",
+        "foreign": '{"experiment": "x", "metrics": {}, "claims": []}',
+    }.items():
+        Path(f"result-{name}").mkdir()
+        Path(f"result-{name}/result.json").write_text(text)
+    shutil.copytree("result", "result-damaged")
+    Path("result-damaged/tables/steps.parquet").write_text("no table")
+
+
+def _write_experiments() -> None:
+    for name, text in {
+        "garbled": "title = ",
+        "untitled": 'study = "localization"',
+        "unknown": 'title = "t"\nrnus = 3',
+        "nothing": 'title = "t"\n[estimators.ekf]',
+        "both": 'title = "t"\n[record]\nscenario = "landmarks"\n[import]\nsource = "mrclam"',
+        "no-scenario": 'title = "t"\n[record]\nscenario = "landmark"',
+        "label": 'title = "t"\n[record]\nscenario = "landmarks"\n[estimators."a/b"]\nkind = "ekf"',
+        "misfit": 'title = "t"\n[record]\nscenario = "landmarks"\n[record.parameters]\n'
+        "range_bearing = { rate_hz = 0.0 }\n[estimators.ekf]",
+        "scenario": "[parameters]\nduration_s = 1",
+    }.items():
+        Path(f"{name}.toml").write_text(text)
+
+
+MRCLAM = {
+    "Barcodes.dat": "1 5\n2 14\n6 63\n",
+    "Landmark_Groundtruth.dat": "6 1.0 2.0 0.0 0.0\n",
+    "Robot1_Groundtruth.dat": "".join(f"{time / 10} 0.0 0.0 0.0\n" for time in range(100, 121)),
+    "Robot1_Odometry.dat": "".join(f"{time / 10} 0.0 0.0\n" for time in range(100, 120)),
+    "Robot1_Measurement.dat": "10.5 63 2.2 1.1\n10.5 99 2.0 1.0\n",
+}
+
+
+def _write_mrclam() -> None:
+    def write(folder: str, changes: dict[str, str | None]) -> None:
+        Path(folder).mkdir()
+        for name, text in {**MRCLAM, **changes}.items():
+            if text is not None:
+                Path(folder, name).write_text(text)
+
+    write("mrclam", {})
+    for name in MRCLAM:
+        stem = name.partition(".")[0]
+        write(f"mrclam-no-{stem}", {name: None})
+        write(f"mrclam-empty-{stem}", {name: "# nothing\n"})
+    write("mrclam-words", {"Robot1_Odometry.dat": "10.0 fast 0.0\n"})
+    write("mrclam-columns", {"Robot1_Odometry.dat": "10.0 0.0\n"})
+    write("mrclam-ragged", {"Robot1_Odometry.dat": "10.0 0.0 0.0\n10.1 0.0 0.0 0.0 7\n"})
+    write("mrclam-past", {"Robot1_Odometry.dat": "-10.0 0.0 0.0\n"})
+    write("mrclam-nan", {"Robot1_Groundtruth.dat": "10.0 nan 0.0 0.0\n"})
+    write("mrclam-barcode", {"Barcodes.dat": "1 5\n"})

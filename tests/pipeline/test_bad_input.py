@@ -1,0 +1,234 @@
+"""Every mistake a user can make is one clear sentence and exit code 2, and nothing is written."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+REPLAY_EKF = "replay {} -e ekf"
+
+# What is given, and words that the sentence must have: what is wrong, and what to do.
+TABLE: dict[str, tuple[str, ...]] = {
+    # nothing, too much, unknown
+    "record": ("either a scenario", "--again"),
+    "record landmarks --again log.mcap": ("either a scenario", "--again"),
+    "record landmark": ("no scenario 'landmark'", "did you mean 'landmarks'"),
+    "record zzz": ("no scenario 'zzz'", "landmarks-adverse", ".toml"),
+    "record zzz.toml": ("zzz.toml", "no such file"),
+    "record folder": ("no scenario 'folder'",),
+    "record garbled.toml": ("garbled.toml", "TOML"),
+    "record scenario.toml": ("scenario.toml", 'recorder = "NAME"'),
+    "record mrclam": ("fuselog import mrclam",),
+    "import landmarks mrclam": ("fuselog record landmarks",),
+    "import zzz mrclam": ("no recorder 'zzz'",),
+    "replay log.mcap": ("Missing option '-e'", "fuselog replay --help"),
+    "replay log.mcap -e efk": ("no estimator 'efk'", "did you mean 'ekf'"),
+    "replay log.mcap -e ekf:x": ("no variants", "'ekf'"),
+    "replay log.mcap -e a/b --set a/b.kind=ekf": ("'a/b'", "letters"),
+    "evaluate log.estimates.mcap --metric acuracy": ("no metric 'acuracy'", "'accuracy'"),
+    "run zzz": ("no experiment 'zzz'", "landmarks", ".toml"),
+    "run landmarks --set study=zzz": ("no study 'zzz'", "localization"),
+    "estimators efk": ("no estimator 'efk'", "'ekf'"),
+    "scenarios zzz": ("no scenario 'zzz'", "landmarks"),
+    "recrod landmarks": ("No such command 'recrod'", "fuselog --help"),
+    # parameters of all levels: names, types, bounds
+    "record landmarks --set duration_s": ("--set duration_s", "key=value"),
+    "record landmarks --set =1": ("--set =1", "key=value"),
+    "record landmarks --set robots=1 --set robots.x=1": ("--set robots.x=1", "a value of its own"),
+    "record landmarks --set duraton_s=1": ("no parameter 'duraton_s'", "did you mean 'duration_s'"),
+    "record landmarks --set duration_s=soon": ("'duration_s' is 'soon'", "number"),
+    "record landmarks --set duration_s=-1": ("'duration_s' is -1", "greater than 0"),
+    "record landmarks --set duration_s=nan": ("'duration_s' is nan", "finite"),
+    "record landmarks --set duration_s=1e12": ("not enough memory",),
+    "record landmarks --set robots=1.5": ("'robots' is 1.5", "integer"),
+    "record landmarks --set range.rate=1": ("no parameter 'range.rate'", "'rate_hz'"),
+    "record landmarks --set range=1": ("'range' is 1", "dictionary"),
+    "record landmarks --seed -1": ("--seed", "-1"),
+    "record landmarks --run -1": ("--run", "-1"),
+    "record landmarks --compression gz": ("'gz'", "'zstd', 'lz4', 'none'"),
+    "replay log.mcap -e ekf --set gate=1": ("--set gate", "did you mean 'gate_probability'"),
+    "replay log.mcap -e ekf --set ukf.kappa=1": ("--set ukf", "ekf"),
+    "replay log.mcap -e ekf --set ekf=1": ("--set ekf=1", "ekf.PARAMETER=VALUE"),
+    "replay log.mcap -e ekf --set ekf.gate=1": ("estimator ekf", "'gate'", "'gate_probability'"),
+    "replay log.mcap -e ekf --set gate_probability=2": (
+        "estimator ekf",
+        "is 2",
+        "less than or equal to 1",
+    ),
+    "replay log.mcap -e ukf --set kappa=-5": ("kappa", "more than -3"),
+    "run landmarks --set duraton_s=1": ("--set duraton_s", "did you mean 'duration_s'"),
+    "run landmarks --set efk.gate_probability=1": ("--set efk", "did you mean 'ekf'"),
+    "run landmarks --set ekf.gate=1": ("estimator ekf", "'gate'"),
+    "run landmarks --set range.rate=1": ("no parameter 'range.rate'", "'rate_hz'"),
+    "run landmarks --set gap_limit_s=-1": ("'gap_limit_s' is -1",),
+    "run landmarks --set options.x=1": ("options of study localization", "'x'"),
+    "run landmarks --set metrics=['acuracy']": ("no metric 'acuracy'", "'accuracy'"),
+    "run landmarks --set record.scenario=landmark": ("no scenario 'landmark'", "'landmarks'"),
+    "run landmarks --runs 0": ("experiment landmarks", "'runs' is 0"),
+    "run landmarks --seed -1": ("'seed' is -1",),
+    "run landmarks --logs -1": ("--logs", "-1"),
+    "run landmarks --data mrclam": ("imports nothing", "--data"),
+    "run mrclam": ("needs real data", "--data"),
+    "run mrclam --data mrclam --runs 2": ("one run", "leave out runs"),
+    "run garbled.toml": ("garbled.toml", "TOML"),
+    "run untitled.toml": ("untitled.toml", "'title' is missing"),
+    "run unknown.toml": ("unknown.toml", "did you mean 'runs'"),
+    "run both.toml": ("both.toml", "either [record] or [import]"),
+    "run nothing.toml": ("[record]", "[import]"),
+    "run no-scenario.toml": ("no scenario 'landmark'", "'landmarks'"),
+    "run label.toml": ("'a/b'", "letters"),
+    "run misfit.toml": ("estimator ekf does not fit", "range_bearing"),
+    # times
+    "replay log.mcap -e ekf --gap-limit -1": ("--gap-limit", "-1"),
+    "replay log.mcap -e ekf --gap-limit nan": ("--gap-limit", "nan"),
+    "replay log.mcap -e ekf --start 1 --end 0.5": ("--start 1 --end 0.5", "after the start"),
+    "replay log.mcap -e ekf --start 9": ("log.mcap", "from 0 to 2 s"),
+    "replay log.mcap -e ekf --end -9": ("log.mcap", "from 0 to 2 s"),
+    "replay log.mcap -e ekf --start 1e300": ("--start", "1e+300"),
+    "replay log.mcap -e ekf --start nan": ("--start", "nan"),
+    # logs that are none, or broken
+    "info zzz.mcap": ("zzz.mcap", "No such file"),
+    "info folder": ("folder", "directory"),
+    "info text.mcap": ("text.mcap", "not an MCAP"),
+    "info empty.mcap": ("empty.mcap", "not an MCAP"),
+    "info cut.mcap": ("cut.mcap", "cut off", "--recover"),
+    REPLAY_EKF.format("zzz.mcap"): ("zzz.mcap", "No such file"),
+    REPLAY_EKF.format("folder"): ("folder", "directory"),
+    REPLAY_EKF.format("text.mcap"): ("text.mcap", "not an MCAP"),
+    REPLAY_EKF.format("empty.mcap"): ("empty.mcap", "not an MCAP"),
+    REPLAY_EKF.format("cut.mcap"): ("cut.mcap", "cut off", "--recover"),
+    REPLAY_EKF.format("damaged.mcap"): ("damaged.mcap", "--recover"),
+    REPLAY_EKF.format("json.mcap"): ("json.mcap", "/robot1/odometry"),
+    REPLAY_EKF.format("nan.mcap"): ("nan.mcap", "/robot1/odometry"),
+    REPLAY_EKF.format("other-fields.mcap"): ("other-fields.mcap", "/robot1/odometry", "forward_mps"),
+    # logs that an estimator cannot use
+    REPLAY_EKF.format("other-schema.mcap"): ("other-schema.mcap", "does not fit", "odometry"),
+    REPLAY_EKF.format("no-odometry.mcap"): ("no-odometry.mcap", "does not fit", "odometry"),
+    REPLAY_EKF.format("no-prior.mcap"): ("no-prior.mcap", "does not fit", "prior"),
+    REPLAY_EKF.format("no-landmarks.mcap"): ("no-landmarks.mcap", "does not fit", "landmarks"),
+    REPLAY_EKF.format("no-range_bearing.mcap"): ("does not fit", "range_bearing"),
+    REPLAY_EKF.format("empty-prior.mcap"): ("/robot1/prior", "prior"),
+    REPLAY_EKF.format("bad-prior.mcap"): ("/robot1/prior", "positive definite"),
+    REPLAY_EKF.format("still.mcap"): ("still.mcap", "no messages", "/robot1/odometry"),
+    REPLAY_EKF.format("log.estimates.mcap"): ("does not fit", "the log has /estimates"),
+    # several logs
+    "replay log.mcap log.mcap -e ekf": ("log.estimates.mcap", "two logs"),
+    "replay log.mcap moved/../log.mcap -e ekf": ("log.estimates.mcap", "two logs"),
+    "replay two-robots.mcap log.mcap -e ekf --out new": ("log.mcap", "/robot2", "ensemble"),
+    "replay log.mcap noisy.mcap -e ekf --out new": ("noisy.mcap", "/robot1/range_bearing", "ensemble"),
+    "replay log.mcap other.mcap -e ekf --out new.mcap": ("--out new.mcap", "folder"),
+    # estimates
+    "evaluate zzz.mcap": ("zzz.mcap", "No such file"),
+    "evaluate log.mcap": ("log.mcap", "no estimates", "fuselog replay"),
+    "evaluate moved/log.estimates.mcap": ("moved/log.mcap", "not there", "--log"),
+    "evaluate log.estimates.mcap --log zzz.mcap": ("zzz.mcap", "No such file"),
+    "evaluate log.estimates.mcap --log other.mcap": ("seed 0", "seed 1"),
+    "evaluate log.estimates.mcap --log log.mcap --log log.mcap": ("1 estimates", "2 --log"),
+    "record --again mrclam.mcap": ("mrclam.mcap", "No such file"),
+    # real data
+    "import mrclam zzz": ("zzz", "no such file or folder"),
+    "import mrclam text.mcap": ("text.mcap", "not a folder"),
+    "import mrclam folder": ("Barcodes.dat", "missing"),
+    "import mrclam mrclam --set sigma=1": ("importer mrclam", "'sigma"),
+    "import mrclam mrclam-no-Barcodes": ("Barcodes.dat", "missing"),
+    "import mrclam mrclam-no-Landmark_Groundtruth": ("Landmark_Groundtruth.dat", "missing"),
+    "import mrclam mrclam-no-Robot1_Groundtruth": ("Robot1_Groundtruth.dat", "missing"),
+    "import mrclam mrclam-no-Robot1_Odometry": ("Robot1_Odometry.dat", "missing"),
+    "import mrclam mrclam-no-Robot1_Measurement": ("Robot1_Measurement.dat", "missing"),
+    "import mrclam mrclam-empty-Robot1_Groundtruth": ("Robot1_Groundtruth.dat", "no data"),
+    "import mrclam mrclam-empty-Robot1_Odometry": ("Robot1_Odometry.dat", "no data"),
+    "import mrclam mrclam-empty-Landmark_Groundtruth": ("Landmark_Groundtruth.dat", "no data"),
+    "import mrclam mrclam-words": ("Robot1_Odometry.dat", "row 1", "'fast'"),
+    "import mrclam mrclam-columns": ("Robot1_Odometry.dat", "3 columns"),
+    "import mrclam mrclam-ragged": ("Robot1_Odometry.dat", "columns"),
+    "import mrclam mrclam-past": ("Robot1_Odometry.dat", "negative"),
+    "import mrclam mrclam-nan": ("Robot1_Groundtruth.dat", "row 1", "nan"),
+    "run mrclam --data folder": ("Barcodes.dat", "missing"),
+    # results
+    "report": ("Missing argument 'RESULTS...'",),
+    "report zzz": ("zzz", "no result.json", "fuselog run"),
+    "report log.mcap": ("log.mcap", "no result.json"),
+    "report result-garbled": ("result-garbled/result.json", "run the experiment again"),
+    "report result-list": ("result-list/result.json", "no result"),
+    "report result-foreign": ("result-foreign/result.json", "'fuselog' is missing"),
+    "report result-damaged": ("result-damaged", "run it again"),
+    # where to write
+    "record landmarks --out folder": ("'folder' is a directory",),
+    "record landmarks --out /dev/null": ("/dev/null", "no regular file"),
+    "record landmarks --out /proc/x.mcap": ("/proc/x.mcap", "cannot be written"),
+    "record landmarks --out text.mcap/x.mcap": ("text.mcap/x.mcap", "cannot be written"),
+    "replay log.mcap -e ekf --out log.mcap": ("log.mcap", "would replace the log"),
+    "replay log.mcap -e ekf --out /proc/x": ("/proc/x", "cannot be written"),
+    "evaluate log.estimates.mcap --out folder": ("folder", "no fuselog result", "--out"),
+    "evaluate log.estimates.mcap --out /proc/x": ("/proc/x", "cannot be written"),
+    "run landmarks --out folder": ("folder", "no fuselog result", "--out"),
+    "run landmarks --out .": (".", "no fuselog result"),
+    "run landmarks --out text.mcap": ("text.mcap", "is a file"),
+    "run landmarks --out text.mcap/x": ("text.mcap/x", "cannot be written"),
+    "run landmarks --out /proc/x": ("/proc/x", "cannot be written"),
+    "report result --out folder": ("'folder' is a directory",),
+    "report result --out /proc/x.html": ("/proc/x.html", "cannot be written"),
+    # the timeline
+    "view zzz": ("zzz", "No such file"),
+    "view folder": ("folder/timeline.rrd",),
+    "view text.mcap --save new.rrd": ("text.mcap", "not an MCAP"),
+    "view log.mcap --save new.rrd --focus zzz": ("'zzz'", "robot1"),
+    "view log.mcap --connect zzz": ("zzz", "rerun+http://"),
+}
+
+
+def _listing(folder: Path) -> dict[str, int]:
+    return {str(path): path.lstat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("arguments", TABLE)
+def test_mistakes_are_one_sentence_and_change_nothing(
+    arguments: str, world: Path, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(world)
+    before = _listing(world)
+    said = fuselog(*arguments.split())
+    assert said.code == 2
+    assert said.out == ""
+    sentence = said.err.removesuffix("\n")
+    assert sentence.startswith("fuselog: ")
+    assert "\n" not in sentence
+    for words in TABLE[arguments]:
+        assert words in sentence
+    assert _listing(world) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "replay empty-odometry.mcap -e ekf",
+        "replay empty-range_bearing.mcap -e ekf",
+        "replay empty-landmarks.mcap -e ekf",
+        "replay empty-truth.mcap -e ekf",
+        "replay no-truth.mcap -e ekf",
+        "replay cut.mcap -e ekf --recover",
+    ],
+)
+def test_what_is_poor_but_no_mistake_is_replayed(
+    arguments: str,
+    world: Path,
+    fuselog: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No landmark seen, no truth, no odometry: there is less to say, and that is said."""
+    monkeypatch.chdir(world)
+    out = tmp_path / "estimates.mcap"
+    said = fuselog(*arguments.split(), "--out", str(out))
+    assert said.code == 0, said.err
+    assert out.exists()
+
+
+def test_a_tracebacks_place_is_shown_on_request(
+    world: Path, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(os.environ, "FUSELOG_TRACEBACK", "1")
+    with pytest.raises(Exception, match="No such file"):
+        fuselog("info", str(world / "zzz.mcap"))

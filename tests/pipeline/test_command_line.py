@@ -1,0 +1,293 @@
+"""The command line end to end: record, look, replay, judge, run, report; and what may interrupt it."""
+
+import fcntl
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorders.log import open_log, read_streams
+
+Fuselog = Callable[..., Any]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_whole_way_from_a_scenario_to_a_report(here: Path, fuselog: Fuselog) -> None:
+    """What the README promises in one go; the two ways to judge agree."""
+    assert fuselog("record", "landmarks", "--set", "duration_s=5", "-o", "log.mcap").code == 0
+    replayed = fuselog("replay", "log.mcap", "-e", "ekf", "-e", "dead-reckoning", "--json").json
+    evaluated = fuselog("evaluate", "log.estimates.mcap", "--json", "--out", "judged").json
+    assert replayed["written"] == ["log.estimates.mcap"]
+    assert replayed["metrics"] == evaluated["metrics"]
+    metrics = replayed["metrics"]
+    assert metrics["ekf.position_rmse_m.robot1"] < metrics["dead-reckoning.position_rmse_m.robot1"]
+    assert fuselog("report", "judged", "-o", "page.html").code == 0
+    assert "ekf" in (here / "page.html").read_text()
+    assert sorted(path.name for path in here.iterdir()) == [
+        "judged",
+        "log.estimates.mcap",
+        "log.mcap",
+        "page.html",
+    ]
+
+
+def test_a_run_is_recorded_again_from_its_log_and_from_its_estimates(
+    here: Path, world: Path, fuselog: Fuselog
+) -> None:
+    assert fuselog("record", "--again", str(world / "log.mcap"), "-o", "again.mcap").code == 0
+    assert (here / "again.mcap").read_bytes() == (world / "log.mcap").read_bytes()
+    assert fuselog("record", "--again", str(world / "log.estimates.mcap"), "-o", "again.mcap").code == 0
+    assert (here / "again.mcap").read_bytes() == (world / "log.mcap").read_bytes()
+    assert fuselog("record", "--again", str(world / "log.mcap"), "--seed", "1", "-o", "1.mcap").code == 0
+    assert (here / "1.mcap").read_bytes() == (world / "other.mcap").read_bytes()
+
+
+@pytest.mark.usefixtures("here")
+def test_a_shipped_scenario_sets_its_parameters(fuselog: Fuselog) -> None:
+    """Late messages and outages come with `landmarks-adverse`, and --set still wins."""
+    said = fuselog("record", "landmarks-adverse", "--set", "duration_s=5", "--set", "robots=1")
+    assert said.code == 0
+    log = open_log("landmarks-adverse.mcap")
+    assert log.run is not None
+    assert log.run.parameters["range_bearing"]["field_of_view_deg"] == 120.0
+    assert not any(topic.startswith("/robot2") for topic in log.topics)
+    seen = read_streams(log, ["/robot1/range_bearing"])["/robot1/range_bearing"]
+    assert (seen.log_time_ns > seen.publish_time_ns).all()
+
+
+def test_estimates_of_several_logs_equal_those_of_one(here: Path, world: Path, fuselog: Fuselog) -> None:
+    """The runs of an ensemble do not touch each other, whichever way they are replayed."""
+    logs = [str(world / "log.mcap"), str(world / "other.mcap")]
+    assert fuselog("replay", *logs, "-e", "ekf", "--out", "both").code == 0
+    for log in logs:
+        assert fuselog("replay", log, "-e", "ekf", "--out", "each").code == 0
+        name = Path(log).stem + ".estimates.mcap"
+        both, each = open_log(here / "both" / name), open_log(here / "each" / name)
+        assert list(both.topics) == list(each.topics)
+        streams = read_streams(both, list(both.topics)), read_streams(each, list(each.topics))
+        for topic in both.topics:
+            for field, column in streams[0][topic].columns.items():
+                np.testing.assert_array_equal(column, streams[1][topic][field])
+
+
+def test_more_runs_than_are_replayed_at_once(
+    here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand logs must not need a thousand open files: they are replayed in parts."""
+    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    logs = [str(world / "log.mcap"), str(world / "other.mcap")]
+    in_parts = fuselog("replay", *logs, "-e", "ekf", "--out", "a", "--json").json["metrics"]
+    monkeypatch.undo()
+    assert (
+        fuselog("replay", *logs, "-e", "ekf", "--out", str(here / "b"), "--json").json["metrics"]
+        == in_parts
+    )
+
+
+@pytest.mark.usefixtures("here")
+def test_settings_reach_the_estimators_that_have_them(world: Path, fuselog: Fuselog) -> None:
+    log, out = str(world / "log.mcap"), "estimates.mcap"
+    every = ["replay", log, "-e", "ekf", "-e", "ukf", "-e", "e", "--set", "e.kind=ekf", "--out", out]
+    both = ["--set", "bias_range_m=0.5", "--set", "kappa=1", "--set", "e.bias_range_m=0", "--json"]
+    metrics = fuselog(*every, *both).json["metrics"]
+    errors = {name: metrics[f"{name}.position_rmse_m.robot1"] for name in ("ekf", "ukf", "e")}
+    assert errors["ekf"] > 2 * errors["e"]
+    assert errors["ukf"] > 2 * errors["e"]
+    settings = json.loads(open_log(out).run.notes["estimators"])  # type: ignore[union-attr]
+    assert settings == {
+        "ekf": {"bias_range_m": 0.5},
+        "ukf": {"bias_range_m": 0.5, "kappa": 1},
+        "e": {"kind": "ekf", "bias_range_m": 0},
+    }
+
+
+@pytest.mark.usefixtures("here")
+def test_a_span_is_replayed_and_judged_alone(world: Path, fuselog: Fuselog) -> None:
+    """Estimates lie within the span; the prior before it is still used."""
+    span = ["--start", "0", "--end", "1"]
+    assert fuselog("replay", str(world / "log.mcap"), "-e", "ekf", *span, "--out", "part.mcap").code == 0
+    log = open_log("part.mcap")
+    stamps_ns = read_streams(log, ["/estimates/ekf/robot1/pose"])[
+        "/estimates/ekf/robot1/pose"
+    ].publish_time_ns
+    assert log.run is not None
+    assert len(stamps_ns) > 0
+    assert stamps_ns.max() < log.run.epoch_ns + 10**9
+
+
+@pytest.mark.usefixtures("here")
+def test_estimates_beside_a_log_and_in_a_folder_find_it_again(world: Path, fuselog: Fuselog) -> None:
+    """The log is named relative to its estimates, so that both can be moved together."""
+    Path("a").mkdir()
+    Path("a/log.mcap").write_bytes((world / "log.mcap").read_bytes())
+    assert fuselog("replay", "a/log.mcap", "-e", "ekf", "--out", "a/b").code == 0
+    Path("a").rename("ä ☃")
+    assert fuselog("evaluate", "ä ☃/b/log.estimates.mcap").code == 0
+
+
+def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
+    said = fuselog("info", str(world / "two-robots.mcap")).out
+    for words in ("landmarks, seed 0, run 0", "duration_s = 2.0", "robots = 2", "2 s from 2026-01-01"):
+        assert words in said
+    assert "speed_mps" not in said  # as by default
+    topics = {
+        row["topic"]: row for row in fuselog("info", str(world / "log.mcap"), "--json").json["topics"]
+    }
+    assert topics["/robot1/odometry"]["messages"] == 40
+    assert topics["/robot1/truth"]["metadata"]["components"] == "x_m,y_m,heading_rad"
+    lossy = fuselog("info", str(world / "cut.mcap"), "--recover")
+    assert lossy.code == 0
+    assert "cut off" in lossy.err
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "words"),
+    [
+        ("scenarios", "landmarks-adverse", ["outages_per_minute", "fuselog record landmarks-adverse"]),
+        ("scenarios", "mrclam", ["sigma_range_m", "fuselog import mrclam PATH"]),
+        ("estimators", "ukf", ["gate_probability", "number > 0 <= 1", "/landmarks"]),
+        ("metrics", "consistency", ["NEES"]),
+        ("experiments", "landmarks", ["dead-reckoning, ekf, ukf", "100 runs"]),
+    ],
+)
+def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuselog) -> None:
+    listed = fuselog(kind, "--json").json
+    assert name in [row["name"] for row in listed]
+    assert name in fuselog(kind).out
+    details = fuselog(kind, name)
+    assert details.code == 0
+    for word in words:
+        assert word in details.out
+    assert fuselog(kind, name, "--json").json == [row for row in listed if row["name"] == name]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """--help answers at once: what takes long to import waits for a command that needs it."""
+    code = (
+        "import sys; from pipeline.command_line import main; code = main(['--help']); "
+        "print(code, *{'numpy', 'numba', 'rerun', 'pandas', 'pydantic', 'rich'} & set(sys.modules))"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert "Record, replay" in said
+    assert said.splitlines()[-1] == "0"
+
+
+@pytest.mark.usefixtures("here")
+def test_output_in_a_narrow_terminal_and_beyond_its_encoding(
+    world: Path, start_fuselog: Callable[..., subprocess.Popen[str]]
+) -> None:
+    name = "ä ☃.mcap"
+    Path(name).write_bytes((world / "log.mcap").read_bytes())
+    narrow = {**os.environ, "COLUMNS": "60", "PYTHONIOENCODING": "ascii"}
+    process = start_fuselog("replay", name, "-e", "ekf", "-e", "dead-reckoning", env=narrow)
+    out, err = process.communicate()
+    assert process.returncode == 0
+    assert err == ""
+    assert max(map(len, out.splitlines())) <= 60
+    assert out.splitlines()[-1] == r"\xe4 \u2603.estimates.mcap"
+
+
+def test_a_reader_that_goes_away_is_no_error(world: Path, start_fuselog: Callable[..., Any]) -> None:
+    """`fuselog info log.mcap | head -0` says nothing on standard error."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    process = start_fuselog("info", str(world / "log.mcap"), stdout=writing)
+    os.close(writing)
+    assert process.communicate()[1] == ""
+    assert process.returncode == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["record", "landmarks", "-o", "new.mcap"],
+        ["run", "landmarks", "--runs", "1", "--set", "duration_s=5", "--out", "new"],
+    ],
+)
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(
+    arguments: list[str], here: Path, start_fuselog: Callable[..., Any]
+) -> None:
+    """The limit on the size of files stands in for the disk's."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
+
+    process = start_fuselog(*arguments, preexec_fn=limit, env={**os.environ, "NUMBA_DISABLE_JIT": "1"})
+    said = process.communicate()
+    assert process.returncode == 2, said
+    assert said[0] == ""
+    assert "cannot be written (File too large)" in said[1]
+    assert said[1].count("\n") == 1
+    assert list(here.iterdir()) == []
+
+
+def _stop_when(part: Path, process: Any, number: int) -> str:
+    """Send a signal once a process has begun to write; what it says on standard error."""
+    deadline = time.monotonic() + 60
+    while not part.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(number)
+    return str(process.communicate()[1])
+
+
+def test_a_stopped_run_leaves_nothing_and_a_killed_one_a_part(
+    here: Path, start_fuselog: Callable[..., Any], fuselog: Fuselog
+) -> None:
+    """What is in the place is whole; what a killed process left is cleared by the next."""
+    long = ["run", "landmarks", "--runs", "500", "--out", "r"]
+    process = start_fuselog(*long)
+    assert _stop_when(here / "r.part", process, signal.SIGINT).strip() == "fuselog: stopped"
+    assert process.returncode == 130
+    assert list(here.iterdir()) == []
+    process = start_fuselog(*long)
+    _stop_when(here / "r.part", process, signal.SIGKILL)
+    assert [path.name for path in here.iterdir()] == ["r.part"]
+    assert fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r").code == 0
+    assert [path.name for path in here.iterdir()] == ["r"]
+
+
+@pytest.mark.parametrize("command", ["record landmarks", "replay {log} -e ekf"])
+def test_a_stopped_recording_or_replay_leaves_nothing(
+    command: str, here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        assert (here / "new.mcap.part").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("recorders.log.LogWriter.write", stop)
+    said = fuselog(*command.format(log=world / "log.mcap").split(), "--out", "new.mcap")
+    assert said.code == 130
+    assert said.err.strip() == "fuselog: stopped"
+    assert list(here.iterdir()) == []
+
+
+def test_two_runs_into_one_folder_do_not_mix(here: Path, fuselog: Fuselog) -> None:
+    part = here / "r.part"
+    part.mkdir()
+    (part / "theirs").touch()
+    handle = os.open(part, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
+    os.close(handle)
+    assert said.code == 2
+    assert "another fuselog is writing it" in said.err
+    assert (part / "theirs").exists()

@@ -1,0 +1,203 @@
+"""Experiments: the result folder and its result.json, the same every time; the report page."""
+
+import json
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import chdir
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.ensemble import hash_streams, record_ensemble
+from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from recorders.log import open_log
+
+Fuselog = Callable[..., Any]
+RUN = ["run", "landmarks", "--set", "duration_s=2", "--runs", "3", "--seed", "5"]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory, fuselog: Fuselog) -> Path:
+    """A small result."""
+    folder = tmp_path_factory.mktemp("results") / "first"
+    assert fuselog(*RUN, "--logs", "2", "--out", str(folder)).code == 0
+    return folder
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".rrd"  # Rerun cuts its chunks by the clock
+    }
+
+
+def test_a_result_folder_holds_what_it_promises(result: Path) -> None:
+    names = set(_contents(result))
+    assert {f"logs/run-000{run}.mcap" for run in range(2)} <= names
+    assert "logs/run-0002.mcap" not in names
+    assert {f"estimates/run-000{run}.mcap" for run in range(2)} <= names
+    assert {"tables/errors.parquet", "tables/errors.csv", "figures/errors-robot1.svg"} <= names
+    assert (result / "timeline.rrd").is_file()
+    pd.testing.assert_frame_equal(
+        pd.read_csv(result / "tables/steps.csv"), pd.read_parquet(result / "tables/steps.parquet")
+    )
+
+
+def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
+    text = (result / "result.json").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    values = json.loads(text)
+    assert list(values) == ["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims"]
+    assert values["experiment"] == "landmarks"
+    assert values["settings"]["seed"] == 5
+    assert values["settings"]["record"]["parameters"] == {"duration_s": 2}
+    assert re.fullmatch("[0-9a-f]{64}", values["input_sha256"])
+    assert values["claims"] == []
+    for key, value in values["metrics"].items():
+        estimator, quantity, case = key.split(".")
+        assert estimator in {"dead-reckoning", "ekf", "ukf"}
+        assert re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", quantity)
+        assert case == "robot1"
+        assert isinstance(value, float)
+
+
+def test_a_run_twice_gives_the_same_bytes(result: Path, fuselog: Fuselog) -> None:
+    """Also with the process's folder, the place of the result and the number of logs changed."""
+    second = result.with_name("second")
+    with chdir(result.parent):
+        assert fuselog(*RUN, "--logs", "3", "--out", "second").code == 0
+    first, again = _contents(result), _contents(second)
+    assert {name: again[name] for name in first} == first
+    assert len(again) == len(first) + 2
+
+
+def test_the_first_runs_log_is_recorded_again_from_the_seed(result: Path, fuselog: Fuselog) -> None:
+    """Logs that were not written can be had: run 1 of seed 5 is run 1 of seed 5."""
+    again = result.with_name("again.mcap")
+    where = ["--set", "duration_s=2", "--seed", "5", "--run", "1", "--out", str(again)]
+    assert fuselog("record", "landmarks", *where).code == 0
+    assert again.read_bytes() == (result / "logs/run-0001.mcap").read_bytes()
+
+
+def test_the_logs_of_a_result_replay_and_judge_as_the_result(result: Path, fuselog: Fuselog) -> None:
+    """`evaluate` on the folder's estimates finds their logs, and says what result.json says."""
+    estimates = sorted(map(str, (result / "estimates").iterdir()))
+    values = fuselog("evaluate", *estimates, "--json").json["metrics"]
+    whole = result.with_name("whole")
+    assert fuselog(*RUN[:-4], "--runs", "2", "--seed", "5", "--out", str(whole)).code == 0
+    expected = json.loads((whole / "result.json").read_text())["metrics"]
+    assert values == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_report_is_one_page_with_all_numbers(result: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    page = tmp_path / "page.html"
+    assert fuselog("report", str(result), str(result), "--out", str(page)).code == 0
+    text = page.read_text()
+    loaded = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?(?!#|data:)([^"\'>)]+)', text)
+    assert loaded == []
+    assert text.count("<svg") == 2
+    assert text.count("position_rmse_m") >= 2
+    assert "seed 5" in text
+
+
+def test_claims_lists_and_odd_text_reach_the_json_the_page_and_the_terminal(
+    tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """NaN becomes null, lists stay lists, and what looks like HTML stays text."""
+    figure = matplotlib.figure.Figure()
+    figure.subplots().plot([0, 1])
+    claims = [
+        Claim("A beats B <always>", "yes", "no", "refuted", "3 of 10 runs"),
+        Claim("C is 4", "4.0", "4.01", "confirmed"),
+    ]
+    outcome = Outcome(
+        {"a.error_m": float("nan"), "a.curve_m.case": [1.0, None, float("inf")]},
+        claims,
+        {"short": pd.DataFrame({"name": ["x"], "value": [0.25]})},
+        {"line": figure},
+        "0" * 64,
+    )
+    with result_folder(tmp_path / "result") as part:
+        write_outcome(part, "test", {"title": "A & B"}, outcome)
+    values = json.loads((tmp_path / "result/result.json").read_text())
+    assert values["metrics"] == {"a.error_m": None, "a.curve_m.case": [1.0, None, None]}
+    assert values["claims"][1] == {
+        "claim": "C is 4",
+        "paper": "4.0",
+        "ours": "4.01",
+        "verdict": "confirmed",
+        "why": "",
+    }
+    page = tmp_path / "page.html"
+    assert fuselog("report", str(tmp_path / "result"), "--out", str(page)).code == 0
+    text = page.read_text()
+    assert "A beats B &lt;always&gt;" in text
+    assert "A &amp; B" in text
+    assert all(claim.ours in text and claim.verdict in text for claim in claims)
+
+
+def test_a_result_replaces_a_result_only_when_it_is_whole(tmp_path: Path) -> None:
+    """An experiment that fails leaves the earlier result as it was."""
+    with result_folder(tmp_path / "new" / "r") as part:
+        write_outcome(part, "first", {"title": ""}, Outcome())
+    before = _contents(tmp_path / "new" / "r")
+    for place in ("new", "other"):
+        with pytest.raises(ZeroDivisionError):
+            _fail_half_way(tmp_path / place / "r")
+    assert _contents(tmp_path / "new" / "r") == before
+    assert [path.name for path in tmp_path.rglob("*.part")] == []
+    assert not (tmp_path / "other").exists()
+
+
+def _fail_half_way(folder: Path) -> None:
+    with result_folder(folder) as part:
+        (part / "half").touch()
+        raise ZeroDivisionError
+
+
+def test_real_data_run_as_an_experiment(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    """The MRCLAM layout goes in at --data; unknown barcodes are told."""
+    data = str(world / "mrclam")
+    said = fuselog(
+        "run", "mrclam", "--data", data, "--set", "sigma_range_m=0.3", "--out", str(tmp_path / "r")
+    )
+    assert said.code == 0, said.err
+    values = json.loads((tmp_path / "r/result.json").read_text())
+    assert values["settings"]["data"] == data
+    assert values["metrics"]["ekf.failed_runs.robot1"] == 0
+    log = open_log(tmp_path / "r/logs/run-0000.mcap")
+    assert log.run is not None
+    assert log.run.parameters["sigma_range_m"] == 0.3
+    assert "99" in " ".join(log.run.notes)
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(
+    world: Path, tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """A filter told of tiny noise and far too large steps loses its covariance, not the ensemble."""
+    said = fuselog(
+        *["replay", str(world / "log.mcap"), "-e", "ukf", "-e", "lost", "--set", "lost.kind=ukf"],
+        *["--set", "lost.turn_noise_density=1e160", "--out", str(tmp_path), "--json"],
+    )
+    assert said.code == 0, said.err
+    assert said.json["metrics"]["ukf.failed_runs.robot1"] == 0
+    assert said.json["metrics"]["lost.failed_runs.robot1"] == 1
+    (sentence,) = said.json["failures"]
+    assert "lost robot1 failed at" in sentence
+    assert sentence in said.err
+
+
+def test_recording_on_an_executor_gives_the_same_runs() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        there = record_ensemble("landmarks", {"duration_s": 1.0}, 3, 4, executor=executor)
+    here = record_ensemble("landmarks", {"duration_s": 1.0}, 3, 4)
+    assert hash_streams(there) == hash_streams(here)
+    first, second = (source.streams["/robot1/truth"]["state"] for source in here[:2])
+    assert not np.array_equal(first, second)

@@ -1,0 +1,188 @@
+"""docs/own-estimator.md: its code is a package that is installed here, and its commands are run."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorders.log import open_log, read_streams
+
+PAGE = (Path(__file__).parents[2] / "docs" / "own-estimator.md").read_text()
+
+# More entry points, for what goes wrong in the code of others.
+BROKEN = """
+from recorders.recording import Simulator
+from replay.plain import Estimates, batch, each_run
+from radio import LOCATE, BeaconsParameters, LocateParameters, SIGNAL_STRENGTH, locate, schemas, simulate
+from recorders.errors import BadInput
+from recorders.log import make_stream
+import numpy as np
+
+
+def make(solve):
+    return batch(
+        "raises", parameters=LocateParameters, streams={"signal_strength": SIGNAL_STRENGTH},
+        whole={"/landmarks": schemas.LANDMARK}, components={"x_m": "linear", "y_m": "linear"},
+        truth="truth", solve=each_run(solve),
+    )
+
+
+def divide(streams, parameters):
+    return 1 / 0
+
+
+def choosy(streams, parameters):
+    if len(streams["/landmarks"]) < 4:
+        raise BadInput("fewer than 4 beacons")
+    return locate(streams, parameters)
+
+
+def twice(parameters, rng):
+    recording = simulate(parameters, rng)
+    return type(recording)(recording.streams * 2)
+
+
+DIVIDE, CHOOSY, NUMBER = make(divide), make(choosy), 7
+TWICE = Simulator("records a topic twice", BeaconsParameters, twice)
+"""
+
+
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page's package as pip would install it, in a folder to work in."""
+    folder = tmp_path_factory.mktemp("radio")
+    project, experiment = _blocks("toml")
+    stated = tomllib.loads(project)["project"]
+    (folder / "radio.py").write_text("\n\n".join(_blocks("python")))
+    (folder / "radio.toml").write_text(experiment)
+    (folder / "broken.py").write_text(BROKEN)
+    groups = stated["entry-points"]
+    groups["fuselog.estimators"] |= {
+        "divide": "broken:DIVIDE",
+        "choosy": "broken:CHOOSY",
+        "number": "broken:NUMBER",
+        "gone": "gone:GONE",
+    }
+    groups["fuselog.recorders"]["twice"] = "broken:TWICE"
+    lines = [
+        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in each.items())
+        for group, each in groups.items()
+    ]
+    information = folder / "radio-0.1.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: radio\nVersion: 0.1\n")
+    (information / "entry_points.txt").write_text("\n".join(lines))
+    return folder
+
+
+def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
+    """Run commands in one process that has the package: exit code, output and errors of each."""
+    code = (
+        "import sys, json, io, shlex; from contextlib import *; from pipeline.command_line import main\n"
+        "for line in json.load(sys.stdin):\n"
+        "    out, err = io.StringIO(), io.StringIO()\n"
+        "    with redirect_stdout(out), redirect_stderr(err): code = main(shlex.split(line)[1:])\n"
+        "    print(json.dumps({'code': code, 'out': out.getvalue(), 'err': err.getvalue()}))\n"
+    )
+    process = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        input=json.dumps(commands),
+        capture_output=True,
+        text=True,
+        cwd=package,
+        env={**os.environ, "PYTHONPATH": str(package)},
+    )
+    assert process.stderr == ""
+    return [json.loads(line) for line in process.stdout.splitlines()]
+
+
+def test_the_page_works_as_written(package: Path) -> None:
+    """Every command of the page runs with its package; the estimators are worth showing."""
+    commands = [line for block in _blocks("sh") for line in block.splitlines()]
+    commands.append("fuselog replay beacons.mcap -e locate -e follow --json --out again.mcap")
+    said = _run(package, commands)
+    assert len(commands) >= 9
+    for command, each in zip(commands, said, strict=True):
+        assert each["code"] == 0, (command, each)
+        assert each["err"] == "", command
+    metrics = json.loads((package / "walk/result.json").read_text())["metrics"]
+    assert metrics["follow.position_rmse_m.walker"] < 1.2
+    assert metrics["follow.position_rmse_m.walker"] < 0.7 * metrics["locate.position_rmse_m.walker"]
+    assert metrics["follow.nis_per_component.walker"] == pytest.approx(1, abs=0.1)
+    assert 0 < metrics["locate.within_1m_share.walker"] < metrics["follow.within_1m_share.walker"] < 1
+    assert metrics["follow-deaf.nis_per_component.walker"] < 0.3
+    assert "within_1m_share" in str(said[4]["out"])
+    assert (package / "beacons.rrd").stat().st_size > 1000
+    schema = open_log(package / "beacons.mcap").topics["/walker/signal_strength"].schema_name
+    assert schema == "radio.SignalStrength"
+
+
+def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
+    """The compiled recursion equals the same function in plain Python, as the page promises."""
+    plain = (
+        (package / "radio.py")
+        .read_text()
+        .replace("follow=follow,\n", "follow=follow,\n    compiled=False,\n")
+    )
+    (package / "plain").mkdir()
+    (package / "plain/radio.py").write_text(plain)
+    record = "fuselog record beacons --set duration_s=20 --out b.mcap"
+    said = _run(package, [record, "fuselog replay b.mcap -e follow --out compiled.mcap"])
+    code = "import sys; from pipeline.command_line import main; sys.exit(main())"
+    subprocess.run(
+        [sys.executable, "-c", code, "replay", "b.mcap", "-e", "follow", "--out", "plain.mcap"],
+        cwd=package,
+        check=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": f"{package / 'plain'}:{package}"},
+    )
+    assert [each["code"] for each in said] == [0, 0]
+    first, second = (open_log(package / name) for name in ("compiled.mcap", "plain.mcap"))
+    assert list(first.topics) == list(second.topics)
+    for topic in first.topics:
+        one, two = (read_streams(log, [topic])[topic] for log in (first, second))
+        for name, column in one.columns.items():
+            np.testing.assert_allclose(column, two[name], rtol=1e-9, atol=1e-12)
+
+
+def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
+    """A plugin's mistake is one sentence that says whose it is, and hurts no other plugin."""
+    record = "fuselog record beacons --set duration_s=5 --out"
+    few, enough = f"{record} few.mcap --set beacons=3", f"{record} enough.mcap"
+    replay = "fuselog replay {} -e {} --out out --json"
+    cases = {
+        few: "",
+        enough: "",
+        replay.format(
+            "enough.mcap", "divide"
+        ): "estimator divide/walker raised ZeroDivisionError: division by zero",
+        replay.format("enough.mcap", "gone"): "estimator 'gone' (gone:GONE) raised ModuleNotFoundError",
+        replay.format("enough.mcap", "number"): "estimator 'number' (broken:NUMBER) is int",
+        replay.format("few.mcap", "choosy"): "fewer than 4 beacons",
+        "fuselog record twice": "/landmarks: recorded as 2 streams",
+        replay.format(
+            "few.mcap enough.mcap", "choosy"
+        ): "few.mcap: choosy walker failed at 4.500 s: fewer than 4 beacons",
+        "fuselog estimators": "",
+    }
+    said = dict(zip(cases, _run(package, list(cases)), strict=True))
+    for command, words in cases.items():
+        assert words in str(said[command]["err"]), command
+        assert str(said[command]["err"]).count("\n") == bool(words)
+    codes = [each["code"] for each in said.values()]
+    assert codes == [0, 0, 2, 2, 2, 2, 2, 0, 0]
+    ensemble = json.loads(str(said[replay.format("few.mcap enough.mcap", "choosy")]["out"]))
+    assert ensemble["metrics"]["choosy.failed_runs.walker"] == 1
+    listed = str(said["fuselog estimators"]["out"])
+    assert "raised ModuleNotFoundError" in listed
+    assert "extended Kalman filter" in listed

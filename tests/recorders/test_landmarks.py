@@ -1,0 +1,302 @@
+"""The simulator of robots among landmarks does what its parameters say; statistics, honest bounds."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scipy.stats import chi2, expon, kstest, norm, poisson, uniform
+
+from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.models.planar import drive, range_bearing, wrap_angle
+from recorders.recording import SIMULATION_EPOCH_NS, record_run
+
+Floats = NDArray[np.float64]
+SURE = 1e-4  # how rarely an honest simulator fails one of these tests; the seeds are fixed
+
+
+def record(seed: int = 1, run: int = 0, **parameters: object) -> dict[str, Stream]:
+    recording, _ = record_run("landmarks", parameters, seed, run)
+    return {stream.topic: stream for stream in recording.streams}
+
+
+def residuals(streams: dict[str, Stream], topic: str) -> tuple[Floats, Floats]:
+    """Measured - true range and bearing of every message; its stamps are stamps of the truth."""
+    seen, truth, landmarks = streams[topic], streams["/robot1/truth"], streams["/landmarks"]
+    pose = truth["state"][np.searchsorted(truth.publish_time_ns, seen.publish_time_ns)]
+    places = landmarks["position_m"][seen["target_id"] - landmarks["landmark_id"][0]]
+    distance, bearing = range_bearing(pose.T, places.T)
+    measured_m = seen.columns.get("range_m", distance)
+    measured_rad = seen.columns.get("bearing_rad", bearing)
+    return measured_m - distance, wrap_angle(measured_rad - bearing)
+
+
+def assert_distributed(sample: Floats, distribution: object) -> None:
+    assert kstest(sample, distribution.cdf).pvalue > SURE
+
+
+def assert_share(count: int, total: int, probability: float) -> None:
+    """A binomial count within the normal approximation's bounds."""
+    deviation = np.sqrt(total * probability * (1 - probability))
+    assert abs(count - total * probability) < norm.isf(SURE / 2) * deviation
+
+
+# Sensors.
+
+
+def test_noise_and_bias_are_gaussian_as_stated():
+    sensor = {
+        "rate_hz": 5.0,
+        "sigma_range_m": 0.2,
+        "bias_range_m": 0.5,
+        "sigma_bearing_rad": 0.03,
+        "bias_bearing_rad": -0.1,
+    }
+    streams = record(range_bearing=sensor, range=sensor, bearing=sensor)
+    for topic, has_range, has_bearing in (("range_bearing", 1, 1), ("range", 1, 0), ("bearing", 0, 1)):
+        range_m, bearing_rad = residuals(streams, f"/robot1/{topic}")
+        assert len(range_m) > 1000
+        if has_range:
+            assert_distributed(range_m, norm(0.5, 0.2))
+        if has_bearing:
+            assert_distributed(bearing_rad, norm(-0.1, 0.03))
+
+
+def test_range_and_bearing_errors_are_independent_and_white():
+    range_m, bearing_rad = residuals(record(duration_s=300.0), "/robot1/range_bearing")
+    bound = norm.isf(SURE / 2) / np.sqrt(len(range_m))
+    assert abs(np.corrcoef(range_m, bearing_rad)[0, 1]) < bound
+    for errors in (range_m, bearing_rad):
+        assert abs(np.corrcoef(errors[1:], errors[:-1])[0, 1]) < bound
+
+
+def test_outliers_are_as_frequent_as_stated_and_anywhere():
+    """Ranges up to the sensor's reach, bearings all round."""
+    sensor = {
+        "rate_hz": 5.0,
+        "outlier_probability": 0.2,
+        "sigma_range_m": 1e-4,
+        "sigma_bearing_rad": 1e-5,
+    }
+    streams = record(duration_s=200.0, range_bearing=sensor)
+    range_m, bearing_rad = residuals(streams, "/robot1/range_bearing")
+    wild_range, wild_bearing = np.abs(range_m) > 1e-3, np.abs(bearing_rad) > 1e-4
+    for wild in (wild_range, wild_bearing):
+        assert_share(int(wild.sum()), len(wild), 0.2)
+    assert_share(int((wild_range & wild_bearing).sum()), len(wild_range), 0.2**2)
+    seen = streams["/robot1/range_bearing"]
+    assert_distributed(seen["range_m"][wild_range], uniform(0, 8))
+    assert_distributed(seen["bearing_rad"][wild_bearing], uniform(-np.pi, 2 * np.pi))
+
+
+def test_ranges_are_never_negative_nor_bearings_beyond_half_a_turn():
+    sensor = {"rate_hz": 5.0, "sigma_range_m": 20.0, "sigma_bearing_rad": 5.0}
+    seen = record(range_bearing=sensor)["/robot1/range_bearing"]
+    assert seen["range_m"].min() >= 0
+    assert np.abs(seen["bearing_rad"]).max() <= np.pi
+
+
+def visible(streams: dict[str, Stream], rate_hz: float, reach_m: float, view_deg: float) -> int:
+    """How many sightings a perfect sensor would make."""
+    truth, landmarks = streams["/robot1/truth"], streams["/landmarks"]
+    poses = truth["state"][:: round(20 / rate_hz)]
+    distance, bearing = range_bearing(poses.T[:, :, None], landmarks["position_m"].T[:, None, :])
+    in_view = np.abs(wrap_angle(bearing)) <= np.radians(view_deg) / 2
+    return int(np.sum((distance <= reach_m) & in_view))
+
+
+@pytest.mark.parametrize(("reach_m", "view_deg"), [(8.0, 360.0), (4.0, 360.0), (8.0, 90.0)])
+def test_sensors_see_what_is_in_range_and_view(reach_m: float, view_deg: float):
+    sensor = {"rate_hz": 5.0, "maximum_range_m": reach_m, "field_of_view_deg": view_deg}
+    streams = record(range_bearing=sensor)
+    assert len(streams["/robot1/range_bearing"]) == visible(streams, 5.0, reach_m, view_deg)
+
+
+def test_dropouts_are_as_frequent_as_stated():
+    streams = record(duration_s=200.0, range_bearing={"rate_hz": 5.0, "dropout_probability": 0.3})
+    assert_share(len(streams["/robot1/range_bearing"]), visible(streams, 5.0, 8.0, 360.0), 0.7)
+
+
+def test_outages_come_at_their_rate_are_recorded_and_silence_the_sensor():
+    sensor = {"rate_hz": 5.0, "outages_per_minute": 3.0, "outage_s": 2.0}
+    streams = record(duration_s=1200.0, range_bearing=sensor)
+    outages, seen = streams["/robot1/range_bearing/outages"], streams["/robot1/range_bearing"]
+    low, high = poisson(60).ppf([SURE / 2, 1 - SURE / 2])
+    assert low <= len(outages) <= high
+    assert_array_equal(outages["end_time_ns"] - outages.publish_time_ns, 2_000_000_000)
+    starts_s = (outages.publish_time_ns - SIMULATION_EPOCH_NS) * 1e-9
+    assert_distributed(starts_s, uniform(0, 1200))
+    stamps = seen.publish_time_ns
+    dead = [
+        (stamps >= start) & (stamps < end)
+        for start, end in zip(outages.publish_time_ns, outages["end_time_ns"], strict=True)
+    ]
+    assert not np.any(dead)
+    perfect = visible(streams, 5.0, 8.0, 360.0)
+    assert 0.8 < len(seen) / perfect < 0.97  # 60 outages of 2 s in 1200 s are a tenth
+    assert "/robot1/range_bearing/outages" not in record()
+
+
+def test_the_three_clocks():
+    """Stamp, arrival and the sensor's own clock, each with its own error; shared within a look."""
+    sensor = {
+        "rate_hz": 4.0,
+        "latency_s": 0.1,
+        "latency_jitter_s": 0.05,
+        "clock_offset_s": -3.0,
+        "stamp_offset_s": 0.025,
+    }
+    seen = record(duration_s=400.0, bearing=sensor)["/robot1/bearing"]
+    looked = (seen["sensor_time_ns"] - SIMULATION_EPOCH_NS) * 1e-9 + 3.0
+    assert_allclose(looked * 4, np.rint(looked * 4), atol=1e-6)
+    assert_allclose((seen.publish_time_ns - SIMULATION_EPOCH_NS) * 1e-9 - looked, 0.025, atol=2e-9)
+    _, first = np.unique(seen["sensor_time_ns"], return_index=True)
+    delay_s = (seen.log_time_ns - SIMULATION_EPOCH_NS) * 1e-9 - looked
+    assert_distributed(delay_s[first], expon(0.1, 0.05))
+    same_look = np.diff(seen["sensor_time_ns"]) == 0
+    assert_array_equal(np.diff(seen.log_time_ns)[same_look], 0)
+
+
+def test_relative_bearings_are_the_differences_of_all_pairs_of_a_look():
+    sensor = {"rate_hz": 5.0, "sigma_bearing_rad": 0.0}
+    streams = record(bearing=sensor, relative_bearing=sensor)
+    bearing, pairs = streams["/robot1/bearing"], streams["/robot1/relative_bearing"]
+    expected = [
+        (stamp, first, second, wrap_angle(bearing["bearing_rad"][i] - bearing["bearing_rad"][j]))
+        for stamp in np.unique(bearing.publish_time_ns)
+        for i, first in places(bearing, stamp)
+        for j, second in places(bearing, stamp)
+        if i < j
+    ]
+    found = sorted(zip(pairs.publish_time_ns, pairs["first_id"], pairs["second_id"], strict=True))
+    assert found == sorted(each[:3] for each in expected)
+    order = np.lexsort((pairs["second_id"], pairs["first_id"], pairs.publish_time_ns))
+    apart = wrap_angle(pairs["angle_rad"][order] - [each[3] for each in sorted(expected)])
+    assert_allclose(apart, 0, atol=1e-12)
+
+
+def places(stream: Stream, stamp: int) -> list[tuple[int, int]]:
+    """Row and target of the messages of one stamp."""
+    rows = np.flatnonzero(stream.publish_time_ns == stamp)
+    return [(int(row), int(stream["target_id"][row])) for row in rows]
+
+
+# Motion.
+
+
+def driven(streams: dict[str, Stream], robot: int = 1) -> tuple[Floats, Floats]:
+    """The true velocities (steps, 2) between the truth's stamps, and the odometry's."""
+    pose = streams[f"/robot{robot}/truth"]["state"]
+    odometry = streams[f"/robot{robot}/odometry"]
+    turn = wrap_angle(np.diff(pose[:, 2])) * 20
+    along = np.hypot(*np.diff(pose[:, :2], axis=0).T) / np.sinc(turn / 40 / np.pi) * 20
+    said = np.stack([odometry["forward_mps"], odometry["turn_radps"]], axis=1)
+    back = np.cos(np.arctan2(*np.diff(pose[:, :2], axis=0).T[::-1]) - pose[:-1, 2] - turn / 40)
+    return np.stack([along * np.sign(back), turn], axis=1), said
+
+
+def test_odometry_errs_by_white_noise_of_its_density_scale_and_bias():
+    streams = record(
+        duration_s=200.0, forward_noise_density=0.04, turn_noise_density=0.03, speed_mps=1.0
+    )
+    true, said = driven(streams)
+    for k, density in enumerate((0.04, 0.03)):
+        errors = true[:, k] - said[:, k]
+        assert_distributed(errors, norm(0, density * np.sqrt(20)))
+        bound = norm.isf(SURE / 2) / np.sqrt(len(errors))
+        assert abs(np.corrcoef(errors[1:], errors[:-1])[0, 1]) < bound
+    noiseless = {"forward_noise_density": 0.0, "turn_noise_density": 0.0}
+    true, said = driven(record(**noiseless, forward_scale_error=0.1, turn_bias_radps=-0.02))
+    assert_allclose(true[:, 0], 1.1 * said[:, 0], atol=1e-9)
+    assert_allclose(true[:, 1], said[:, 1] - 0.02, atol=1e-9)
+
+
+def test_truth_is_what_the_true_velocities_drive():
+    """Poses follow one another by the arc; the estimators rely on the same function."""
+    streams = record()
+    true, _ = driven(streams)
+    pose = streams["/robot1/truth"]["state"]
+    moved = np.transpose(drive(pose[:-1].T, true.T, 0.05))
+    assert_allclose(moved[:, :2], pose[1:, :2], atol=1e-9)
+    assert_allclose(wrap_angle(moved[:, 2] - pose[1:, 2]), 0, atol=1e-9)
+
+
+def test_priors_err_as_they_say():
+    """Over 300 runs the normalised squares are chi-square with three degrees."""
+    squares = []
+    for run in range(300):
+        streams = record(run=run, duration_s=0.1, landmarks=0, prior_sigma_m=0.5, prior_sigma_rad=0.2)
+        prior, truth = streams["/robot1/prior"], streams["/robot1/truth"]
+        error = prior["mean"][0] - truth["state"][0]
+        error[2] = wrap_angle(error[2])
+        squares.append(error @ np.linalg.inv(prior["covariance"].reshape(3, 3)) @ error)
+    assert_distributed(np.array(squares), chi2(3))
+
+
+def test_robots_see_each_other_where_they_are():
+    streams = record(robots=3, robots_see_each_other=True, landmarks=4)
+    seen = streams["/robot1/range_bearing"]
+    assert set(seen["target_id"].tolist()) <= {2, 3, *streams["/landmarks"]["landmark_id"].tolist()}
+    for other in (2, 3):
+        rows = seen["target_id"] == other
+        assert rows.sum() > 50
+        at = np.searchsorted(streams["/robot1/truth"].publish_time_ns, seen.publish_time_ns[rows])
+        apart = (streams[f"/robot{other}/truth"]["state"] - streams["/robot1/truth"]["state"])[at, :2]
+        assert_distributed(seen["range_m"][rows] - np.hypot(*apart.T), norm(0, 0.1))
+
+
+# Random streams.
+
+
+def same(first: Stream, second: Stream) -> bool:
+    return first.columns.keys() == second.columns.keys() and all(
+        np.array_equal(column, second.columns[name]) for name, column in first.columns.items()
+    )
+
+
+def test_a_seed_and_a_run_give_the_same_numbers_and_others_give_others():
+    first, again = record(seed=7, run=3), record(seed=7, run=3)
+    assert first.keys() == again.keys()
+    assert all(same(first[topic], again[topic]) for topic in first)
+    for other in (record(seed=7, run=4), record(seed=8, run=3)):
+        assert not any(same(first[topic], other[topic]) for topic in first)
+
+
+def test_runs_are_independent():
+    """The noise of neighbouring runs and seeds is not correlated."""
+    runs = [
+        residuals(record(seed, run), "/robot1/range_bearing")[0][:1000]
+        for seed in (1, 2)
+        for run in (0, 1)
+    ]
+    correlation = np.corrcoef(runs)[np.triu_indices(4, 1)]
+    assert np.abs(correlation).max() < norm.isf(SURE / 2) / np.sqrt(1000)
+
+
+def test_another_robot_or_sensor_changes_no_other_stream():
+    """Each draws from a random stream of its own; only the landmarks' numbers follow the robots'."""
+    alone = record()
+    crowded = record(robots=3, bearing={"rate_hz": 2.0}, relative_bearing={"rate_hz": 3.0})
+    for topic in ("/robot1/truth", "/robot1/odometry", "/robot1/prior"):
+        assert same(alone[topic], crowded[topic])
+    assert_array_equal(alone["/landmarks"]["position_m"], crowded["/landmarks"]["position_m"])
+    seen, seen_too = alone["/robot1/range_bearing"], crowded["/robot1/range_bearing"]
+    assert_array_equal(seen["range_m"], seen_too["range_m"])
+    assert_array_equal(seen["target_id"] + 2, seen_too["target_id"])
+    faulty = record(odometry_latency_s=1.0, range_bearing={"rate_hz": 5.0, "latency_s": 1.0})
+    assert same(alone["/robot1/range_bearing"], faulty["/robot1/range_bearing"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"robots": 0}, "'robots' is 0"),
+        ({"range": {"dropout_probability": 1.5}}, r"'range\.dropout_probability' is 1.5"),
+        ({"range": {"speed": 1}}, r"no parameter 'range\.speed'; there are: rate_hz"),
+        ({"duration_s": float("nan")}, "'duration_s' is nan"),
+        ({"forward_scale_error": -1.0}, "'forward_scale_error' is -1"),
+    ],
+)
+def test_impossible_parameters_are_refused_by_name(parameters: dict[str, object], words: str):
+    with pytest.raises(BadInput, match=words):
+        record(**parameters)
