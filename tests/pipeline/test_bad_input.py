@@ -140,10 +140,10 @@ TABLE: dict[str, tuple[str, ...]] = {
     "import mrclam mrclam-empty-Robot1_Groundtruth": ("Robot1_Groundtruth.dat", "no data"),
     "import mrclam mrclam-empty-Robot1_Odometry": ("Robot1_Odometry.dat", "no data"),
     "import mrclam mrclam-empty-Landmark_Groundtruth": ("Landmark_Groundtruth.dat", "no data"),
-    "import mrclam mrclam-words": ("Robot1_Odometry.dat", "row 1", "'fast'"),
+    "import mrclam mrclam-words": ("Robot1_Odometry.dat", "row 1", "fast, no number"),
     "import mrclam mrclam-columns": ("Robot1_Odometry.dat", "3 columns"),
     "import mrclam mrclam-ragged": ("Robot1_Odometry.dat", "columns"),
-    "import mrclam mrclam-past": ("Robot1_Odometry.dat", "negative"),
+    "import mrclam mrclam-past": ("Robot1_Odometry.dat", "no time in seconds since 1970"),
     "import mrclam mrclam-nan": ("Robot1_Groundtruth.dat", "row 1", "nan"),
     "run mrclam --data folder": ("Barcodes.dat", "missing"),
     # results
