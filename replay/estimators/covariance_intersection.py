@@ -23,6 +23,7 @@ from replay.estimators.gaussian import Floats, Function, cholesky
 Criterion = Literal["trace", "determinant"]
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
 SINGULAR = 1e-13
+ITERATIONS = 10_000
 GOLDEN = 0.6180339887498949
 
 
@@ -84,21 +85,29 @@ def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats)
             total[row, column] = share * left[row, column] + rest * right[row, column]
 
 
+def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
+    """Fill the covariance of the weighted sum of informations, (14)."""
+    size = len(covariance)
+    total = np.zeros((size, size))
+    for i in range(count):
+        for row in range(size):
+            for column in range(row + 1):
+                total[row, column] += weights[i] * information[i, row, column]
+    return inverted(total, covariance)
+
+
 def combined(
     count: int, weights: Floats, information: Floats, means: Floats, mean: Floats, covariance: Floats
 ) -> bool:
     """Fill mean and covariance of the weighted sum of informations, (14) and (15)."""
+    if not summed(count, weights, information, covariance):
+        return False
     size = len(mean)
-    total = np.zeros((size, size))
     vector = np.zeros(size)
     for i in range(count):
         for row in range(size):
-            for column in range(size):
-                weighted = weights[i] * information[i, row, column]
-                total[row, column] += weighted
-                vector[row] += weighted * means[i, column]
-    if not inverted(total, covariance):
-        return False
+            for k in range(size):
+                vector[row] += weights[i] * information[i, row, k] * means[i, k]
     for row in range(size):
         mean[row] = 0.0
         for k in range(size):
@@ -106,34 +115,34 @@ def combined(
     return True
 
 
-def by_trace(information: Floats, covariance: Floats) -> float:
-    """The gain of a weight: tr(I_i P^2) / tr P, which is at most 1 for all i at the least trace."""
-    size = len(covariance)
-    gain, trace = 0.0, 0.0
-    for row in range(size):
+def trace_slope(covariance: Floats, slope: Floats) -> None:
+    """Fill P^2 / tr P: the criterion gains tr(I_i slope) by weight i."""
+    trace = 0.0
+    for row in range(len(covariance)):
         trace += covariance[row, row]
-        for column in range(size):
+        for column in range(row + 1):
             squared = 0.0
-            for k in range(size):
-                squared += covariance[row, k] * covariance[k, column]
-            gain += information[row, column] * squared
-    return np.sqrt(gain / trace)
+            for k in range(len(covariance)):
+                squared += covariance[row, k] * covariance[column, k]
+            slope[row, column] = squared
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            slope[row, column] /= trace
+            slope[column, row] = slope[row, column]
 
 
-def by_determinant(information: Floats, covariance: Floats) -> float:
-    """The gain of a weight: tr(I_i P) / n, which is at most 1 for all i at the least determinant."""
+def determinant_slope(covariance: Floats, slope: Floats) -> None:
+    """Fill P / n: the criterion gains tr(I_i slope) by weight i."""
     size = len(covariance)
-    gain = 0.0
     for row in range(size):
         for column in range(size):
-            gain += information[row, column] * covariance[row, column]
-    return gain / size
+            slope[row, column] = covariance[row, column] / size
 
 
-def optimised(gain_of: Function, power: int, tolerance: float, iterations: int) -> Function:
-    """Weights by w_i <- w_i gain_i, normalised, until no weight can gain more than the tolerance.
+def optimised(fill_slope: Function, power: float, tolerance: float, iterations: int) -> Function:
+    """Weights by w_i <- w_i g_i^power, normalised, until none can gain more than the tolerance.
 
-    `gain_of` is the gradient's ratio to the power 1 / `power`.
+    At the least criterion no gain g_i = tr(I_i slope) exceeds 1, and those of weights above 0 are 1.
     """
 
     def weigh(
@@ -146,22 +155,30 @@ def optimised(gain_of: Function, power: int, tolerance: float, iterations: int) 
         covariance: Floats,
     ) -> float:
         gap = np.inf
-        gain = np.empty(count)
+        size = len(mean)
+        slope = np.empty((size, size))
         for i in range(count):
             weights[i] = 1.0 / count
         for _ in range(iterations):
-            if not combined(count, weights, information, means, mean, covariance):
+            if not summed(count, weights, information, covariance):
                 return np.inf
+            fill_slope(covariance, slope)
             total, gap = 0.0, -np.inf
+            before = weights[:count].copy()
             for i in range(count):
-                gain[i] = gain_of(information[i], covariance)
-                gap = max(gap, gain[i] ** power - 1.0)
-                total += weights[i] * gain[i]
+                gain = 0.0
+                for row in range(size):
+                    for k in range(size):
+                        gain += information[i, row, k] * slope[row, k]
+                gap = max(gap, gain - 1.0)
+                weights[i] *= gain**power
+                total += weights[i]
             if gap <= tolerance:
+                weights[:count] = before
                 break
             for i in range(count):
-                weights[i] *= gain[i] / total
-        return gap
+                weights[i] /= total
+        return gap if combined(count, weights, information, means, mean, covariance) else np.inf
 
     return weigh
 
@@ -339,6 +356,11 @@ def mix_split(
     return True
 
 
+def steps_for(tolerance: float) -> int:
+    """How many steps of a golden section leave a tenth of the root of the tolerance."""
+    return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
+
+
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
     """Where in (0, 1) a search for the least value looks next, after `value` at the last place.
 
@@ -429,27 +451,29 @@ def pairwise(mix: Function, steps: int) -> Function:
     return fuse
 
 
-RULES: dict[str, Callable[[float, int], Function]] = {
-    "ci-trace": lambda tolerance, iterations: weighted(optimised(by_trace, 2, tolerance, iterations)),
-    "ci-determinant": lambda tolerance, iterations: weighted(
-        optimised(by_determinant, 1, tolerance, iterations)
+RULES: dict[str, Callable[[float], Function]] = {
+    "ci-trace": lambda tolerance: weighted(optimised(trace_slope, 0.5, tolerance, ITERATIONS)),
+    "ci-determinant": lambda tolerance: weighted(
+        optimised(determinant_slope, 1.0, tolerance, ITERATIONS)
     ),
-    "niehsen": lambda _, __: weighted(weigh_by_trace_inverse),
-    "franken": lambda _, __: weighted(weigh_by_shares),
-    "naive": lambda _, __: weighted(weigh_fully),
-    "inverse-ci": lambda _, __: pairwise(mix_inverse, 40),
-    "split-ci": lambda _, __: pairwise(mix_split, 40),
+    "niehsen": lambda _: weighted(weigh_by_trace_inverse),
+    "franken": lambda _: weighted(weigh_by_shares),
+    "naive": lambda _: weighted(weigh_fully),
+    "inverse-ci": lambda tolerance: pairwise(mix_inverse, steps_for(tolerance)),
+    "split-ci": lambda tolerance: pairwise(mix_split, steps_for(tolerance)),
 }
 
 
-def rule(name: str, tolerance: float, iterations: int = 10_000) -> Function:
-    """The rule of a name of RULES; `tolerance` bounds the gap where weights are optimised.
+def rule(name: str, tolerance: float) -> Function:
+    """The rule of a name of RULES.
 
+    `tolerance` bounds the gap where weights are optimised together, and the square of ten times a
+    single weight's error.
     Raises BadInput for another name.
     """
     if name not in RULES:
         raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
-    return RULES[name](tolerance, iterations)
+    return RULES[name](tolerance)
 
 
 @lru_cache(maxsize=16)
