@@ -239,15 +239,20 @@ def box(border: Arcs) -> Arena:
     return Arena(every.min(axis=0), every.max(axis=0))
 
 
-def rings(border: Arcs, tolerance_m: float = 1e-3) -> list[Floats]:
-    """The border as closed polygons (n, 2), the set on the left, sagitta within the tolerance."""
+def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
+    """Closed polygons (n, 2) around the set, which is on their left.
+
+    They hold the set: vertices are on arcs that bend inwards and outside of those that bend outwards.
+    Together they are larger than it by no more than the tolerance, in units of its area.
+    """
+    tolerance_m = relative_tolerance * max(area(border), 1e-12) / max(border.length.sum(), 1e-12)
     end = border.at(border.length)
     left = set(range(len(border.length)))
     found: list[Floats] = []
     while left:
         current = left.pop()
         origin = border.start[current]
-        corners = [_sampled(border, current, tolerance_m)]
+        corners = [_vertices(border, current, tolerance_m)]
         while left:
             candidates = np.array(sorted(left))
             gaps = np.linalg.norm(border.start[candidates] - end[current], axis=1)
@@ -255,17 +260,27 @@ def rings(border: Arcs, tolerance_m: float = 1e-3) -> list[Floats]:
                 break
             current = int(candidates[np.argmin(gaps)])
             left.remove(current)
-            corners.append(_sampled(border, current, tolerance_m))
+            corners.append(_vertices(border, current, tolerance_m))
         found.append(np.concatenate(corners))
     return found
 
 
-def _sampled(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """Points along one arc, its end left out."""
-    length = border.length[index]
-    count = int(np.ceil(length * np.sqrt(np.abs(border.curvature[index]) / (8 * tolerance_m)))) + 1
-    arc = Arcs(*(np.repeat(part[index : index + 1], count, axis=0) for part in border))
-    return arc.at(np.linspace(0.0, length, count, endpoint=False))
+def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
+    """A polygon's vertices along one arc, its end left out; tangents meet outside of convex arcs."""
+    length, curvature = border.length[index], border.curvature[index]
+    pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
+    pieces = max(pieces, int(np.ceil(abs(length * curvature))))
+    step = length / pieces
+    convex = curvature > 0
+    along = step * (np.arange(pieces) + (0.5 if convex else 0.0))
+    arc = Arcs(*(np.repeat(part[index : index + 1], pieces, axis=0) for part in border))
+    points = arc.at(along)
+    if not convex:
+        return points
+    heading = border.heading_rad[index] + curvature * along
+    outward = np.stack([np.sin(heading), -np.cos(heading)], axis=1)
+    beyond = (1.0 / np.cos(0.5 * step * curvature) - 1.0) / curvature
+    return np.concatenate([border.start[index : index + 1], points + beyond * outward])
 
 
 def to_blame(pairs: Pairs, arena: Arena) -> NDArray[np.int64]:
