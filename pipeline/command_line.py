@@ -140,7 +140,9 @@ def evaluate(estimates: tuple[Path, ...], logs: tuple[Path, ...], **options: Any
 @click.option("--at", "at_s", type=float, help="Put the time cursor this many seconds into the run.")
 @click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
+@click.option("--focus", help="What to show first, such as robot3.")
 @recover_option
+@gap_option
 def view(path: Path, **options: Any) -> None:
     """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
     from pipeline.commands import view_path

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
@@ -17,6 +18,8 @@ from recorders.recording import Importer
 from recorders.registry import available, load
 from replay.blocks import Ragged, gather
 from replay.sources import LogSource
+from replay.timeline import viewer
+from replay.timeline.show import recorded_outputs, show
 
 
 def _source(
@@ -147,7 +150,8 @@ def _print_outcome(replayed: Replayed, *, as_json: bool, written: Sequence[Path]
 
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
-    raise BadInput("the timeline is not here yet")
+    """Draw the first run."""
+    show(replayed.sources[0], replayed.outputs, replayed.errors, save=save, connect=connect)
 
 
 def view_path(
@@ -155,12 +159,39 @@ def view_path(
     *,
     screenshot: Path | None,
     at_s: float | None,
+    focus: str | None,
     save: Path | None,
     connect: str | None,
+    gap_limit_s: float,
     recover: bool,
 ) -> None:
-    """Open what a path holds in the viewer, or take its picture."""
-    raise BadInput("the timeline is not here yet")
+    """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    with TemporaryDirectory(prefix="fuselog-view-") as folder:
+        rrd = path / "timeline.rrd" if path.is_dir() else path
+        if rrd.suffix != ".rrd":
+            rrd = save or Path(folder) / "timeline.rrd"
+            _draw_log(path, rrd, connect, focus, gap_limit_s, recover=recover)
+        elif save is not None or connect is not None or focus is not None:
+            raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
+        if screenshot is not None:
+            for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
+                err.print(f"fuselog: {complaint}", highlight=False)
+        elif save is None and connect is None:
+            viewer.view(rrd)
+
+
+def _draw_log(
+    path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
+) -> None:
+    """Draw a log, or an estimates log together with the log that it is of."""
+    log = open_log(path, recover=recover)
+    source = LogSource(log)
+    outputs = recorded_outputs(source)
+    if outputs and log.run is not None and "log" in log.run.notes:
+        source = _source(source_path(log), recover=recover)
+    replayed = judge([source], outputs, gap_limit_s)
+    show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
+    _state_losses([source])
 
 
 def run_named(

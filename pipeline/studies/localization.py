@@ -31,6 +31,7 @@ from replay.evaluation import (
     step_table,
 )
 from replay.sources import MemorySource, memory_source
+from replay.timeline.show import show
 
 
 def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
@@ -43,6 +44,7 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
         progress=setting.progress,
     )
     write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
     return summarise(replayed), hash_streams(sources)
 
 

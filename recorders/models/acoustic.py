@@ -1,0 +1,131 @@
+"""What an acoustic sensor hears of a supersonic shot, in the plane.
+
+Osborne, Bar-Shalom, George and Kaplan, "Statistical Efficiency of Target Localization from Angle and
+Shockwave Measurements", JAIF 2014. Angles are anticlockwise from the x axis, in rad. Component-first:
+`Components` are a tuple of components or an array whose first axis is the component; components are
+numbers or arrays and broadcast.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.models.planar import Component, Components, wrap_angle
+
+
+class Medium(NamedTuple):
+    """The air, and the bullet's constant speed in multiples of that of sound."""
+
+    speed_of_sound_mps: float = 342.0
+    mach_number: float = 2.0
+
+    @property
+    def mach_angle_rad(self) -> float:
+        """Half the opening of the shockwave's cone; eq (5)."""
+        return float(np.arcsin(1.0 / self.mach_number))
+
+
+class Noise(NamedTuple):
+    """Standard deviations of what a sensor measures; `position_m` is that of its GPS, per axis."""
+
+    muzzle_blast_rad: float
+    shockwave_rad: float
+    time_difference_s: float
+    position_m: float
+
+
+def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, Component]:
+    """Direction of arrival of the muzzle blast, eq (6) with atan2, and the distance in m."""
+    x, y = shooter[0] - sensor[0], shooter[1] - sensor[1]
+    return np.arctan2(y, x), np.hypot(x, y)
+
+
+def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
+    """On which side of the line of fire a sensor hears the shockwave: +1 or -1; 0 where it does not.
+
+    It does within 90 deg less the Mach angle of the line, the line itself left out (figure 2). Eq (7)
+    says the same, but for angles that need wrapping.
+    """
+    off_line = wrap_angle(azimuth - np.pi - trajectory)
+    return np.where(np.abs(off_line) < 0.5 * np.pi - medium.mach_angle_rad, np.sign(off_line), 0.0)
+
+
+def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) -> Component:
+    """Direction of arrival of the shockwave; eq (7)."""
+    return trajectory - side * (0.5 * np.pi + medium.mach_angle_rad)
+
+
+def measured_side(azimuth: Component, shockwave: Component) -> Component:
+    """The side of the line of fire that follows from the two directions of arrival alone."""
+    return -np.sign(wrap_angle(azimuth - shockwave))
+
+
+def trajectory_from_shockwave(shockwave: Component, side: Component, medium: Medium) -> Component:
+    """The bullet's direction, eq (7) turned around."""
+    return wrap_angle(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
+
+
+def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:
+    """Seconds from shockwave to muzzle blast; `separation` is muzzle blast less shockwave direction."""
+    return distance * (1.0 - np.cos(separation)) / medium.speed_of_sound_mps
+
+
+def time_difference_gradient(
+    distance: Component, separation: Component, medium: Medium
+) -> tuple[Component, Component]:
+    """Derivatives of `time_difference` by distance and by separation."""
+    speed = medium.speed_of_sound_mps
+    return (1.0 - np.cos(separation)) / speed, distance * np.sin(separation) / speed
+
+
+def range_from_time_difference(delay: Component, separation: Component, medium: Medium) -> Component:
+    """The distance to the shooter in m; eq (9)."""
+    return medium.speed_of_sound_mps * delay / (1.0 - np.cos(separation))
+
+
+def hear(
+    shooter: Components, trajectory: Component, sensor: Components, medium: Medium
+) -> tuple[Component, Component, Component]:
+    """Both directions of arrival and the time difference; NaN for a shockwave that is not heard."""
+    azimuth, distance = azimuth_range(shooter, sensor)
+    side = shockwave_side(azimuth, trajectory, medium)
+    shockwave = np.where(side == 0.0, np.nan, shockwave_azimuth(trajectory, side, medium))
+    return azimuth, wrap_angle(shockwave), time_difference(distance, azimuth - shockwave, medium)
+
+
+def local_estimate_covariances(
+    distance: Component, separation: Component, noise: Noise, medium: Medium
+) -> tuple[Component, Component, Component]:
+    """Variance of the range estimate, and its covariances with azimuth and trajectory.
+
+    Eq (26), whose numerator has c^2 sigma_tau^2, in m^2; eqs (17) and (18) in m rad.
+    """
+    missing = 1.0 - np.cos(separation)
+    lever = distance * np.sin(separation) / missing
+    delay = medium.speed_of_sound_mps * noise.time_difference_s / missing
+    angles = noise.muzzle_blast_rad**2 + noise.shockwave_rad**2
+    return (
+        delay**2 + lever**2 * angles,
+        -lever * noise.muzzle_blast_rad**2,
+        lever * noise.shockwave_rad**2,
+    )
+
+
+def local_estimate_covariance_gradients(
+    distance: Component, separation: Component, noise: Noise, medium: Medium
+) -> tuple[tuple[Component, Component], ...]:
+    """Derivatives of `local_estimate_covariances` by distance and by separation.
+
+    With the chain rule these are eqs (63)-(77).
+    """
+    missing = 1.0 - np.cos(separation)
+    sine = np.sin(separation)
+    slope = sine / missing
+    delay = medium.speed_of_sound_mps * noise.time_difference_s / missing
+    angles = noise.muzzle_blast_rad**2 + noise.shockwave_rad**2
+    # d(sine / missing) / d separation = -1 / missing
+    return (
+        (2.0 * distance * slope**2 * angles, -2.0 * slope * (delay**2 + distance**2 * angles / missing)),
+        (-slope * noise.muzzle_blast_rad**2, distance / missing * noise.muzzle_blast_rad**2),
+        (slope * noise.shockwave_rad**2, -distance / missing * noise.shockwave_rad**2),
+    )

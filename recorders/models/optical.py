@@ -1,0 +1,111 @@
+"""Line of sight of an optical sensor whose attitude may be biased.
+
+Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements
+with Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an
+array whose first axis is the component; components are numbers or arrays and broadcast.
+"""
+
+import numpy as np
+
+from recorders.models.planar import Component, Components
+
+Triple = tuple[Component, Component, Component]
+
+
+def azimuth_elevation(x: Components) -> tuple[Component, Component]:
+    """Angles in rad to the point `x` (3, ...) in the sensor's frame, y up; eq (3) with atan2."""
+    return np.arctan2(x[0], x[2]), np.arctan2(x[1], np.hypot(x[0], x[2]))
+
+
+def azimuth_elevation_gradients(x: Components) -> tuple[Triple, Triple]:
+    """Gradients in rad/m of azimuth and elevation by `x`; eqs (71)-(76), (74) with its root mended."""
+    ground = np.hypot(x[0], x[2])
+    squared = ground**2 + x[1] ** 2
+    azimuth = (x[2] / ground**2, 0.0 * x[1], -x[0] / ground**2)
+    slope = -x[1] / (ground * squared)
+    return azimuth, (x[0] * slope, ground / squared, x[2] * slope)
+
+
+def rotate(attitude: Components, x: Components) -> Triple:
+    """Turn `x` into the frame of a sensor with attitude (yaw, pitch, roll) in rad.
+
+    That is Rz(yaw) Ry(pitch) Rx(roll) x with active rotations, as the paper's appendix and tables have
+    it; its eq (1) is this with every angle negated.
+    """
+    yaw, pitch, roll = attitude
+    return _about_z(yaw, _about_y(pitch, _about_x(roll, x)))
+
+
+def line_of_sight(
+    target: Components, sensor: Components, attitude: Components
+) -> tuple[Component, Component]:
+    """Azimuth and elevation in rad of a target in m, eqs (2)-(4); `attitude` includes the bias."""
+    return azimuth_elevation(rotate(attitude, _subtract(target, sensor)))
+
+
+def line_of_sight_gradients(
+    target: Components, sensor: Components, attitude: Components
+) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
+    """Gradients of azimuth and elevation by target x, y, z (rad/m) and yaw, pitch, roll (rad/rad).
+
+    The chain rule backwards through the three rotations; equals eqs (45)-(103) of the appendix once
+    its misprints in (67), (74), (89), (92) and (102) are mended.
+    """
+    yaw, pitch, roll = attitude
+    offset = _subtract(target, sensor)
+    pitched = _about_y(pitch, _about_x(roll, offset))
+    seen = _about_z(yaw, pitched)
+
+    def pull_back(gradient: Triple) -> tuple[Component, ...]:
+        by_pitched = _about_z(-yaw, gradient)
+        by_target = _about_x(-roll, _about_y(-pitch, by_pitched))
+        return (
+            *by_target,
+            gradient[1] * seen[0] - gradient[0] * seen[1],
+            by_pitched[0] * pitched[2] - by_pitched[2] * pitched[0],
+            by_target[2] * offset[1] - by_target[1] * offset[2],
+        )
+
+    azimuth, elevation = azimuth_elevation_gradients(seen)
+    return pull_back(azimuth), pull_back(elevation)
+
+
+def direction(azimuth: Component, elevation: Component, attitude: Components) -> Triple:
+    """Unit vector, in the common frame, along which a sensor of this attitude sees these angles."""
+    yaw, pitch, roll = attitude
+    level = np.cos(elevation)
+    seen = (level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth))
+    return _about_x(-roll, _about_y(-pitch, _about_z(-yaw, seen)))
+
+
+def turning_vector(attitude: Components, change: Components) -> Triple:
+    """The small rotation vector of the scene, in the common frame, that a change of attitude hides.
+
+    When the scene turns by it about the sensor while the attitude changes by `change` (yaw, pitch,
+    roll), the sensor sees what it saw before.
+    """
+    _, pitch, roll = attitude
+    yawed, pitched, rolled = change
+    zero = 0.0 * rolled
+    by_yaw = _about_x(-roll, _about_y(-pitch, (zero, zero, yawed)))
+    by_pitch = _about_x(-roll, (zero, pitched, zero))
+    return -by_yaw[0] - by_pitch[0] - rolled, -by_yaw[1] - by_pitch[1], -by_yaw[2] - by_pitch[2]
+
+
+def _subtract(x: Components, y: Components) -> Triple:
+    return x[0] - y[0], x[1] - y[1], x[2] - y[2]
+
+
+def _about_x(angle: Component, x: Components) -> Triple:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return x[0], cosine * x[1] - sine * x[2], sine * x[1] + cosine * x[2]
+
+
+def _about_y(angle: Component, x: Components) -> Triple:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return cosine * x[0] + sine * x[2], x[1], cosine * x[2] - sine * x[0]
+
+
+def _about_z(angle: Component, x: Components) -> Triple:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return cosine * x[0] - sine * x[1], sine * x[0] + cosine * x[1], x[2]

@@ -1,0 +1,28 @@
+"""Where rays meet: the starting point of localization from angles."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Rays closer to parallel than this (smallest eigenvalue of the mean projector) do not meet.
+PARALLEL = 1e-12
+
+
+def intersect_rays(origin_m: Array, direction: Array) -> Array:
+    """The point nearest to rays in least squares, (..., d): (sum(I - u u'))^-1 sum((I - u u') origin).
+
+    Unit vectors `direction` u are (..., rays, d), origins (rays, d) or alike; a ray of NaNs is left out.
+    NaN where the rays do not meet: fewer than two are left, all are parallel, or all point away from it.
+    """
+    missing = np.isnan(direction)
+    unit = np.where(missing, 0.0, direction)
+    origin = np.broadcast_to(origin_m, unit.shape)
+    identity = np.eye(unit.shape[-1])
+    projector = np.where(missing[..., None], 0.0, identity) - unit[..., :, None] * unit[..., None, :]
+    normal = projector.sum(axis=-3)
+    moment = (projector @ origin[..., None]).sum(axis=-3)
+    meet = np.linalg.eigvalsh(normal)[..., :1] > PARALLEL * unit.shape[-2]
+    point = np.linalg.solve(np.where(meet[..., None], normal, identity), moment)[..., 0]
+    ahead = ((point[..., None, :] - origin) * unit).sum(axis=-1) > 0.0
+    return np.where(meet & ahead.any(axis=-1, keepdims=True), point, np.nan)

@@ -1,0 +1,19 @@
+"""Sample sets of N(0, I) for linear regression Kalman filters, and where they are kept."""
+
+from replay.sampling.cache import SetName, cached_set
+from replay.sampling.distance import lcd_distance
+from replay.sampling.lcd import lcd_samples, moment_corrected
+from replay.sampling.names import Sampling, parse_sampling
+from replay.sampling.samplers import Sampler, Samples
+
+__all__ = [
+    "Sampler",
+    "Samples",
+    "Sampling",
+    "SetName",
+    "cached_set",
+    "lcd_distance",
+    "lcd_samples",
+    "moment_corrected",
+    "parse_sampling",
+]

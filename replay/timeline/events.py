@@ -1,0 +1,94 @@
+"""What happened in a run, as text: gated measurements, failures, and spans without a sensor."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorders.log import Stream, schemas
+from replay.timeline.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
+
+NOT_SENSED = frozenset(
+    schema.full_name
+    for schema in (
+        schemas.LANDMARK,
+        schemas.TRUTH_STATE,
+        schemas.OUTAGE,
+        schemas.LINK_EVENT,
+        schemas.GAUSSIAN_ESTIMATE,
+    )
+)
+
+
+class Happened(NamedTuple):
+    """What happened to an estimator or a sensor: a text for each time, all of one level."""
+
+    who: str
+    level: str
+    time_ns: Times
+    texts: list[str]
+
+
+def draw_events(canvas: Canvas, scene: Scene, case: str) -> rrb.TextLogView:
+    """The events of a case: one entity per estimator and sensor."""
+    root = entity_path("events", case)
+    for who, level, time_ns, texts in (*_of_estimators(scene, case), *_of_sensors(scene, case)):
+        lines = [f"{who}: {text}" for text in texts]
+        columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
+        canvas.send(f"{root}/{who}", time_ns, columns)
+    shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
+
+
+def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
+    for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
+        times = stream.publish_time_ns
+        drawn, span_s = len(thin(times)), (times[-1] - times[0]) * 1e-9
+        if drawn < len(times):
+            text = f"drawn at {drawn / span_s:.3g} Hz of {len(times) / span_s:.3g} Hz"
+            yield Happened(estimator, "INFO", times[:1], [text])
+    for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
+        gated = stream.take(stream["accepted"] == 0)
+        squares = gated["normalised_innovation_squared"].tolist()
+        texts = [
+            f"gated target {target}: NIS {square:.1f}"
+            for target, square in zip(gated["target_id"].tolist(), squares, strict=True)
+        ]
+        yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
+        reasons = stream.metadata.get("reasons", "").split("; ")
+        texts = [
+            f"failed: {reasons[reason] if reason < len(reasons) else reason}"
+            for reason in stream["reason"].tolist()
+        ]
+        yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
+
+
+def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
+    """Spans in which a sensor was dead, stated by the log or seen as a gap."""
+    for topic in scene.topics_near(case):
+        if scene.source.topics[topic].schema_name in NOT_SENSED:
+            continue
+        outages = np.empty((0, 2), np.int64)
+        if f"{topic}/outages" in scene.source.topics:
+            stated = scene.read(f"{topic}/outages")
+            outages = np.stack([stated.publish_time_ns, stated["end_time_ns"]], axis=1)
+        gaps = _gaps(scene.read(topic))
+        explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
+        sensor = topic.removeprefix(f"/{case}").removeprefix("/")
+        yield _spans(sensor, "dead for", outages)
+        yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])
+
+
+def _gaps(stream: Stream) -> Times:
+    """Where a sensor was silent for much longer than usual: (n, 2), from and to."""
+    times = stream.publish_time_ns
+    long = np.diff(times) > gap_limit_ns(times)
+    return np.stack([times[:-1][long], times[1:][long]], axis=1)
+
+
+def _spans(sensor: str, what: str, spans: Times) -> Happened:
+    texts = [f"{what} {seconds:.1f} s" for seconds in (np.diff(spans)[:, 0] * 1e-9).tolist()]
+    return Happened(sensor, "WARN", spans[:, 0], texts)

@@ -1,0 +1,44 @@
+"""NEES, ellipses and dilution against numbers worked out by hand."""
+
+import numpy as np
+import pytest
+
+from recorders.errors import BadInput
+from replay.consistency import (
+    component_error_squared,
+    dilution_of_precision,
+    ellipse_area,
+    normalized_error_squared,
+)
+
+
+def test_nees_of_mixed_units() -> None:
+    """Metres beside microradians, correlated."""
+    sigma = np.array([1e4, 1e-6])
+    covariance = np.outer(sigma, sigma) * [[1.0, 0.5], [0.5, 1.0]]
+    error = np.array([[2e4, 1e-6], [0.0, 0.0]])
+    # (4 - 2 * 0.5 * 2 + 1) / (1 - 0.25)
+    np.testing.assert_allclose(normalized_error_squared(error, covariance), [4.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(component_error_squared(error, covariance)[0], [4.0, 1.0])
+
+
+def test_infinite_variance_counts_nothing_and_nan_stays_nan() -> None:
+    covariance = np.array([np.diag([4.0, np.inf]), np.diag([np.nan, 1.0])])
+    nees = normalized_error_squared(np.array([2.0, 5.0]), covariance)
+    assert nees[0] == pytest.approx(1.0)
+    assert np.isnan(nees[1])
+
+
+def test_singular_covariance_is_refused() -> None:
+    with pytest.raises(BadInput, match="singular"):
+        normalized_error_squared(np.ones(2), np.ones((2, 2)))
+
+
+def test_ellipse_area() -> None:
+    """95 % of a plane Gaussian lie within pi * 5.9915 * sqrt(det)."""
+    assert ellipse_area(np.diag([4.0, 9.0])) == pytest.approx(np.pi * 5.991464547 * 6.0)
+
+
+def test_dilution_of_precision() -> None:
+    """Eq (32): an error of range times total noise has dilution one."""
+    assert dilution_of_precision(5.0, 1000.0, np.array([3e-3, 4e-3])) == pytest.approx(1.0)
