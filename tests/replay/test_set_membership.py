@@ -57,7 +57,7 @@ def test_a_misidentified_landmark_is_a_fault_with_its_pair():
     _, right = judged(clean, ("exact",))
     assert right["exact"].faults == 0
     faults = replayed.outputs["/estimates/exact/robot1/fault"].stream
-    assert sets["exact"].faults > 10
+    assert sets["exact"].faults > 5
     spoilt, true = (each[0].streams["/robot1/relative_bearing"] for each in (sources, clean))
     # same seed, but the draws of wrong landmarks differ: a pair is wrong where it misses its true angle
     angle = {
