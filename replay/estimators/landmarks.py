@@ -316,7 +316,7 @@ def _sightings(
             target_id[at] = ragged["target_id"][row]
     run_of = np.repeat(np.arange(len(order.offsets) - 1), np.diff(order.offsets))
     sensor = order.topic - 1
-    target = _rows_on_map(landmarks, (run_of << 32) + target_id)
+    target = rows_on_map(landmarks, (run_of << 32) + target_id)
     started = order.time_ns >= start_ns[run_of]
     seen = (sensor >= 0) & (target >= 0) & started
     return Sightings(
@@ -330,7 +330,8 @@ def _sightings(
     ), target_id
 
 
-def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+def rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The rows of the map that keys (run * 2^32 + landmark) have, -1 where it lacks them."""
     if len(landmarks.keys) == 0:
         return np.full(len(keys), -1)
     rows = np.minimum(np.searchsorted(landmarks.keys, keys), len(landmarks.keys) - 1)
@@ -427,7 +428,7 @@ class Outputs(NamedTuple):
         return Ragged(stream, np.searchsorted(at, events.offsets))
 
 
-def _stated(topic: Topic, name: str, given: float | None) -> float:
+def stated(topic: Topic, name: str, given: float | None) -> float:
     """A parameter as given, else as the channel's metadata states it."""
     if given is not None:
         return given
@@ -488,8 +489,8 @@ def _settings(
     weights: Floats,
 ) -> Settings:
     density = [
-        _stated(odometry, "forward_noise_density", parameters.forward_noise_density),
-        _stated(odometry, "turn_noise_density", parameters.turn_noise_density),
+        stated(odometry, "forward_noise_density", parameters.forward_noise_density),
+        stated(odometry, "turn_noise_density", parameters.turn_noise_density),
     ]
     variance = np.full((len(sensed), 2), np.nan)
     bias = np.zeros(2)
@@ -497,10 +498,10 @@ def _settings(
     if isinstance(parameters, LocalizationParameters):
         for row, topic in enumerate(sensed):
             if not topic.endswith("/bearing"):
-                sigma = _stated(topics[topic], "sigma_range_m", parameters.sigma_range_m)
+                sigma = stated(topics[topic], "sigma_range_m", parameters.sigma_range_m)
                 variance[row, 0] = sigma**2
             if not topic.endswith("/range"):
-                sigma = _stated(topics[topic], "sigma_bearing_rad", parameters.sigma_bearing_rad)
+                sigma = stated(topics[topic], "sigma_bearing_rad", parameters.sigma_bearing_rad)
                 variance[row, 1] = sigma**2
         bias = np.array([parameters.bias_range_m, parameters.bias_bearing_rad])
         gate[1:] = chi2.ppf(parameters.gate_probability, [1, 2])
