@@ -1,9 +1,10 @@
 """Cooperative localization: robots that share position estimates when they see each other.
 
-Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees another, each
-of the two takes the sighting as a measurement of itself that rests on the other's estimate: as if
-that were independent (naive), or by covariance intersection (Jin, Lee, Hashimoto, DIND networks, 4.2 and
-5.2; the sensor's own noise is independent). The joint filter keeps all correlations, as a centre could.
+Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees
+another, each of the two takes the sighting as a measurement of itself that rests on the other's estimate:
+as if that were independent (naive), or by covariance intersection (Jin, Lee, Hashimoto, DIND networks,
+4.2 and 5.2; the sensor's own noise is independent). The joint filter keeps all correlations, as a centre
+could.
 """
 
 import copy
@@ -242,6 +243,8 @@ def cooperation(joint: bool, intersect: bool, share: bool) -> Function:
                             fill_spread(jacobian, here_before, other)
                         if intersect:
                             fused, fused_spread = np.empty(3), np.empty((3, 3))
+                            if is_outlier(rows, spread, other, own, innovation, settings.gate):
+                                continue
                             weight = sight(
                                 at.copy(),
                                 spread.copy(),
