@@ -1,7 +1,7 @@
 """Cooperative localization: robots that share position estimates when they see each other.
 
 Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees
-another, each of the two takes the sighting as a measurement of itself that rests on the other's estimate:
+another, each of the two takes the sighting as a measurement of itself that rests on the other one:
 as if that were independent (naive), or by covariance intersection (Jin, Lee, Hashimoto, DIND networks,
 4.2 and 5.2; the sensor's own noise is independent). The joint filter keeps all correlations, as a centre
 could.

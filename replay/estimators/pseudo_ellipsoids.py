@@ -24,7 +24,7 @@ Weighting = Literal["area", "batch", "determinant", "equal"]
 Size = Callable[[Floats], float]
 SEARCH_NODES = 120
 # of the literal filter's prior, in squared half arenas: wide, and yet not so wide that digits are lost
-PRIOR_VARIANCE = 1e3
+PRIOR_VARIANCE = 1e2
 
 
 class PseudoEllipsoid(NamedTuple):
