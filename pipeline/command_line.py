@@ -1,6 +1,10 @@
 """The command `fuselog`. Commands import what they need when they run: `--help` answers at once."""
 
+import io
+import math
+import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +12,41 @@ import click
 
 from recorders.errors import BadInput
 
+
+class OutputFile(click.Path):
+    """A file to write: a new one, or a regular one that is replaced; never a device or a folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, dir_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path."""
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if path.exists() and not path.is_file():
+            self.fail(f"{path} is no regular file", param, ctx)
+        return path
+
+
+class Seconds(click.FloatRange):
+    """A time in seconds that fits the stamps of a log."""
+
+    name = "seconds"
+
+    def __init__(self, minimum: float = -1e9) -> None:
+        super().__init__(minimum, 1e9)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number."""
+        seconds = float(super().convert(value, param, ctx))
+        if math.isnan(seconds):
+            self.fail(f"{value} is no number of seconds", param, ctx)
+        return seconds
+
+
 FOLDER = click.Path(path_type=Path, file_okay=False)
-FILE = click.Path(path_type=Path, dir_okay=False)
+FILE = OutputFile()
 ANY_PATH = click.Path(path_type=Path)
+COUNT = click.IntRange(min=0)
 
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
@@ -22,6 +58,7 @@ recover_option = click.option(
 gap_option = click.option(
     "--gap-limit",
     "gap_limit_s",
+    type=Seconds(0),
     default=0.2,
     show_default=True,
     help="Seconds over which truth is interpolated at most.",
@@ -34,19 +71,25 @@ def fuselog() -> None:
     """Record, replay, judge and look at estimators for sensor fusion."""
 
 
-@fuselog.command()
+@fuselog.command(short_help="Simulate a scenario and write its log.")
 @click.argument("scenario", required=False)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SCENARIO.mcap].")
-@click.option("--seed", default=0, show_default=True, help="Seed of the random numbers.")
-@click.option("--run", default=0, show_default=True, help="Which run of the seed.")
-@click.option("--again", type=FILE, help="Record the run of this log again, from its own metadata.")
-@click.option("--compression", default="zstd", show_default=True, help="zstd, lz4 or none.")
+@click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
+@click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
+@click.option("--again", type=ANY_PATH, help="Record the run of this log again, by its own metadata.")
+@click.option(
+    "--compression",
+    type=click.Choice(["zstd", "lz4", "none"]),
+    default="zstd",
+    show_default=True,
+    help="Of the log's chunks.",
+)
 @set_option
 def record(
     scenario: str | None,
     out: Path | None,
-    seed: int,
-    run: int,
+    seed: int | None,
+    run: int | None,
     again: Path | None,
     compression: str,
     settings: tuple[str, ...],
@@ -58,28 +101,30 @@ def record(
     from recorders.recording import record_run
 
     if (scenario is None) == (again is None):
-        raise BadInput("give a scenario or --again LOG; fuselog scenarios lists what there is")
+        raise BadInput("give either a scenario, one that fuselog scenarios lists, or --again LOG")
     if again is not None:
         source = open_log(again).run
         if source is None or source.seed is None:
             raise BadInput(f"{again}: the log does not say how it was simulated; name a scenario")
-        name, values, seed, run = source.scenario, source.parameters, source.seed, source.run
-        label = f"{again.stem}-again"
+        name, values, label = source.scenario, source.parameters, f"{again.stem}-again"
+        seed = source.seed if seed is None else seed
+        run = source.run if run is None else run
     else:
         name, values, label = load_scenario(scenario or "")
-    recording, metadata = record_run(name, merge(values, parse_settings(settings)), seed, run)
+    values = merge(values, parse_settings(settings))
+    recording, metadata = record_run(name, values, seed or 0, run or 0)
     path = out or Path(f"{label}.mcap")
     write_log(path, recording.streams, metadata, compression=compression)
     _say_written(path, sum(map(len, recording.streams)))
 
 
-@fuselog.command(name="import")
+@fuselog.command(name="import", short_help="Import real data and write their log.")
 @click.argument("source")
 @click.argument("path", type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
 @set_option
 def import_(source: str, path: Path, out: Path | None, settings: tuple[str, ...]) -> None:
-    """Import real data of kind SOURCE from PATH, as published, and write its log."""
+    """Import real data of kind SOURCE from PATH, as published, and write their log."""
     from recorders.log import write_log
     from recorders.parameters import parse_settings
     from recorders.recording import import_run
@@ -96,17 +141,20 @@ def _say_written(path: Path, messages: int) -> None:
     click.echo(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
 
 
-@fuselog.command()
+@fuselog.command(short_help="Replay estimators over logs and write their estimates.")
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option(
     "-e", "--estimator", "names", multiple=True, required=True, help="An estimator (repeatable)."
 )
 @click.option(
-    "-o", "--out", type=ANY_PATH, help="Estimates log, or a folder for several [default: beside]."
+    "-o",
+    "--out",
+    type=ANY_PATH,
+    help="Where to write LOG.estimates.mcap: a folder, or for one log a name.mcap [default: beside].",
 )
 @click.option("--arrival-order", is_flag=True, help="Go by log time, as the messages arrived.")
-@click.option("--start", "start_s", type=float, help="Begin this many seconds into the run.")
-@click.option("--end", "end_s", type=float, help="End this many seconds into the run.")
+@click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
 @recover_option
@@ -114,16 +162,21 @@ def _say_written(path: Path, messages: int) -> None:
 @json_option
 @set_option
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
-    """Replay estimators over LOGS (the runs of one ensemble) and write their estimates."""
+    """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
+
+    --set gate_probability=1 sets a parameter of all estimators that have it, --set
+    ekf.gate_probability=1 of one.
+    """
     from pipeline.commands import replay_logs
 
     replay_logs(list(logs), list(names), **options)
 
 
-@fuselog.command()
+@fuselog.command(short_help="Judge estimates against the truth.")
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
-@click.option("--out", type=FOLDER, help="Write tables (Parquet and CSV) to this folder.")
+@click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
+@click.option("--out", type=FOLDER, help="Write a result folder, as fuselog run does.")
 @recover_option
 @gap_option
 @json_option
@@ -134,10 +187,10 @@ def evaluate(estimates: tuple[Path, ...], logs: tuple[Path, ...], **options: Any
     evaluate_logs(list(estimates), list(logs), **options)
 
 
-@fuselog.command()
+@fuselog.command(short_help="Open a log, estimates or a result in the Rerun viewer.")
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
-@click.option("--at", "at_s", type=float, help="Put the time cursor this many seconds into the run.")
+@click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
 @click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option("--focus", help="What to show first, such as robot3.")
@@ -150,24 +203,30 @@ def view(path: Path, **options: Any) -> None:
     view_path(path, **options)
 
 
-@fuselog.command()
+@fuselog.command(short_help="Run an experiment: record, replay, evaluate, draw.")
 @click.argument("experiment")
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
-@click.option("--logs", default=20, show_default=True, help="Write the logs of the first K runs.")
+@click.option(
+    "--logs", type=COUNT, default=20, show_default=True, help="Write the logs of the first K runs."
+)
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
 @json_option
 @set_option
 def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> None:
-    """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw."""
+    """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
+
+    --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
+    --set gap_limit_s=1 an entry of the experiment.
+    """
     from pipeline.commands import run_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     run_named(experiment, over, **options)
 
 
-@fuselog.command()
+@fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
 def report(results: tuple[Path, ...], out: Path) -> None:
@@ -178,55 +237,82 @@ def report(results: tuple[Path, ...], out: Path) -> None:
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 
-@fuselog.command()
+@fuselog.command(short_help="Say what a log holds.")
 @click.argument("log", type=ANY_PATH)
 @recover_option
 @json_option
 def info(log: Path, recover: bool, as_json: bool) -> None:
     """Say what LOG holds: the run, its topics, schemas, message counts."""
-    from pipeline.commands import log_info
+    from pipeline.information import show_log
 
-    log_info(log, recover=recover, as_json=as_json)
+    show_log(log, recover=recover, as_json=as_json)
 
 
-def _list_command(name: str, text: str) -> None:
-    @fuselog.command(name=name, help=text)
+def _list_command(kind: str, text: str) -> None:
+    @fuselog.command(name=f"{kind}s", help=text)
+    @click.argument("name", required=False)
     @json_option
-    def listing(as_json: bool) -> None:
-        from pipeline import commands
-        from pipeline.terminal import print_json, print_table
+    def listing(name: str | None, as_json: bool) -> None:
+        from pipeline import catalog
 
-        rows: list[dict[str, str]] = getattr(commands, name)()
-        if as_json:
-            print_json(rows)
-        elif rows:
-            print_table("", list(rows[0]), [list(row.values()) for row in rows])
+        catalog.show(getattr(catalog, f"{kind}s")(), kind, name, as_json=as_json)
 
 
-_list_command("scenarios", "List what can be recorded and imported.")
-_list_command("estimators", "List the estimators and their parameters.")
-_list_command("experiments", "List the shipped experiments.")
+_list_command("scenario", "List what can be recorded and imported, or all about NAME.")
+_list_command("estimator", "List the estimators, or all about NAME.")
+_list_command("metric", "List the metrics, or all about NAME.")
+_list_command("experiment", "List the shipped experiments, or all about NAME.")
 
 
-def main() -> None:
-    """Run the command line; a user's mistake is one sentence and exit code 2."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
+
+    FUSELOG_TRACEBACK=1 shows where an error comes from, for who writes an estimator.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
     try:
-        fuselog(standalone_mode=False)
-    except BadInput as error:
-        sys.exit(_fail(str(error)))
-    except click.UsageError as error:
+        fuselog(arguments, standalone_mode=False)
+        print(end="", flush=True)
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        sys.exit(2)
+        return 2
     except click.ClickException as error:
-        sys.exit(_fail(error.format_message()))
+        where = getattr(error, "ctx", None)
+        hint = f"; see {where.command_path} --help" if where else ""
+        return _fail(error.format_message().rstrip(".") + hint)
     except (click.Abort, KeyboardInterrupt):
         click.echo("fuselog: stopped", err=True)
-        sys.exit(130)
+        return 130
     except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(141)
+        _drop_output()
+        return 1
+    except (BadInput, OSError, MemoryError) as error:
+        if os.environ.get("FUSELOG_TRACEBACK"):
+            raise
+        _drop_output()
+        return _fail(_sentence(error))
+    return 0
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return f"not enough memory; ask for fewer runs or less time ({error})"
+    return str(error)
 
 
 def _fail(sentence: str) -> int:
     click.echo(f"fuselog: {sentence}", err=True)
     return 2
+
+
+def _drop_output() -> None:
+    """Where standard output takes no more, have the interpreter not try again at its end."""
+    try:
+        print(end="", flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

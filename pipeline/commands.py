@@ -1,49 +1,26 @@
-"""What the commands do: the work between the command line and the library."""
+"""What the commands do: the work between the command line and the library.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+Rerun and matplotlib take long to import: only what draws imports them.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
-from pipeline.experiment import load_experiment, read_toml, run_experiment, shipped
-from pipeline.results import write_tables
+from pipeline.experiment import load_experiment, run_experiment
+from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
-from pipeline.terminal import err, out, print_json, print_metrics, print_table, progress
-from recorders.errors import BadInput
-from recorders.log import Log, open_log
+from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
+from recorders.errors import BadInput, choices
+from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
-from recorders.recording import Importer
-from recorders.registry import available, load
 from replay.blocks import Ragged, gather
-from replay.sources import LogSource
-from replay.timeline import viewer
-from replay.timeline.show import recorded_outputs, show
-
-
-def _source(
-    path: Path, *, recover: bool, start_s: float | None = None, end_s: float | None = None
-) -> LogSource:
-    """A log as a source, with a span in seconds from its epoch."""
-    log = open_log(path, recover=recover)
-    epoch_ns = log.run.epoch_ns if log.run else 0
-    start_ns = None if start_s is None else epoch_ns + round(start_s * 1e9)
-    end_ns = None if end_s is None else epoch_ns + round(end_s * 1e9)
-    return LogSource(log, start_ns, end_ns)
-
-
-def _state_losses(sources: Sequence[LogSource]) -> None:
-    for source in sources:
-        if source.log.loss_statement:
-            err.print(f"fuselog: {source.log.loss_statement}", highlight=False)
-
-
-def _estimator_settings(names: Sequence[str], settings: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator: `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all."""
-    values = parse_settings(settings)
-    own = {name: values.pop(name) for name in names if isinstance(values.get(name), dict)}
-    return {name: {**values, **own.get(name, {})} for name in names}
+from replay.engine import configure, find_estimator
+from replay.metrics import find_metrics, measure
+from replay.sources import LogSource, log_span_ns
 
 
 def replay_logs(
@@ -62,32 +39,87 @@ def replay_logs(
     settings: Sequence[str],
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
-    sources = [_source(path, recover=recover, start_s=start_s, end_s=end_s) for path in logs]
-    estimators = _estimator_settings(names, settings)
     paths = _estimate_paths(logs, out)
-    replay_to_logs(
-        sources,
-        estimators,
-        paths,
-        order="log_time" if arrival_order else "publish_time",
-        progress=progress,
-    )
-    _state_losses(sources)
-    replayed = _judge_logs(sources, [open_log(path) for path in paths], gap_limit_s)
+    estimators = _estimator_settings(names, settings)
+    sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
+    order: Clock = "log_time" if arrival_order else "publish_time"
+    replay_to_logs(sources, estimators, paths, order=order, progress=progress)
+    _state_losses(source.log for source in sources)
+    replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
+    _print_outcome(replayed, (), as_json=as_json, written=paths)
     if save is not None or connect is not None:
         _show(replayed, save, connect)
-    _print_outcome(replayed, as_json=as_json, written=paths)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
-    """Where the estimates of each log go: beside it, to the one file given, or into a folder."""
-    if out is None:
-        return [path.with_suffix(".estimates.mcap") for path in logs]
-    if len(logs) == 1 and out.suffix == ".mcap":
-        return [out]
-    if len({path.name for path in logs}) < len(logs):
-        raise BadInput("the logs share file names; replay them in turn with --out for each")
-    return [out / path.name for path in logs]
+    """Where the estimates of each log go: beside it, to the one file given, or into a folder.
+
+    Raises BadInput where two would be the same, or one would replace a log.
+    """
+    if out is not None and out.suffix == ".mcap":
+        if len(logs) > 1:
+            raise BadInput(f"--out {out}: {len(logs)} logs have an estimates log each; give a folder")
+        paths = [out]
+    else:
+        paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
+    places = [path.resolve() for path in paths]
+    sources = {log.resolve() for log in logs}
+    for path, place in zip(paths, places, strict=True):
+        if place in sources:
+            raise BadInput(f"{path}: the estimates would replace the log; give another --out")
+        if places.count(place) > 1:
+            raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
+    return paths
+
+
+def _estimator_settings(names: Sequence[str], settings: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label.
+
+    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
+    BadInput where none has.
+    """
+    given = parse_settings(settings)
+    chosen: dict[str, dict[str, Any]] = {}
+    known: dict[str, set[str]] = {}
+    for name in names:
+        own = given.get(name, {})
+        if not isinstance(own, dict):
+            raise BadInput(f"--set {name}={own}: expected {name}.PARAMETER=VALUE")
+        chosen[name] = dict(own)
+        estimator, _ = find_estimator(str(own.get("kind", name)))
+        known[name] = set(estimator.parameters.model_fields)
+    for key, value in given.items():
+        takers = [name for name in chosen if key in known[name]]
+        if key not in chosen and not takers:
+            everything = sorted({*chosen, *(each for fields in known.values() for each in fields)})
+            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, everything)}")
+        for name in takers:
+            chosen[name].setdefault(key, value)
+    for name, values in chosen.items():
+        configure(name, values)
+    return chosen
+
+
+def _span(source: LogSource, start_s: float | None, end_s: float | None) -> LogSource:
+    """The part of a log between two times in seconds from its epoch."""
+    if start_s is not None and end_s is not None and start_s >= end_s:
+        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
+    start_ns, end_ns = (
+        None if time_s is None else source.epoch_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
+    )
+    first_ns, last_ns = log_span_ns(source.log)
+    if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
+        first_s, last_s = ((time_ns - source.epoch_ns) * 1e-9 for time_ns in (first_ns, last_ns))
+        raise BadInput(
+            f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
+        )
+    return LogSource(source.log, start_ns, end_ns)
+
+
+def _state_losses(logs: Iterable[Log]) -> None:
+    for log in logs:
+        if log.loss_statement:
+            warn(log.loss_statement)
 
 
 def evaluate_logs(
@@ -95,6 +127,7 @@ def evaluate_logs(
     logs: list[Path],
     *,
     out: Path | None,
+    metrics: Sequence[str],
     recover: bool,
     gap_limit_s: float,
     as_json: bool,
@@ -103,16 +136,33 @@ def evaluate_logs(
     if logs and len(logs) != len(estimates):
         raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
     opened = [open_log(path, recover=recover) for path in estimates]
-    sources = [_source(path, recover=recover) for path in logs or [source_path(each) for each in opened]]
-    replayed = _judge_logs(sources, opened, gap_limit_s)
+    for each in opened:
+        if not any(topic.startswith("/estimates/") for topic in each.topics):
+            raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
+    places = logs or [_source_path(each) for each in opened]
+    sources = [LogSource(open_log(path, recover=recover)) for path in places]
+    for each, source in zip(opened, sources, strict=True):
+        _check_same_run(each, source.log)
+    replayed = judge(sources, _read_outputs(opened), gap_limit_s)
     if not replayed.errors and not replayed.innovations:
         raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
+    _state_losses([*opened, *(source.log for source in sources)])
     if out is not None:
-        write_tables(out, summarise(replayed).tables)
-    _print_outcome(replayed, as_json=as_json, written=[out] if out else [])
+        settings = {
+            "title": f"estimates of {sources[0].name}",
+            "estimates": [str(path) for path in estimates],
+            "logs": [source.name for source in sources],
+            "gap_limit_s": gap_limit_s,
+            "metrics": list(metrics),
+        }
+        outcome = summarise(replayed, metrics)
+        outcome.input_sha256 = _hash_files([*estimates, *places])
+        with result_folder(out) as folder:
+            write_outcome(folder, "evaluate", settings, outcome)
+    _print_outcome(replayed, metrics, as_json=as_json, written=[out] if out else [])
 
 
-def source_path(estimates: Log) -> Path:
+def _source_path(estimates: Log) -> Path:
     """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
     named = estimates.run.notes.get("log") if estimates.run else None
     if named is None:
@@ -123,34 +173,60 @@ def source_path(estimates: Log) -> Path:
     return path
 
 
-def read_outputs(logs: Sequence[Log]) -> dict[str, Ragged]:
+def _check_same_run(estimates: Log, log: Log) -> None:
+    """Raise BadInput where estimates are of another run than the log's."""
+    of, run = estimates.run, log.run
+    if (
+        of
+        and run
+        and (of.scenario, of.parameters, of.seed, of.run)
+        != (run.scenario, run.parameters, run.seed, run.run)
+    ):
+        raise BadInput(
+            f"{estimates.path}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
+            f"{log.path} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
+        )
+
+
+def _read_outputs(logs: Sequence[Log]) -> dict[str, Ragged]:
     """The streams of an ensemble's estimates logs."""
-    sources = [LogSource(log) for log in logs]
     topics = list(logs[0].topics)
     for log in logs[1:]:
         if list(log.topics) != topics:
             raise BadInput(f"{log.path}: holds other topics than {logs[0].path}; judge it on its own")
-    read = [source.read(topics) for source in sources]
+    read = [LogSource(log).read(topics) for log in logs]
     return {topic: gather([streams[topic] for streams in read]) for topic in topics}
 
 
-def _judge_logs(sources: Sequence[LogSource], estimates: Sequence[Log], gap_limit_s: float) -> Replayed:
-    return judge(sources, read_outputs(estimates), gap_limit_s)
+def _hash_files(paths: Sequence[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
-def _print_outcome(replayed: Replayed, *, as_json: bool, written: Sequence[Path]) -> None:
-    outcome = summarise(replayed)
+def _print_outcome(
+    replayed: Replayed, metrics: Sequence[str], *, as_json: bool, written: Sequence[Path]
+) -> None:
+    values = plain(measure(replayed.judged, find_metrics(metrics)))
+    failures = replayed.failures
+    for sentence in failures[:5]:
+        warn(sentence)
+    if len(failures) > 5:
+        warn(f"{len(failures)} failures in all")
     if as_json:
-        print_json({"metrics": outcome.metrics, "written": [str(path) for path in written]})
+        print_json({"metrics": values, "failures": failures, "written": [str(path) for path in written]})
         return
-    if outcome.metrics:
-        print_metrics(outcome.metrics)
+    print_metrics(values)
     for path in written:
-        out.print(str(path), highlight=False, soft_wrap=True)
+        say(str(path))
 
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
     """Draw the first run."""
+    from replay.timeline.show import show
+
     show(replayed.sources[0], replayed.outputs, replayed.errors, save=save, connect=connect)
 
 
@@ -166,6 +242,8 @@ def view_path(
     recover: bool,
 ) -> None:
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    from replay.timeline import viewer
+
     with TemporaryDirectory(prefix="fuselog-view-") as folder:
         rrd = path / "timeline.rrd" if path.is_dir() else path
         if rrd.suffix != ".rrd":
@@ -175,7 +253,7 @@ def view_path(
             raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
         if screenshot is not None:
             for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
-                err.print(f"fuselog: {complaint}", highlight=False)
+                warn(complaint)
         elif save is None and connect is None:
             viewer.view(rrd)
 
@@ -184,14 +262,16 @@ def _draw_log(
     path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
 ) -> None:
     """Draw a log, or an estimates log together with the log that it is of."""
+    from replay.timeline.show import recorded_outputs, show
+
     log = open_log(path, recover=recover)
     source = LogSource(log)
     outputs = recorded_outputs(source)
     if outputs and log.run is not None and "log" in log.run.notes:
-        source = _source(source_path(log), recover=recover)
+        source = LogSource(open_log(_source_path(log), recover=recover))
     replayed = judge([source], outputs, gap_limit_s)
     show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
-    _state_losses([source])
+    _state_losses([log, source.log])
 
 
 def run_named(
@@ -209,78 +289,8 @@ def run_named(
     folder = out or Path("out") / label
     result = run_experiment(label, experiment, folder, data=data, logs=logs, progress=progress)
     if as_json:
-        print_json(result)
+        print_json(result.model_dump(mode="json"))
         return
-    print_metrics(result["metrics"])
-    if result["claims"]:
-        columns = ["claim", "paper", "ours", "verdict", "why"]
-        print_table("Claims", columns, [[row[key] for key in columns] for row in result["claims"]])
-    _say(f"{folder}: logs, estimates, tables, figures, result.json")
-
-
-def _say(text: str) -> None:
-    out.print(text, highlight=False, soft_wrap=True)
-
-
-def log_info(path: Path, *, recover: bool, as_json: bool) -> None:
-    """Print what a log holds."""
-    log = open_log(path, recover=recover)
-    run = asdict(log.run) if log.run else None
-    topics = [
-        {
-            "topic": topic.name,
-            "schema": topic.schema_name,
-            "messages": topic.messages,
-            "metadata": dict(topic.metadata),
-        }
-        for topic in log.topics.values()
-    ]
-    if as_json:
-        print_json({"path": str(path), "run": run, "topics": topics, "lost": log.loss_statement})
-        return
-    for key, value in (run or {}).items():
-        _say(f"{key}: {value}")
-    print_table(
-        "",
-        ["topic", "schema", "messages"],
-        [[row["topic"], row["schema"], row["messages"]] for row in topics],
-    )
-    if log.loss_statement:
-        _say(log.loss_statement)
-
-
-def scenarios() -> list[dict[str, str]]:
-    """Recorders, and the scenario files that ship."""
-    rows = []
-    for name in available("recorders"):
-        recorder = load("recorders", name)
-        how = "import" if isinstance(recorder, Importer) else "record"
-        rows.append({"scenario": name, "how": how, "what": recorder.summary})
-    for name, path in shipped("scenarios").items():
-        rows.append({"scenario": name, "how": "record", "what": read_toml(path).get("title", "")})
-    return rows
-
-
-def estimators() -> list[dict[str, str]]:
-    """Estimators with what they need and their parameters."""
-    rows = []
-    for name in available("estimators"):
-        estimator = load("estimators", name)
-        fields = estimator.parameters.model_fields.items()
-        rows.append(
-            {
-                "estimator": name,
-                "what": estimator.summary,
-                "needs": estimator.needs,
-                "parameters": ", ".join(f"{key}={entry.default}" for key, entry in fields),
-            }
-        )
-    return rows
-
-
-def experiments() -> list[dict[str, str]]:
-    """Shipped experiments."""
-    return [
-        {"experiment": name, "what": read_toml(path).get("title", "")}
-        for name, path in shipped("experiments").items()
-    ]
+    print_metrics(result.metrics)
+    print_claims(result.claims)
+    say(f"{folder}: logs, estimates, tables, figures, result.json")

@@ -4,20 +4,20 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 """
 
 import hashlib
+import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, schemas
-from recorders.log.reader import Order
+from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
 from replay.engine import BLOCK_MESSAGES, bind, collect, replay
@@ -27,25 +27,55 @@ from replay.evaluation import (
     errors_of,
     gaussian_estimates,
     innovations_of,
+    split_topic,
 )
+from replay.metrics import Output
 from replay.sources import MemorySource, Source, memory_source
 
-Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+# Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
+RUNS_AT_ONCE = 128
+
+Settings = Mapping[str, Mapping[str, Any]]
+Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
 
 
-def no_progress(items: Iterable[Any], title: str, total: int) -> Iterable[Any]:  # noqa: ARG001
+def no_progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[Any]:  # noqa: ARG001
     """The progress bar of programs that show none."""
     return items
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """An ensemble with what the estimators made of it."""
+    """An ensemble with what the estimators made of it, and how that compares with the truth."""
 
     sources: Sequence[Source]
     outputs: dict[str, Ragged]
     errors: list[Errors]
     innovations: list[Innovations]
+
+    @property
+    def judged(self) -> list[Errors | Innovations | Output]:
+        """All that metrics may judge."""
+        outputs = [
+            Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
+            for topic, rows in self.outputs.items()
+        ]
+        return [*self.errors, *self.innovations, *outputs]
+
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for every run that an estimator could not follow to the end."""
+        sentences = []
+        for topic, rows in self.outputs.items():
+            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
+                reasons = rows.stream.metadata.get("reasons", "").split("; ")
+                for run in np.flatnonzero(np.diff(rows.offsets)).tolist():
+                    failure, source = rows.of_run(run), self.sources[run]
+                    elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
+                    reason = reasons[int(failure["reason"][0])]
+                    what = " ".join(filter(None, split_topic(topic)))
+                    sentences.append(f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}")
+        return sentences
 
 
 def record_ensemble(
@@ -57,8 +87,6 @@ def record_ensemble(
     executor: Executor | None = None,
 ) -> list[MemorySource]:
     """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`."""
-    if runs < 1:
-        raise BadInput(f"--runs {runs}: at least one run is needed")
     record = partial(_record, scenario, dict(parameters), seed)
     recorded = executor.map(record, range(runs)) if executor else map(record, range(runs))
     return list(progress(recorded, f"recording {scenario}", runs))
@@ -70,18 +98,30 @@ def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -
 
 def replay_ensemble(
     sources: Sequence[Source],
-    estimators: Mapping[str, Mapping[str, Any]],
+    estimators: Settings,
     *,
     gap_limit_s: float,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
+    outputs = replay_in_memory(sources, estimators, order=order, progress=progress)
+    return judge(sources, outputs, gap_limit_s)
+
+
+def replay_in_memory(
+    sources: Sequence[Source],
+    estimators: Settings,
+    *,
+    order: Clock = "publish_time",
+    progress: Progress = no_progress,
+) -> dict[str, Ragged]:
+    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
         outputs |= collect(replay(sources, bound, order=order))
-    return judge(sources, outputs, gap_limit_s)
+    return outputs
 
 
 def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
@@ -95,56 +135,53 @@ def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: fl
     return Replayed(sources, outputs, [each for each in found if each is not None], innovations)
 
 
-def estimates_metadata(
-    source: Source, estimators: Mapping[str, Mapping[str, Any]], log: str = ""
-) -> RunMetadata:
-    """What an estimates log says of itself: the run it is of, the estimators, and where its log is."""
-    run = source.run or RunMetadata("unknown")
-    parameters = {"estimators": {label: dict(values) for label, values in estimators.items()}}
-    return RunMetadata(
-        run.scenario, parameters, run.seed, run.run, run.epoch_ns, {"log": log} if log else {}
-    )
-
-
 def replay_to_logs(
     sources: Sequence[Source],
-    estimators: Mapping[str, Mapping[str, Any]],
+    estimators: Settings,
     paths: Sequence[Path],
     *,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
 ) -> None:
     """Replay and write one estimates log per run, block by block: memory holds the blocks in hand."""
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
-    with ExitStack() as stack:
-        writers = [
-            stack.enter_context(LogWriter(path, _metadata_beside(source, estimators, path)))
-            for path, source in zip(paths, sources, strict=True)
-        ]
-        blocks = replay(sources, bound, order=order, block_messages=block_messages)
-        for block in progress(blocks, "replaying", 0):
-            for run, writer in enumerate(writers):
-                writer.write([ragged.of_run(run) for ragged in block])
+
+    def write_some(first: int) -> Iterator[int]:
+        now = slice(first, first + RUNS_AT_ONCE)
+        with ExitStack() as stack:
+            writers = [
+                stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
+                for path, source in zip(paths[now], sources[now], strict=True)
+            ]
+            for block in replay(sources[now], bound, order=order, block_messages=block_messages):
+                for run, writer in enumerate(writers):
+                    writer.write([ragged.of_run(run) for ragged in block])
+                yield first
+
+    parts = map(write_some, range(0, len(sources), RUNS_AT_ONCE))
+    for _ in progress(chain.from_iterable(parts), "replaying", None):
+        pass
 
 
-def _metadata_beside(
-    source: Source, estimators: Mapping[str, Mapping[str, Any]], path: Path
+def estimates_metadata(
+    source: Source, estimators: Settings, path: Path, log: Path | None = None
 ) -> RunMetadata:
-    """The log is named relative to its estimates, so that both can be moved together."""
-    log = os.path.relpath(Path(source.name).resolve(), path.resolve().parent)
-    return estimates_metadata(source, estimators, log)
+    """What the estimates log at `path` says of itself: the run that it is of, the estimators, its log.
+
+    The log's place is stated relative to the estimates', so that both can be moved together.
+    """
+    run = source.run or RunMetadata("unknown")
+    place = os.path.relpath((log or Path(source.name)).resolve(), path.resolve().parent)
+    settings = json.dumps({label: dict(values) for label, values in estimators.items()})
+    return replace(run, notes={"log": place, "estimators": settings})
 
 
 def hash_streams(sources: Sequence[MemorySource]) -> str:
     """SHA-256 over every column of every run: equal where the input data are equal."""
     digest = hashlib.sha256()
     for source in sources:
-        for array in _arrays(source.streams):
-            digest.update(np.ascontiguousarray(array).data)
+        for stream in source.streams.values():
+            for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
+                digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
-
-
-def _arrays(streams: Mapping[str, Stream]) -> Iterator[np.ndarray]:
-    for stream in streams.values():
-        yield from (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())

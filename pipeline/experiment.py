@@ -5,21 +5,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
 from pipeline.ensemble import Progress, no_progress
-from pipeline.results import Outcome, result_folder, write_outcome
-from recorders.errors import BadInput
-from recorders.parameters import Parameters, build, merge
-from recorders.registry import load
+from pipeline.results import Outcome, Result, result_folder, write_outcome
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters, build, describe, merge
+from recorders.recording import Recorder
+from recorders.registry import available, load
+from replay.engine import configure
+from replay.metrics import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
 
 
 class Record(Parameters):
-    """What to simulate."""
+    """What to simulate: a scenario by name or TOML file, and what differs from its defaults."""
 
     scenario: str
     parameters: dict[str, Any] = {}
@@ -36,7 +39,7 @@ class Experiment(Parameters):
     """One experiment as its TOML file says it.
 
     `estimators` maps a label to parameters; a parameter `kind` names the estimator where the label is
-    not its name. `options` are the study's own.
+    not its name. `metrics` are all registered ones where none is named. `options` are the study's own.
     """
 
     title: str
@@ -46,23 +49,40 @@ class Experiment(Parameters):
     record: Record | None = None
     import_: Import | None = Field(None, alias="import")
     estimators: dict[str, dict[str, Any]] = {}
-    gap_limit_s: PositiveFloat = 0.2
+    metrics: list[str] = []
+    gap_limit_s: NonNegativeFloat = 0.2
     options: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        if self.import_ and self.record:
+            raise ValueError("give either [record] or [import], not both")
+        if self.import_ and (self.runs, self.seed) != (1, 0):
+            raise ValueError("imported data are one run without a seed; leave out runs and seed")
+        return self
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how an experiment runs."""
+    """Where and how an experiment runs; `options` are of the study's own type."""
 
     folder: Path
     data: Path | None = None
     logs: int = 20
+    options: Any = None
     progress: Progress = no_progress
 
 
-# A study does an experiment's work: writes its logs and timeline into the setting's folder, and returns
-# what it found with a hash of its input data.
-Study = Callable[[Experiment, Setting], tuple[Outcome, str]]
+@dataclass(frozen=True)
+class Study:
+    """A registered study does an experiment's work.
+
+    `run` writes its logs and timeline into the setting's folder, and returns what it found.
+    """
+
+    summary: str
+    run: Callable[[Experiment, Setting], Outcome]
+    options: type[Parameters] = Parameters
 
 
 def shipped(kind: str) -> dict[str, Path]:
@@ -74,7 +94,7 @@ def shipped(kind: str) -> dict[str, Path]:
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file's values; raises BadInput where it is missing or malformed."""
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise BadInput(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -86,18 +106,46 @@ def load_experiment(
 ) -> tuple[str, Experiment]:
     """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
 
-    A setting goes to the estimator or the part of the experiment that its first word names, else to the
-    scenario's or importer's parameters: `ekf.gate_probability=1`, `gap_limit_s=1`, `robots=2`.
+    A setting goes to the entry of the experiment or to the estimator that its first word names, else to
+    the scenario's or importer's parameters: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`.
     """
-    if name.endswith(".toml"):
-        path = Path(name)
-    else:
-        known = shipped("experiments")
-        if name not in known:
-            raise BadInput(f"no experiment '{name}'; there are: {', '.join(known)}, or give a .toml")
-        path = known[name]
+    known = shipped("experiments")
+    if not name.endswith(".toml") and name not in known:
+        raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = known.get(name, Path(name))
     values = read_toml(path)
-    return path.stem, build(Experiment, {**_apply(values, settings), **over}, str(path))
+    where = f"experiment {name}"
+    stated = build(Experiment, values, where)
+    return path.stem, build(Experiment, {**merge(values, _assigned(stated, settings)), **over}, where)
+
+
+def _assigned(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings where they belong in an experiment; raises BadInput where one belongs nowhere."""
+    entries = {each.alias or name for name, each in Experiment.model_fields.items()}
+    part, recorder, names = "import", "", set()
+    if experiment.import_:
+        recorder = experiment.import_.source
+    elif experiment.record:
+        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
+    if recorder:
+        described = describe(load("recorders", recorder, Recorder).parameters)
+        names = {each.name.partition(".")[0] for each in described}
+    assigned: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in entries:
+            place: dict[str, Any] = {key: value}
+        elif key in experiment.estimators:
+            place = {"estimators": {key: value}}
+        elif key in names:
+            place = {part: {"parameters": {key: value}}}
+        else:
+            known = sorted(names | entries | experiment.estimators.keys())
+            raise BadInput(
+                f"--set {key}: no such entry of the experiment, parameter of what it records, "
+                f"or estimator; {choices(key, known)}"
+            )
+        assigned = merge(assigned, place)
+    return assigned
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
@@ -105,29 +153,18 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
 
     A scenario file has `recorder` and a table `parameters`.
     """
-    known = shipped("scenarios")
-    if not name.endswith(".toml") and name not in known:
+    files, recorders = shipped("scenarios"), available("recorders")
+    if name in recorders:
         return name, {}, name
-    path = known.get(name, Path(name))
+    if not name.endswith(".toml") and name not in files:
+        known = [*recorders, *files]
+        raise BadInput(f"no scenario '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = files.get(name, Path(name))
     values = read_toml(path)
     recorder, parameters = values.get("recorder"), values.get("parameters", {})
     if not isinstance(recorder, str) or not isinstance(parameters, dict):
         raise BadInput(f'{path}: a scenario file has recorder = "NAME" and a [parameters] table')
     return recorder, parameters, path.stem
-
-
-def _apply(values: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    own = {"title", "study", "gap_limit_s", "options", "estimators"}
-    part = "import" if "import" in values else "record"
-    over: dict[str, Any] = {}
-    for key, value in settings.items():
-        if key in own:
-            over = merge(over, {key: value})
-        elif key in values.get("estimators", {}):
-            over = merge(over, {"estimators": {key: value}})
-        else:
-            over = merge(over, {part: {"parameters": {key: value}}})
-    return merge(values, over)
 
 
 def run_experiment(
@@ -138,14 +175,20 @@ def run_experiment(
     data: Path | None = None,
     logs: int = 20,
     progress: Progress = no_progress,
-) -> dict[str, Any]:
+) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
-    if experiment.import_ is not None and data is None:
+    if experiment.import_ and data is None:
         raise BadInput(f"experiment {name} needs real data: give its folder with --data")
-    study: Study = load("studies", experiment.study)
+    if data is not None and not experiment.import_:
+        raise BadInput(f"experiment {name} imports nothing; leave out --data")
+    study: Study = load("studies", experiment.study, Study)
+    options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    for label, values in experiment.estimators.items():
+        configure(label, values)
+    find_metrics(experiment.metrics)
     with result_folder(folder) as part:
-        outcome, input_hash = study(experiment, Setting(part, data, logs, progress))
+        outcome = study.run(experiment, Setting(part, data, logs, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)
-        return write_outcome(part, name, settings, outcome, input_hash)
+        return write_outcome(part, name, settings, outcome)

@@ -3,17 +3,20 @@
 A result folder is built beside its place and moved there when it is whole.
 """
 
+import fcntl
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from recorders.errors import BadInput
+from recorders.parameters import Parameters, build
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,14 +38,34 @@ class Claim:
     why: str = ""
 
 
+def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
+    """A claim that a measured condition confirms or refutes."""
+    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
+
+
 @dataclass
 class Outcome:
-    """What a study found. Metric keys are `estimator.quantity_unit[.case]`."""
+    """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
+
+    `input_sha256` is a hash of the data that went in.
+    """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
     claims: list[Claim] = field(default_factory=list)
     tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
     figures: dict[str, "Figure"] = field(default_factory=dict)
+    input_sha256: str = ""
+
+
+class Result(Parameters):
+    """What result.json says."""
+
+    experiment: str
+    fuselog: str
+    settings: dict[str, Any]
+    input_sha256: str
+    metrics: dict[str, MetricValue]
+    claims: list[Claim]
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
@@ -85,77 +108,100 @@ def metric_tables(metrics: Mapping[str, MetricValue]) -> list[MetricTable]:
 def result_folder(folder: Path) -> Iterator[Path]:
     """A folder to fill, beside its place; it replaces an earlier result there when all went well.
 
-    Raises BadInput where something else than a result of ours is in the place.
+    Raises BadInput where something else than a result of ours is in the place, where another process
+    is filling it, or where it cannot be written.
     """
-    if folder.exists() and not (folder / RESULT_FILE).is_file():
+    place = folder.resolve()
+    if place.exists() and not (place / RESULT_FILE).is_file():
         raise BadInput(f"{folder}: exists and is no fuselog result; give another folder with --out")
-    part = folder.with_name(folder.name + ".part")
+    part, old = (place.with_name(place.name + ending) for ending in (".part", ".old"))
     try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
+        with _held(part):
+            yield part
+            shutil.rmtree(old, ignore_errors=True)
+            if place.exists():
+                place.rename(old)
+            part.rename(place)
+            shutil.rmtree(old, ignore_errors=True)
+    except BlockingIOError:
+        raise BadInput(f"{folder}: another fuselog is writing it; wait, or give another --out") from None
     except OSError as error:
-        raise BadInput(f"{folder}: cannot be written ({error.strerror})") from error
+        raise BadInput(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """An empty folder that this process alone may fill; it is removed where that goes wrong.
+
+    The lock goes with the process, however that ends, and what it left is cleared here.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
     try:
-        yield part
-        old = folder.with_name(folder.name + ".old")
-        shutil.rmtree(old, ignore_errors=True)
-        if folder.exists():
-            folder.rename(old)
-        part.rename(folder)
-        shutil.rmtree(old, ignore_errors=True)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            for path in folder.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            yield
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+    finally:
+        os.close(handle)
 
 
 def write_outcome(
-    folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome, input_hash: str
-) -> dict[str, Any]:
+    folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
+) -> Result:
     """Write tables (Parquet and CSV), figures (SVG) and result.json; returns what result.json says."""
-    write_tables(folder / "tables", outcome.tables)
+    # here, since lists and --help need none of it
+    import matplotlib as mpl
+    import pyarrow
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    for name, table in outcome.tables.items():
+        (folder / "tables").mkdir(exist_ok=True)
+        columns = pyarrow.Table.from_pandas(table, preserve_index=False)
+        pyarrow.parquet.write_table(columns, folder / "tables" / f"{name}.parquet")
+        pyarrow.csv.write_csv(columns, folder / "tables" / f"{name}.csv")
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
-        figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
-    result = {
-        "experiment": experiment,
-        "fuselog": version("fuselog"),
-        "settings": dict(settings),
-        "input_sha256": input_hash,
-        "metrics": {key: _plain(value) for key, value in outcome.metrics.items()},
-        "claims": [asdict(claim) for claim in outcome.claims],
-    }
-    text = json.dumps(result, indent=2, allow_nan=False)
-    (folder / RESULT_FILE).write_text(text + "\n")
+        with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+            figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
+    result = Result(
+        experiment=experiment,
+        fuselog=version("fuselog"),
+        settings=dict(settings),
+        input_sha256=outcome.input_sha256,
+        metrics=plain(outcome.metrics),
+        claims=outcome.claims,
+    )
+    text = json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False)
+    (folder / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
     return result
 
 
-def write_tables(folder: Path, tables: Mapping[str, "pd.DataFrame"]) -> None:
-    """Write every table as NAME.parquet and NAME.csv."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, table in tables.items():
-        table.to_parquet(folder / f"{name}.parquet", index=False)
-        table.to_csv(folder / f"{name}.csv", index=False)
-
-
-def read_result(folder: Path) -> dict[str, Any]:
+def read_result(folder: Path) -> Result:
     """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
     path = folder / RESULT_FILE
     try:
-        result: dict[str, Any] = json.loads(path.read_text())
-    except FileNotFoundError:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
         raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
-    if not isinstance(result, dict) or not {"experiment", "metrics", "claims"} <= result.keys():
+    if not isinstance(values, dict):
         raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
-    return result
+    return build(Result, values, str(path))
 
 
-def _plain(value: MetricValue) -> MetricValue:
-    """Numbers as JSON has them: NaN and infinity become null."""
-    if isinstance(value, list):
-        return [_number(entry) for entry in value]
-    return _number(value)
+def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:
+    """Metrics as JSON has them: NaN and infinity become null."""
+    return {
+        key: [_number(entry) for entry in value] if isinstance(value, list) else _number(value)
+        for key, value in metrics.items()
+    }
 
 
 def _number(value: float | None) -> float | None:

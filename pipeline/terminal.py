@@ -1,27 +1,45 @@
 """What the terminal shows: progress bars and tables. Standard output is for results alone."""
 
 import json
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from pipeline.results import MetricValue, metric_tables
-
-out = Console()
-err = Console(stderr=True)
+from pipeline.results import Claim, MetricValue, metric_tables
 
 
-def progress(items: Iterable[Any], title: str, total: int) -> Iterable[Any]:
+def _console(*, stderr: bool) -> Console:
+    """Plain text, wide where no terminal breaks it."""
+    console = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = 1000
+    return console
+
+
+out = _console(stderr=False)
+err = _console(stderr=True)
+
+
+def progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[Any]:
     """Pass items through with a progress bar on standard error; none where nobody watches."""
     with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(title, total=total)
-        for item in items:
-            yield item
-            bar.advance(task)
+        yield from bar.track(items, total=total, description=title)
+
+
+def say(text: str) -> None:
+    """A line on standard output; the terminal breaks it, not we, so that paths stay whole."""
+    out.print(text, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """A line on standard error."""
+    err.print(f"fuselog: {text}", soft_wrap=True)
 
 
 def print_json(value: Any) -> None:
@@ -30,20 +48,24 @@ def print_json(value: Any) -> None:
     sys.stdout.write("\n")
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """A table; numbers are set right."""
-    table = Table(title=title or None, title_justify="left")
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> None:
+    """A table; columns of numbers are set right, long texts are broken into lines."""
     body = [list(row) for row in rows]
+    table = Table(
+        title=title or None, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False
+    )
     for index, column in enumerate(columns):
         numeric = bool(body) and all(isinstance(row[index], int | float | None) for row in body)
         table.add_column(column, justify="right" if numeric else "left", overflow="fold")
     for row in body:
-        table.add_row(*(format_number(value) for value in row))
+        table.add_row(*map(format_value, row))
     out.print(table)
 
 
-def format_number(value: object) -> str:
-    """Four significant digits for floats, text for the rest."""
+def format_value(value: object) -> str:
+    """Four significant digits for floats, nothing for None, text for the rest."""
+    if isinstance(value, list):
+        return " ".join(map(format_value, value))
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
@@ -51,4 +73,11 @@ def print_metrics(metrics: Mapping[str, MetricValue]) -> None:
     """Metrics as tables: one per case, a row per quantity, a column per estimator."""
     for table in metric_tables(metrics):
         rows = [[quantity, *values] for quantity, values in table.rows]
-        print_table(table.case, ["", *table.estimators], rows)
+        print_table(["", *table.estimators], rows, table.case)
+
+
+def print_claims(claims: Sequence[Claim]) -> None:
+    """Claims, each with what the paper says and what we found."""
+    for claim in claims:
+        say(f"{claim.verdict}: {claim.claim}")
+        say(f"  paper: {claim.paper}; ours: {claim.ours}" + (f"; {claim.why}" if claim.why else ""))

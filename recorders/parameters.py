@@ -1,12 +1,13 @@
 """Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
 
 import tomllib
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from textwrap import shorten
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 
 
 class Parameters(BaseModel):
@@ -24,14 +25,19 @@ def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> 
         return kind.model_validate(merge(_nested_defaults(kind), values))
     except ValidationError as error:
         first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
+        path = [str(part) for part in first["loc"]]
+        name = ".".join(path)
         if first["type"] == "extra_forbidden":
-            model = _model_at(kind, first["loc"][:-1])
-            names = ", ".join(model.model_fields) if model else "no parameters"
-            raise BadInput(f"{where}: no parameter '{name}'; there are: {names}") from None
-        raise BadInput(
-            f"{where}: parameter '{name}' is {first['input']!r}; {_mend(first['msg'])}"
-        ) from None
+            *above, last = path
+            known = _names_at(kind, above)
+            raise BadInput(f"{where}: no parameter '{name}'; {choices(last, known)}") from None
+        if first["type"] == "missing":
+            raise BadInput(f"{where}: parameter '{name}' is missing") from None
+        message = first["msg"].removeprefix("Value error, ").replace("Input", "it")
+        if not name:
+            raise BadInput(f"{where}: {message}") from None
+        given = shorten(repr(first["input"]), 60)
+        raise BadInput(f"{where}: parameter '{name}' is {given}; {message}") from None
 
 
 def _nested_defaults(kind: type[Parameters]) -> dict[str, Any]:
@@ -42,17 +48,54 @@ def _nested_defaults(kind: type[Parameters]) -> dict[str, Any]:
     }
 
 
-def _mend(message: str) -> str:
-    return message[:1].lower() + message[1:]
+def _names_at(kind: type[BaseModel], path: Sequence[str]) -> list[str]:
+    """The names of the parameters in the table at `path`."""
+    names = [each.name for each in describe(kind)]
+    prefix = "".join(f"{part}." for part in path)
+    below = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+    return list(dict.fromkeys(name.partition(".")[0] for name in below))
 
 
-def _model_at(kind: type[BaseModel], path: tuple[int | str, ...]) -> type[BaseModel] | None:
-    for part in path:
-        entry = kind.model_fields.get(str(part))
-        if entry is None or not isinstance(entry.annotation, type):
-            return None
-        kind = entry.annotation
-    return kind
+class Described(NamedTuple):
+    """One parameter as a person reads it: its full name, its default, and what it accepts."""
+
+    name: str
+    default: Any
+    accepts: str
+
+
+def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
+    """All parameters of a type, those of nested tables by full names; `values` stand for defaults."""
+    schema = kind.model_json_schema()
+    return list(_described(schema, schema.get("$defs", {}), "", values or {}))
+
+
+def _described(
+    table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
+) -> Iterator[Described]:
+    """Walk a JSON schema; `given` are defaults that the table above states for this one."""
+    for name, entry in table.get("properties", {}).items():
+        default = entry.get("default")
+        options = [
+            definitions[each["$ref"].rpartition("/")[2]] if "$ref" in each else each
+            for each in entry.get("anyOf", [entry])
+        ]
+        below = next((each for each in options if "properties" in each), None)
+        if below is None:
+            value = given.get(name, default)
+            yield Described(prefix + name, value, " or ".join(map(_accepts, options)))
+        else:
+            values = merge(default or {}, given.get(name) or {})
+            yield from _described(below, definitions, f"{prefix}{name}.", values)
+
+
+def _accepts(schema: Mapping[str, Any]) -> str:
+    """What a schema of one value accepts: its type and bounds, or its choices."""
+    if "enum" in schema:
+        return ", ".join(map(str, schema["enum"]))
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    return " ".join([schema.get("type", "anything").replace("null", "none"), *bounds])
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What a recorder is: something that turns parameters, or a folder of real data, into streams."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,8 +10,8 @@ import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream
-from recorders.parameters import ParametersType, build
-from recorders.registry import load
+from recorders.parameters import Parameters, ParametersType, build
+from recorders.registry import foreign_code, load
 
 # Simulated runs start at 2026-01-01T00:00:00Z: stamps are never negative and tools show a date.
 SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
@@ -18,7 +19,7 @@ SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
 
 @dataclass(frozen=True)
 class Recording:
-    """Streams in memory, before they are a log.
+    """Streams in memory, before they are a log: one for every topic.
 
     `epoch_ns` is the run's time zero; `notes` are facts the recorder met, one short text each.
     """
@@ -27,22 +28,33 @@ class Recording:
     epoch_ns: int = SIMULATION_EPOCH_NS
     notes: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not self.streams:
+            raise BadInput("a recording holds no streams; give it at least one")
+        for topic, count in Counter(stream.topic for stream in self.streams).items():
+            if count > 1:
+                raise BadInput(f"topic {topic}: recorded as {count} streams; make one stream of them")
+
 
 @dataclass(frozen=True)
-class Simulator(Generic[ParametersType]):
-    """A scenario that can be recorded any number of times, each run from its own random stream."""
+class Recorder(Generic[ParametersType]):
+    """What recorders have in common: what they are in one line, and their parameters."""
 
     summary: str
     parameters: type[ParametersType]
+
+
+@dataclass(frozen=True)
+class Simulator(Recorder[ParametersType]):
+    """A scenario that can be recorded any number of times, each run from its own random stream."""
+
     simulate: Callable[[ParametersType, np.random.Generator], Recording]
 
 
 @dataclass(frozen=True)
-class Importer(Generic[ParametersType]):
+class Importer(Recorder[ParametersType]):
     """Reads real data: a file or folder as its publishers lay it out."""
 
-    summary: str
-    parameters: type[ParametersType]
     read: Callable[[Path, ParametersType], Recording]
 
 
@@ -53,26 +65,33 @@ def record_run(
 
     Raises BadInput for an unknown scenario or parameter, or one that only imports.
     """
-    simulator = load("recorders", scenario)
+    simulator: Recorder[Any] = load("recorders", scenario, Recorder)
     if not isinstance(simulator, Simulator):
-        raise BadInput(f"'{scenario}' imports real data; use: fuselog import {scenario} FOLDER")
+        raise BadInput(f"'{scenario}' imports real data; use: fuselog import {scenario} PATH")
+    if seed < 0 or run < 0:
+        raise BadInput(f"seed {seed}, run {run}: a seed and a run are numbers from zero on")
     parameters = build(simulator.parameters, values, f"scenario {scenario}")
-    if seed < 0:
-        raise BadInput(f"--seed {seed}: a seed is zero or positive")
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,)))
-    recording = simulator.simulate(parameters, generator)
-    dumped = parameters.model_dump(mode="json")
-    return recording, RunMetadata(scenario, dumped, seed, run, recording.epoch_ns, dict(recording.notes))
+    with foreign_code(f"scenario {scenario}"):
+        recording = simulator.simulate(parameters, generator)
+        return recording, _metadata(scenario, parameters, seed, run, recording)
 
 
 def import_run(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Recording, RunMetadata]:
     """Import real data; raises BadInput for an unknown importer or parameter, or data it cannot read."""
-    importer = load("recorders", source)
+    importer: Recorder[Any] = load("recorders", source, Recorder)
     if not isinstance(importer, Importer):
         raise BadInput(f"'{source}' simulates; use: fuselog record {source}")
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder; give the {source} data as published")
     parameters = build(importer.parameters, values, f"importer {source}")
-    recording = importer.read(path, parameters)
-    dumped = parameters.model_dump(mode="json")
-    return recording, RunMetadata(source, dumped, None, 0, recording.epoch_ns, dict(recording.notes))
+    with foreign_code(f"importer {source}"):
+        recording = importer.read(path, parameters)
+        return recording, _metadata(source, parameters, None, 0, recording)
+
+
+def _metadata(
+    name: str, parameters: Parameters, seed: int | None, run: int, recording: Recording
+) -> RunMetadata:
+    values = parameters.model_dump(mode="json")
+    return RunMetadata(name, values, seed, run, recording.epoch_ns, dict(recording.notes))

@@ -5,32 +5,57 @@ All register in one way, ours and third parties' alike: as entry points of an in
 `fuselog.timelines`). Listing names imports nothing.
 """
 
-from difflib import get_close_matches
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from textwrap import shorten
 from typing import Any
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
+
+SINGULAR = {"studies": "study"}
 
 
+@cache
 def available(kind: str) -> dict[str, EntryPoint]:
     """The registered names of a kind ("recorders", say), sorted, with where each comes from."""
     found = entry_points(group=f"fuselog.{kind}")
     return {entry.name: entry for entry in sorted(found, key=lambda entry: entry.name)}
 
 
-def load(kind: str, name: str) -> Any:
+def load(kind: str, name: str, expected: type = object) -> Any:
     """The object registered under `name`.
 
-    Raises BadInput where there is none, with the names there are, or where it does not import.
+    Raises BadInput where there is none, with the names there are, where it does not import, or where it
+    is not of the `expected` type.
     """
     known = available(kind)
+    one = SINGULAR.get(kind, kind.removesuffix("s"))
     if name not in known:
-        near = get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(known) or 'none'}"
-        raise BadInput(f"no {kind.removesuffix('s')} '{name}'; {hint}")
-    try:
-        return known[name].load()
-    except (ImportError, AttributeError) as error:
+        raise BadInput(f"no {one} '{name}'; {choices(name, known)}")
+    with foreign_code(f"{one} '{name}' ({known[name].value})"):
+        found = known[name].load()
+    if not isinstance(found, expected):
         raise BadInput(
-            f"{kind.removesuffix('s')} '{name}' ({known[name].value}) does not import: {error}"
+            f"{one} '{name}' ({known[name].value}) is {type(found).__name__}; "
+            f"the entry point must lead to {expected.__name__}"
+        )
+    return found
+
+
+@contextmanager
+def foreign_code(what: str) -> Iterator[None]:
+    """Around calls of registered code: what it raises becomes one sentence that says whose code it was.
+
+    Bad input, a lack of memory or disk, and interrupts go through as they are.
+    """
+    try:
+        yield
+    except (BadInput, MemoryError, OSError):
+        raise
+    except Exception as error:
+        said = shorten(str(error), 200)
+        raise BadInput(
+            f"{what} raised {type(error).__name__}: {said}; FUSELOG_TRACEBACK=1 shows where"
         ) from error

@@ -1,15 +1,16 @@
 """Ragged columns: the streams of many runs laid end to end, and their merged order of events."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Stream
-from recorders.log.reader import Order
+from recorders.log import Clock, Stream
 from recorders.log.streams import concatenate
+from replay.compile import compile_over_runs
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,18 @@ class Ragged:
 class Events(NamedTuple):
     """The messages of several topics in time order: run r owns offsets[r]:offsets[r + 1].
 
-    Event e is row `row[e]` of the topic with index `topic[e]`. `is_last[e]` says that no later event of
-    the run has its stamp: the moment for an estimate.
+    Event e is of the topic with index `topic[e]`, and message number `source[e]` of all topics laid end
+    to end. `is_last[e]` says that no later event of the run has its stamp: the moment for an estimate.
     """
 
     offsets: NDArray[np.int64]
     time_ns: NDArray[np.int64]
     topic: NDArray[np.int64]
-    row: NDArray[np.int64]
+    source: NDArray[np.int64]
     is_last: NDArray[np.bool_]
+
+
+CarriedType = TypeVar("CarriedType", bound=NamedTuple)
 
 
 class Block(NamedTuple):
@@ -55,6 +59,36 @@ class Block(NamedTuple):
 
     streams: dict[str, Ragged]
     events: Events
+
+    def column(self, *names: str, missing: float = np.nan) -> NDArray:
+        """One field of every event: the first of `names` that its topic has, else `missing`."""
+        parts = []
+        for ragged in self.streams.values():
+            found = [name for name in names if name in ragged.stream.columns]
+            parts.append(ragged[found[0]] if found else np.full(len(ragged), missing))
+        return np.concatenate(parts)[self.events.source]
+
+
+def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
+    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs."""
+    columns: Any = carried
+    return type(carried)(*(column[runs] for column in columns))
+
+
+def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The offsets that the chosen rows of ragged columns have, laid end to end."""
+    return np.concatenate([[0], np.cumsum(chosen)])[offsets]
+
+
+def filled_rows(
+    offsets: NDArray[np.int64], end: NDArray[np.int64]
+) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
+    """What is filled of ragged columns whose run r goes from offsets[r] to end[r]: rows, and offsets."""
+    if np.array_equal(end, offsets[1:]):
+        return slice(None), offsets
+    run = np.repeat(np.arange(len(end)), np.diff(offsets))
+    filled = np.arange(len(run)) < end[run]
+    return np.flatnonzero(filled), ragged_rows(filled, offsets)
 
 
 def gather(parts: Sequence[Stream]) -> Ragged:
@@ -65,25 +99,51 @@ def gather(parts: Sequence[Stream]) -> Ragged:
     return Ragged(concatenate(filled), offsets)
 
 
-def merge_events(streams: Mapping[str, Ragged], order: Order) -> Events:
+def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
-    offsets = sum((ragged.offsets for ragged in streams.values()), np.zeros(1, np.int64))
-    runs = len(offsets) - 1
-    pieces = [
-        np.stack(
-            [
-                np.repeat(np.arange(runs), np.diff(ragged.offsets)),
-                ragged.stream.publish_time_ns if order == "publish_time" else ragged.stream.log_time_ns,
-                ragged.stream.position,
-                np.full(len(ragged), index),
-                np.arange(len(ragged)),
-            ]
-        )
-        for index, ragged in enumerate(streams.values())
-    ]
-    run, time_ns, position, topic, row = np.concatenate(pieces, axis=1)
-    merged = np.lexsort((position, time_ns, run))
-    time_ns, run = time_ns[merged], run[merged]
-    is_last = np.ones(len(merged), bool)
-    is_last[:-1] = (time_ns[1:] != time_ns[:-1]) | (run[1:] != run[:-1])
-    return Events(offsets, time_ns, topic[merged], row[merged], is_last)
+    everything = list(streams.values())
+    clock = "publish_time_ns" if order == "publish_time" else "log_time_ns"
+    times_ns = np.concatenate([getattr(ragged.stream, clock) for ragged in everything])
+    positions = np.concatenate([ragged.stream.position for ragged in everything])
+    starts = np.cumsum([0, *(len(ragged) for ragged in everything[:-1])])
+    bounds = np.stack([ragged.offsets for ragged in everything]) + starts[:, None]
+    offsets = sum((ragged.offsets for ragged in everything), np.zeros(1, np.int64))
+    count = len(times_ns)
+    topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
+    events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
+    heads = partial(np.empty, len(everything), np.int64)
+    _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
+    return events
+
+
+@lru_cache(maxsize=1)
+def _merge() -> Callable[..., None]:
+    return compile_over_runs(merge_run, allocates=False)
+
+
+def merge_run(
+    run: int,
+    bounds: NDArray[np.int64],
+    times_ns: NDArray[np.int64],
+    positions: NDArray[np.int64],
+    events: Events,
+    heads: NDArray[np.int64],
+) -> None:
+    """Merge the sorted topics of one run: topic k has the messages bounds[k, run]:bounds[k, run + 1]."""
+    for k in range(len(heads)):
+        heads[k] = bounds[k, run]
+    for event in range(events.offsets[run], events.offsets[run + 1]):
+        first = -1
+        for k in range(len(heads)):
+            if heads[k] < bounds[k, run + 1]:
+                if first < 0:
+                    first = k
+                later_ns = times_ns[heads[k]] - times_ns[heads[first]]
+                if later_ns < 0 or (later_ns == 0 and positions[heads[k]] < positions[heads[first]]):
+                    first = k
+        time_ns = times_ns[heads[first]]
+        if event > events.offsets[run] and time_ns == events.time_ns[event - 1]:
+            events.is_last[event - 1] = False
+        events.time_ns[event], events.is_last[event] = time_ns, True
+        events.topic[event], events.source[event] = first, heads[first]
+        heads[first] += 1

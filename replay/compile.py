@@ -15,13 +15,15 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable
-from functools import lru_cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+from numba.core.errors import NumbaError
 
 from recorders.errors import BadInput
 
@@ -35,75 +37,113 @@ def cache_folder() -> Path:
     return (Path(home) if home else Path.home() / ".cache") / "fuselog"
 
 
-def compile_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) -> Callable[..., None]:
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
         run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
             belongs to that run. It may be a closure over model functions and numbers: that is how it is
             specialised. It may use NumPy and functions that keep to the same.
+        allocates: whether it makes arrays. A kernel that does not is compiled without the counting of
+            references to arrays, and is several times as fast.
 
-    Returns `loop(runs, *arguments)`; its results do not depend on the number of runs or cores.
+    Returns `loop(runs, *arguments, scratch=None)`; its results do not depend on the number of runs or
+    cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
+    that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
     """
-    bundle = _Bundle()
-    bundle.add("run_once", run_once)
+    # a division by zero gives infinity, which is a failure of its run, and no exception
+    inner = "error_model='numpy', forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True"
+    bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates})")
+    kernel = bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
     text = "\n".join(
         [
             "from __future__ import annotations",
             "import numba",
-            *sorted(bundle.imports - {"import numba as numba"}),
+            *sorted(bundle.imports),
             *bundle.definitions,
-            # numba loses writes to arrays of a NamedTuple inside prange itself: the loop only calls
-            "@numba.njit(cache=True, parallel=True)",
-            f"def loop(runs, {names}):",
-            "    for run in numba.prange(runs):",
-            f"        run_once(run, {names})",
+            f"@numba.njit(cache=True, nogil=True, _nrt={allocates})",
+            f"def loop(first, end, {names}):",
+            "    for run in range(first, end):",
+            f"        {kernel}(run, {names})",
             "",
         ]
     )
-    return _load(text).loop
+    return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
+
+
+def _over_runs(
+    runs: int,
+    *arguments: Any,
+    scratch: Callable[[], Any] | None = None,
+    name: str,
+    loop: Callable[..., None],
+) -> None:
+    """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+
+    def work(first: int, end: int) -> None:
+        loop(first, end, *arguments, *([scratch()] if scratch else []))
+
+    cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    try:
+        if cores > 1:
+            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+            with ThreadPoolExecutor(cores) as pool:
+                list(pool.map(work, cuts[:-1], cuts[1:]))
+        else:
+            work(0, runs)
+    except NumbaError as error:
+        reason = str(error).splitlines()[-1]
+        raise BadInput(
+            f"kernel '{name}' does not compile: {reason} "
+            "(a kernel that makes arrays is compiled with allocates=True)"
+        ) from error
 
 
 class _Bundle:
-    """Sources in the order they are needed, and the imports above them."""
+    """Sources in the order they are needed, and the imports above them.
 
-    def __init__(self) -> None:
+    Everything gets a name of its own: two closures of one function, over different models, are two.
+    """
+
+    def __init__(self, decorator: str) -> None:
+        self._decorator = decorator
         self.imports: set[str] = set()
         self.definitions: list[str] = []
-        self._values: dict[str, Any] = {}
+        self._names: dict[Any, str] = {}
 
-    def add(self, name: str, value: Any) -> None:
-        """Define `name`, and before it what it needs."""
-        if name in self._values:
-            if self._values[name] is not value:
-                raise BadInput(
-                    f"a kernel reaches two different things called '{name}'; rename one of them"
-                )
-            return
-        self._values[name] = value
+    def add(self, name: str, value: Any) -> str:
+        """Define a value, called `name` where it is used, and before it what it needs; its own name."""
+        is_plain = isinstance(value, bool | int | float | str | tuple)
+        key = (name, repr(value)) if is_plain else value
+        if key in self._names:
+            return self._names[key]
+        own = self._names[key] = f"{name}_{len(self._names)}"
         if isinstance(value, FunctionType):
-            self._add_function(name, value)
+            self.definitions.append(f"{self._decorator}\n{self._source(own, value)}")
         elif isinstance(value, ModuleType):
-            self.imports.add(f"import {value.__name__} as {name}")
-        elif isinstance(value, bool | int | float | str | tuple):
-            self.definitions.append(f"{name} = {value!r}")
+            self.imports.add(f"import {value.__name__} as {own}")
+        elif is_plain:
+            self.definitions.append(f"{own} = {value!r}")
         else:
-            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {name}")
+            self.imports.add(f"from {value.__module__} import {value.__qualname__} as {own}")
+        return own
 
-    def _add_function(self, name: str, function: FunctionType) -> None:
-        if name != function.__name__:
-            self.add(function.__name__, function)
-            self.definitions.append(f"{name} = {function.__name__}")
-            return
+    def _source(self, own: str, function: FunctionType) -> str:
         closure = inspect.getclosurevars(function)
-        for needed, value in {**closure.globals, **closure.nonlocals}.items():
-            self.add(needed, value)
-        self.definitions.append(f"@numba.njit\n{_source(function)}")
+        needed = {**closure.globals, **closure.nonlocals}
+        names = {name: self.add(name, value) for name, value in needed.items()}
+        definition = _definition(function)
+        definition.name = own
+        for node in ast.walk(definition):
+            if isinstance(node, ast.Name):
+                node.id = names.get(node.id, node.id)
+        return ast.unparse(definition)
 
 
-def _source(function: FunctionType) -> str:
+def _definition(function: FunctionType) -> ast.FunctionDef:
     """A function's source without its decorators and docstring."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
@@ -118,24 +158,36 @@ def _source(function: FunctionType) -> str:
     definition.decorator_list = []
     if ast.get_docstring(definition) is not None:
         definition.body = definition.body[1:]
-    return ast.unparse(definition)
+    return definition
 
 
 @lru_cache(maxsize=64)
 def _load(text: str) -> ModuleType:
     stamp = f"{numba.__version__} {version('numpy')}"
-    digest = hashlib.sha256((stamp + text).encode()).hexdigest()[:24]
-    folder = cache_folder() / "kernels"
-    path = folder / f"kernel_{digest}.py"
+    name = f"kernel_{hashlib.sha256((stamp + text).encode()).hexdigest()[:24]}"
+    try:
+        return _imported(name, text, cache_folder() / "kernels")
+    except (OSError, RuntimeError):  # numba raises the latter where it finds no folder to write to
+        return _imported(name, text, Path(_own_folder().name))
+
+
+@lru_cache(maxsize=1)
+def _own_folder() -> tempfile.TemporaryDirectory[str]:
+    """Where this process compiles, for itself alone, if the cache folder cannot be written."""
+    return tempfile.TemporaryDirectory(prefix="fuselog-")
+
+
+def _imported(name: str, text: str, folder: Path) -> ModuleType:
+    path = folder / f"{name}.py"
     if not path.exists() or path.read_text() != text:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as part:
             part.write(text)
         Path(part.name).replace(path)
-    specification = importlib.util.spec_from_file_location(path.stem, path)
+    specification = importlib.util.spec_from_file_location(name, path)
     assert specification is not None
     assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)
-    sys.modules[path.stem] = module  # numba's cache looks for it there
+    sys.modules[name] = module  # numba's cache looks for it there
     specification.loader.exec_module(module)
     return module

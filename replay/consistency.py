@@ -7,31 +7,38 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from recorders.errors import BadInput
-
 Array = NDArray[np.float64]
+
+# A share of a variance below this is rounding.
+ROUNDING = 1e-14
 
 
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
-    """NEES e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
+    """NEES or NIS e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
 
-    A component of infinite variance counts nothing; NaN where an error or a covariance is NaN. Raises
-    BadInput where a covariance is singular.
+    A component of infinite variance counts nothing. NaN where there are no components, where an error or
+    a covariance is NaN, or where a covariance is not positive definite.
     """
-    n = error.shape[-1]
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    known = ~np.isinf(variance)
-    inverse_sigma = np.where(known, 1.0 / np.sqrt(np.where(known, variance, 1.0)), 0.0)
-    both = known[..., :, None] & known[..., None, :]
-    correlation = (
-        inverse_sigma[..., :, None] * np.where(both, covariance, 0.0) * inverse_sigma[..., None, :]
-    )
-    correlation = np.where(both, correlation, np.eye(n))
-    scaled = (inverse_sigma * error)[..., None]
-    try:
-        return (np.swapaxes(scaled, -1, -2) @ np.linalg.solve(correlation, scaled))[..., 0, 0]
-    except np.linalg.LinAlgError as failure:
-        raise BadInput("NEES: a covariance is singular; leave out the components it fixes") from failure
+    size = error.shape[-1]
+    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
+    both = finite[..., :, None] & finite[..., None, :]
+    covariance = np.where(both, covariance, np.eye(size))
+    error = np.where(finite, error, 0.0)
+    # |L^-1 e|^2 by the Cholesky factors L of all P at once
+    factor, whitened = np.empty_like(covariance), np.empty_like(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for row in range(size):
+            for column in range(row + 1):
+                reached = np.sum(factor[..., row, :column] * factor[..., column, :column], axis=-1)
+                entry = covariance[..., row, column] - reached
+                if column < row:
+                    factor[..., row, column] = entry / factor[..., column, column]
+                else:
+                    is_sound = entry > ROUNDING * covariance[..., row, row]
+                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
+            reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
+            whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
+    return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:

@@ -6,17 +6,20 @@ whole streams and is done. The same call serves one run and many, so an ensemble
 the runs replayed one by one, bit for bit.
 """
 
+import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, Generic
 
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log.reader import Order, Topic
+from recorders.log import Clock, Stream, Topic
 from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
-from recorders.registry import load
+from recorders.registry import foreign_code, load
 from replay.blocks import Block, Ragged, gather, merge_events
 from replay.sources import Source
 
@@ -45,9 +48,13 @@ class Recursive:
 
 @dataclass(frozen=True)
 class Batch:
-    """An estimator that needs its topics whole: `solve` turns them into output streams."""
+    """An estimator that needs everything at once: `solve` turns its topics into output streams.
+
+    `streams` are the measurements, within the span that is replayed; `whole` as for `Recursive`.
+    """
 
     name: str
+    streams: tuple[str, ...]
     whole: tuple[str, ...]
     solve: Callable[[dict[str, Ragged]], list[Ragged]]
 
@@ -71,34 +78,54 @@ class Estimator(Generic[ParametersType]):
     variant: str | None = None
 
 
-def bind(name: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
-    """Bind the estimator `name`, or `name:variant`, to an ensemble.
+def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
+    """The registered estimator of `name`, and the parameter that a `name:variant` sets.
 
-    `settings` are its parameters; an entry `kind` gives the registered name where `name` is only a
-    label, so that one estimator can be replayed with several settings at once.
-
-    Raises BadInput where the name or a parameter is unknown, the estimator does not fit the log, or the
-    runs of the ensemble do not hold the same topics.
+    Raises BadInput where there is none, or it has no variants.
     """
+    kind, _, variant = name.partition(":")
+    estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    if not variant:
+        return estimator, {}
+    if estimator.variant is None:
+        raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
+    return estimator, {estimator.variant: variant}
+
+
+def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
+    """The estimator of a label, and its parameters.
+
+    `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
+    estimator can be replayed with several settings at once. The other settings are its parameters.
+
+    Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+    """
+    if not re.fullmatch(r"[\w:-]+", label):
+        raise BadInput(f"estimator '{label}': a label is made of letters, digits, '-', '_' and ':'")
     values = dict(settings)
-    kind, _, variant = str(values.pop("kind", name)).partition(":")
-    estimator: Estimator[Any] = load("estimators", kind)
-    if variant:
-        if estimator.variant is None:
-            raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
-        values[estimator.variant] = variant
-    parameters: Parameters = build(estimator.parameters, values, f"estimator {name}")
+    estimator, variant = find_estimator(str(values.pop("kind", label)))
+    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+
+
+def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+    """Bind an estimator to an ensemble; see `configure`.
+
+    Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
+    of them must be stated alike.
+    """
+    estimator, parameters = configure(label, settings)
     first = sources[0]
-    bound = estimator.bind(name, first.topics, parameters)
+    with foreign_code(f"estimator {label}"):
+        bound = estimator.bind(label, first.topics, parameters)
     if not bound:
         raise BadInput(
-            f"{first.name}: estimator {name} does not fit this log: it needs {estimator.needs}; "
+            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
     for source in sources[1:]:
-        for topic in {topic for each in bound for topic in topics_of(each)}:
-            there = source.topics.get(topic)
-            if there is None or there.schema_name != first.topics[topic].schema_name:
+        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
+            here, there = first.topics[topic], source.topics.get(topic)
+            if there is None or _stated(there) != _stated(here):
                 raise BadInput(
                     f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
                     "ensemble hold the same topics, replay this one on its own"
@@ -106,16 +133,16 @@ def bind(name: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> l
     return bound
 
 
-def topics_of(bound: Bound) -> tuple[str, ...]:
-    """All topics that a bound estimator reads."""
-    return bound.whole + (bound.streams if isinstance(bound, Recursive) else ())
+def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
+    """What an estimator is told of a topic when it is bound."""
+    return topic.schema_name, topic.metadata
 
 
 def replay(
     sources: Sequence[Source],
     estimators: Sequence[Bound],
     *,
-    order: Order = "publish_time",
+    order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
 ) -> Iterator[list[Ragged]]:
     """Replay an ensemble; yields the output streams of all estimators, block by block.
@@ -125,23 +152,31 @@ def replay(
         estimators: bound estimators with different names.
         order: the clock to go by, publish time or (as it arrived) log time.
         block_messages: about how many messages of a run are in memory at once.
+
+    Raises BadInput where an estimator raises, or no run has a message for it.
     """
-    needed = {topic for bound in estimators for topic in bound.whole}
-    whole = _read_whole(sources, sorted(needed))
-    for bound in estimators:
-        if isinstance(bound, Batch):
-            yield bound.solve({topic: whole[topic] for topic in bound.whole})
-    recursive = [bound for bound in estimators if isinstance(bound, Recursive)]
-    states = [bound.start({topic: whole[topic] for topic in bound.whole}) for bound in recursive]
-    streamed = sorted({topic for bound in recursive for topic in bound.streams})
-    for block in _ensemble_blocks(sources, streamed, order, block_messages):
+    whole = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    given = [{topic: whole[topic] for topic in bound.whole} for bound in estimators]
+    states: list[Any] = [None] * len(estimators)
+    for index, bound in enumerate(estimators):
+        if isinstance(bound, Recursive):
+            with foreign_code(f"estimator {bound.name}"):
+                states[index] = bound.start(given[index])
+            continue
+        for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
+            with foreign_code(f"estimator {bound.name}"):
+                solved = bound.solve(given[index] | block)
+            yield solved
+    streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
+    for block in _ensemble_blocks(sources, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
-        for index, bound in enumerate(recursive):
-            streams = {topic: block[topic] for topic in bound.streams}
-            states[index], produced = bound.run(
-                states[index], Block(streams, merge_events(streams, order))
-            )
-            outputs += produced
+        for index, bound in enumerate(estimators):
+            if isinstance(bound, Recursive):
+                streams = {topic: block[topic] for topic in bound.streams}
+                events = merge_events(streams, order)
+                with foreign_code(f"estimator {bound.name}"):
+                    states[index], produced = bound.run(states[index], Block(streams, events))
+                outputs += produced
         yield outputs
 
 
@@ -151,7 +186,7 @@ def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, R
 
 
 def _ensemble_blocks(
-    sources: Sequence[Source], topics: Sequence[str], order: Order, block_messages: int
+    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
     """The next block of every run, until all runs are at their end.
 
@@ -159,16 +194,15 @@ def _ensemble_blocks(
     """
     if not topics:
         return
-    readers = [source.blocks(topics, order, block_messages) for source in sources]
     empty = {topic: sources[0].empty(topic) for topic in topics}
-    while True:
-        blocks = [next(reader, None) for reader in readers]
-        if all(block is None for block in blocks):
-            return
-        yield {
-            topic: gather([(block or {}).get(topic, empty[topic]) for block in blocks])
-            for topic in topics
-        }
+    ended: dict[str, Stream] = {}
+    is_empty = True
+    runs = [source.blocks(topics, order, block_messages) for source in sources]
+    for blocks in zip_longest(*runs, fillvalue=ended):
+        yield {topic: gather([block.get(topic, empty[topic]) for block in blocks]) for topic in topics}
+        is_empty = False
+    if is_empty:
+        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:

@@ -18,6 +18,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
+from replay.consistency import normalized_error_squared
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
@@ -79,17 +80,6 @@ def split_topic(topic: str) -> tuple[str, str]:
     return parts[0], "/".join(parts[1:-1])
 
 
-def squared_mahalanobis(error: Floats, covariance: Floats) -> Floats:
-    """The form e' P^-1 e, errors (n, d), covariances (n, d, d); NaN where P is not positive definite."""
-    result = np.full(len(error), np.nan)
-    if error.shape[1] == 0 or len(error) == 0:
-        return result
-    good = np.linalg.eigvalsh(covariance)[:, 0] > 0
-    solved = np.linalg.solve(covariance[good], error[good, :, None])[..., 0]
-    result[good] = np.sum(error[good] * solved, axis=1)
-    return result
-
-
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
     """Where the mean of `runs` chi-square values lies with this probability if all is well."""
     tail = 0.5 * (1 - probability)
@@ -106,8 +96,6 @@ def truth_at(
     """
     times = truth.publish_time_ns
     state = truth["state"]
-    if len(times) == 0:
-        return np.full((len(time_ns), state.shape[1]), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
@@ -150,7 +138,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
-    epochs = np.array([source.run.epoch_ns if source.run else 0 for source in sources])
+    epochs = np.array([source.epoch_ns for source in sources])
     covariance = stream["covariance"].reshape(len(stream), size, size)[known]
     return Errors(
         estimator,
@@ -163,7 +151,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         (stream.publish_time_ns - epochs[run])[known] * 1e-9,
         error[known],
         covariance,
-        squared_mahalanobis(error[known], covariance),
+        normalized_error_squared(error[known], covariance),
         int((~known).sum()),
     )
 
@@ -177,6 +165,8 @@ def _reference(
     gap_limit_s: float,
 ) -> Floats:
     truth = source.read([topic])[topic]
+    if len(truth) == 0:
+        return np.full((len(estimates), len(components)), np.nan)
     there = truth.components
     missing = [name for name in components if name not in there]
     if missing:
@@ -244,43 +234,6 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
     table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
     return table
-
-
-def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of the position and of every component over all runs and steps."""
-    values: dict[str, float] = {}
-    if errors.position:
-        squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
-        values["position_rmse_m"] = float(np.sqrt(squared.mean()))
-    for column, name in enumerate(errors.components):
-        if column not in errors.position:
-            quantity, _, unit = name.rpartition("_")
-            rmse = float(np.sqrt(np.mean(errors.error[:, column] ** 2)))
-            values[f"{quantity}_rmse_{unit}"] = rmse
-    return values
-
-
-def consistency(errors: Errors) -> dict[str, float]:
-    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
-    values = {"nees": float(np.nanmean(errors.nees))}
-    if errors.position and len(errors.position) < len(errors.components):
-        block = errors.covariance[:, errors.position][:, :, errors.position]
-        nees = squared_mahalanobis(errors.error[:, errors.position], block)
-        values["position_nees"] = float(np.nanmean(nees))
-    table = step_table(errors)
-    inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
-    values["nees_steps_within_95"] = float(inside.mean())
-    return values
-
-
-def innovation_metrics(innovations: Innovations) -> dict[str, float]:
-    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
-    if len(innovations.squared) == 0:
-        return {}
-    return {
-        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
-        "gated_share": float(1 - innovations.accepted.mean()),
-    }
 
 
 def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:

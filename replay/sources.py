@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, Stream, read_blocks, read_empty, read_streams
-from recorders.log.reader import Order, Topic
+from recorders.log import Clock, Log, RunMetadata, Stream, Topic, read_blocks, read_empty, read_streams
 from recorders.recording import Recording
 
 
@@ -24,6 +23,10 @@ class Source(Protocol):
         """What the run was."""
 
     @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+
+    @property
     def topics(self) -> Mapping[str, Topic]:
         """What it holds."""
 
@@ -34,7 +37,7 @@ class Source(Protocol):
         """The topic without its messages."""
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
@@ -58,6 +61,11 @@ class LogSource:
         return self.log.run
 
     @property
+    def epoch_ns(self) -> int:
+        """The run's time zero; the log's beginning where it does not say."""
+        return self.log.run.epoch_ns if self.log.run else log_span_ns(self.log)[0]
+
+    @property
     def topics(self) -> Mapping[str, Topic]:
         """The log's topics."""
         return self.log.topics
@@ -71,7 +79,7 @@ class LogSource:
         return read_empty(self.log, topic)
 
     def blocks(
-        self, topics: Sequence[str], order: Order, block_messages: int
+        self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
         """Blocks of the source's span."""
         return read_blocks(
@@ -89,8 +97,13 @@ class MemorySource:
     """A recording in memory: replayed as if it had been written and read back."""
 
     streams: Mapping[str, Stream]
-    run: RunMetadata | None
+    run: RunMetadata
     name: str
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+        return self.run.epoch_ns
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -116,19 +129,28 @@ class MemorySource:
     def blocks(
         self,
         topics: Sequence[str],
-        order: Order,
+        order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """One block: everything is in memory already."""
-        block = {topic: self._in_order(topic, order) for topic in topics}
-        yield {topic: stream for topic, stream in block.items() if len(stream)}
+        """One block, unless there is nothing: everything is in memory already."""
+        block = {topic: self._in_order(topic, order) for topic in topics if len(self.streams[topic])}
+        if block:
+            yield block
 
-    def _in_order(self, topic: str, order: Order) -> Stream:
+    def _in_order(self, topic: str, order: Clock) -> Stream:
         stream = self.streams[topic]
         clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
-        if np.all(clock[1:] >= clock[:-1]):
+        later, after = np.diff(clock), np.diff(stream.position)
+        if np.all((later > 0) | ((later == 0) & (after > 0))):
             return stream
         return stream.take(np.lexsort((stream.position, clock)))
+
+
+def log_span_ns(log: Log) -> tuple[int, int]:
+    """The first and the last log time of a log; zeros where it has no messages."""
+    spans = [region.spans["log_time"] for region in log.container.regions]
+    first = min((span.first_ns for span in spans), default=0)
+    return first, max((span.last_ns for span in spans), default=0)
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:

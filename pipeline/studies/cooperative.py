@@ -5,18 +5,18 @@ Claims: Jin, Lee, Hashimoto, DIND networks, section 4.2, on real robots; the pap
 
 import numpy as np
 
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome
 from pipeline.studies import localization
 
 ALONE, NAIVE, CI, JOINT = "alone", "naive", "ci", "joint"
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    outcome, input_hash = localization.study(experiment, setting)
+    outcome = localization.study(experiment, setting)
     outcome.claims = claims(outcome.metrics)
-    return outcome, input_hash
+    return outcome
 
 
 def claims(metrics: dict[str, MetricValue]) -> list[Claim]:
@@ -56,3 +56,6 @@ def claims(metrics: dict[str, MetricValue]) -> list[Claim]:
         Claim(claim, "section 4.2, no numbers", ours, "confirmed" if holds else "refuted")
         for claim, ours, holds in rows
     ]
+
+
+COOPERATIVE = Study("robots that share their estimates: what each way of fusing costs", study)

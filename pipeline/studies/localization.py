@@ -4,11 +4,11 @@ It is what most experiments need: record or import, replay, judge, draw. Familie
 call `localize` and add their own tables, figures and claims.
 """
 
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from pipeline.ensemble import (
     Replayed,
@@ -17,24 +17,21 @@ from pipeline.ensemble import (
     record_ensemble,
     replay_ensemble,
 )
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study, load_scenario
 from pipeline.results import MetricValue, Outcome, split_metric
+from recorders.errors import BadInput
 from recorders.log import LogWriter
+from recorders.parameters import merge
 from recorders.recording import import_run
-from replay.evaluation import (
-    Errors,
-    accuracy,
-    chi_square_interval,
-    consistency,
-    error_table,
-    innovation_metrics,
-    step_table,
-)
+from replay.evaluation import Errors, chi_square_interval, error_table, step_table
+from replay.metrics import find_metrics, measure
 from replay.sources import MemorySource, memory_source
-from replay.timeline.show import show
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     sources = obtain(experiment, setting)
     replayed = replay_ensemble(
@@ -44,25 +41,24 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
         progress=setting.progress,
     )
     write_logs(experiment, setting, sources, replayed)
+    from replay.timeline.show import show
+
     show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
-    return summarise(replayed), hash_streams(sources)
+    outcome = summarise(replayed, experiment.metrics)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
 
 
 def obtain(experiment: Experiment, setting: Setting) -> list[MemorySource]:
     """The experiment's runs: simulated, or the one that is imported."""
-    if experiment.import_ is not None:
-        path = setting.data or Path()
-        return [
-            memory_source(*import_run(experiment.import_.source, path, experiment.import_.parameters))
-        ]
-    assert experiment.record is not None
-    return record_ensemble(
-        experiment.record.scenario,
-        experiment.record.parameters,
-        experiment.seed,
-        experiment.runs,
-        setting.progress,
-    )
+    if experiment.import_ and setting.data:
+        imported = import_run(experiment.import_.source, setting.data, experiment.import_.parameters)
+        return [memory_source(*imported)]
+    if not experiment.record:
+        raise BadInput(f"experiment '{experiment.title}': give what to [record] or to [import]")
+    recorder, values, _ = load_scenario(experiment.record.scenario)
+    parameters = merge(values, experiment.record.parameters)
+    return record_ensemble(recorder, parameters, experiment.seed, experiment.runs, setting.progress)
 
 
 def write_logs(
@@ -75,23 +71,18 @@ def write_logs(
         log = setting.folder / "logs" / f"run-{run:04d}.mcap"
         with LogWriter(log, source.run) as writer:
             writer.write(source.streams.values())
-        metadata = estimates_metadata(source, experiment.estimators, f"../logs/{log.name}")
-        with LogWriter(setting.folder / "estimates" / log.name, metadata) as writer:
+        estimates = setting.folder / "estimates" / log.name
+        metadata = estimates_metadata(source, experiment.estimators, estimates, log)
+        with LogWriter(estimates, metadata) as writer:
             writer.write([ragged.of_run(run) for ragged in replayed.outputs.values()])
 
 
-def summarise(replayed: Replayed) -> Outcome:
-    """Metrics, tables and figures of a judged replay."""
+def summarise(replayed: Replayed, metrics: Sequence[str] = ()) -> Outcome:
+    """Metrics (all, where none is named), tables and figures of a judged replay."""
     outcome = Outcome()
-    for errors in replayed.errors:
-        if len(errors.nees):
-            _add(outcome, errors.estimator, errors.case, accuracy(errors) | consistency(errors))
-        missing = {"estimates_without_truth": float(errors.without_truth)}
-        _add(outcome, errors.estimator, errors.case, missing)
-    for innovations in replayed.innovations:
-        _add(outcome, innovations.estimator, innovations.case, innovation_metrics(innovations))
-    judged = [errors for errors in replayed.errors if len(errors.nees)]
+    outcome.metrics.update(measure(replayed.judged, find_metrics(metrics)))
     outcome.tables["summary"] = summary_table(outcome.metrics)
+    judged = [errors for errors in replayed.errors if len(errors.nees)]
     if judged:
         outcome.tables["errors"] = pd.concat([error_table(errors) for errors in judged])
         outcome.tables["steps"] = pd.concat([step_table(errors) for errors in judged])
@@ -101,36 +92,43 @@ def summarise(replayed: Replayed) -> Outcome:
     return outcome
 
 
-def _add(outcome: Outcome, estimator: str, case: str, values: dict[str, float]) -> None:
-    for quantity, value in values.items():
-        key = f"{estimator}.{quantity}" + (f".{case}" if case else "")
-        outcome.metrics[key] = value
-
-
-def summary_table(metrics: dict[str, MetricValue]) -> pd.DataFrame:
+def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
     """One row per metric: estimator, quantity, case, value."""
     rows = [(*split_metric(key), value) for key, value in metrics.items()]
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
-def error_figure(judged: list[Errors], case: str) -> Figure:
-    """Position RMSE, and NEES with its 95 % interval, over time; all runs together."""
+def error_figure(judged: list[Errors], case: str) -> "Figure":
+    """RMSE, and NEES with its 95 % interval, over time; all runs together."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
+    quantity, label = _main_quantity(judged[0])
     for errors in judged:
         table = _thinned(step_table(errors))
-        above.plot(table["elapsed_s"], table["position_rmse_m"], label=errors.estimator, lw=1)
+        above.plot(table["elapsed_s"], table[quantity], label=errors.estimator, lw=1)
         below.plot(table["elapsed_s"], table["nees"], label=errors.estimator, lw=1)
     runs = len(np.unique(judged[0].run))
     low, high = chi_square_interval(len(judged[0].components), runs)
     below.axhspan(low, high, color="0.85", zorder=0, label="95 % if consistent")
-    above.set(ylabel="position RMSE (m)", title=f"{case or 'errors'}, {runs} runs")
+    above.set(ylabel=label, title=f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}")
     below.set(ylabel="mean NEES", xlabel="time (s)", yscale="log")
     above.legend(loc="upper left")
     below.legend(loc="upper left")
     return figure
 
 
+def _main_quantity(errors: Errors) -> tuple[str, str]:
+    """The column of the step table to draw, and what to call it: position, else the first component."""
+    if errors.position:
+        return "position_rmse_m", "position RMSE (m)"
+    return f"rmse_{errors.components[0]}", f"RMSE {errors.components[0]}"
+
+
 def _thinned(table: pd.DataFrame, points: int = 2000) -> pd.DataFrame:
     """Every k-th row, so that a figure has no more points than a person sees."""
     return table.iloc[:: max(1, len(table) // points)]
+
+
+LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)

@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from pydantic import NonNegativeFloat
 
 from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
 from pipeline.studies.localization import obtain, summarise, write_logs
-from recorders.parameters import Parameters, build, merge
+from recorders.parameters import Parameters, merge
 from replay.blocks import gather
 from replay.estimators.covariance_intersection import fuse
 from replay.estimators.networks import ALONE, CENTRALISED, NetworkParameters, message_bytes
@@ -35,9 +35,9 @@ class NetworkOptions(Parameters):
     loss_rules: tuple[str, ...] = ("naive", CI)
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    options = build(NetworkOptions, experiment.options, "options of the networks study")
+    options: NetworkOptions = setting.options
     sources = obtain(experiment, setting)
     replayed = _replay(sources, experiment.estimators, experiment, setting)
     write_logs(experiment, setting, sources, replayed)
@@ -54,7 +54,8 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
     outcome.tables |= {"network": table, "loss": by_loss}
     outcome.figures["loss"] = _loss_figure(by_loss)
     outcome.claims = _claims(table, by_loss)
-    return outcome, hash_streams(sources)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
 
 
 def _replay(
@@ -236,3 +237,10 @@ def _claim_of_equation_17() -> Claim:
 
 def _claim(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
     return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
+
+
+NETWORKS = Study(
+    "sensor networks: what each fusion rule costs in accuracy, consistency and bytes",
+    study,
+    NetworkOptions,
+)

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
-from pipeline.experiment import Experiment, Setting
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome
 from pipeline.studies.localization import obtain, write_logs
 from replay.evaluation import split_topic
@@ -21,7 +21,7 @@ EXACT, BOX, L4, L8 = "exact", "box", "l4", "l8"
 FIRST_PAIR, SECTION_V = "section-v-first-pair", "section-v"
 
 
-def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
+def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     sources = obtain(experiment, setting)
     replayed = replay_ensemble(
@@ -37,7 +37,8 @@ def study(experiment: Experiment, setting: Setting) -> tuple[Outcome, str]:
         outcome.claims = _claims(outcome.metrics)
     else:
         outcome.figures["bounds"] = _bounds_figure(outcome.metrics)
-    return outcome, hash_streams(sources)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
 
 
 def frame_table(judged: Sequence[JudgedSets]) -> pd.DataFrame:
@@ -214,3 +215,6 @@ def _value(metrics: Mapping[str, MetricValue], key: str) -> float:
     """A metric that is one number; NaN where there is none."""
     found = metrics.get(key)
     return float(found) if isinstance(found, int | float) else float("nan")
+
+
+SET_MEMBERSHIP = Study("set-valued fixes: areas, containment of the truth, faults", study)

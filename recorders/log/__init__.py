@@ -1,18 +1,21 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
-from recorders.log.reader import Log, open_log, read_blocks, read_empty, read_streams
+from recorders.log.opening import Log, Topic, open_log
+from recorders.log.reader import read_blocks, read_empty, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
-from recorders.log.streams import Stream, make_stream
+from recorders.log.streams import Clock, Stream, make_stream
 from recorders.log.writer import LogWriter, write_log
 
 __all__ = [
+    "Clock",
     "Field",
     "Log",
     "LogWriter",
     "RunMetadata",
     "Schema",
     "Stream",
+    "Topic",
     "make_stream",
     "open_log",
     "read_blocks",

@@ -1,301 +1,248 @@
-"""The MCAP container as byte regions: where the chunks of a file are, and how much of it is whole.
+"""The MCAP container: which regions of a file hold messages, and what else stands in it.
 
-A file with a summary is opened through the official reader. One without (legal, or cut off) is walked
-record by record. Messages outside chunks are laid out like an uncompressed chunk, and are read as one.
+The data section is walked record by record. A chunk that the summary tells of is stepped over; any other
+is opened on the way, so that a file without an index, or with one that leaves chunks out, is read all
+the same. Messages outside chunks are laid out like an uncompressed chunk, and are read as one.
+Source: the MCAP specification (mcap.dev/spec).
 """
 
 import io
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
-import lz4.frame
-import numpy as np
-import zstandard
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log.writer import INDEX_ENTRY, MAGIC
+from recorders.log.chunks import MAGIC, RECORD_HEAD, Damaged, Span, open_region, read_records
+from recorders.log.sealed import unseal
+from recorders.log.streams import Clock
 
-
-class Damaged(Exception):
-    """A part of a file that cannot be read; says which and why."""
-
-
-_HEAD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_INDEX_HEAD = struct.Struct("<BQHI")
+_FOOTER = struct.Struct("<BQQQI8s")
+# The part of the footer that the summary's checksum covers.
+_FOOTER_CHECKED_BYTES = 25
 _LOOSE = frozenset({Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL})
-# A run of messages outside chunks is cut here, so that memory stays bounded.
+# A run of records outside chunks is cut here, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class Region:
-    """One chunk, or one run of messages outside chunks, and what is known of it before reading."""
+    """One chunk, or one run of records outside chunks, and what is known of it without opening it.
+
+    The span of publish time is absent where only a foreign index tells of the chunk; `channel_ids` is
+    None where the index does not say which channels it holds.
+    """
 
     offset: int
     length: int
-    start_log_time_ns: int
-    end_log_time_ns: int
-    is_chunk: bool = True
-    index_offsets: dict[int, int] = field(default_factory=dict)
+    spans: Mapping[Clock, Span]
+    channel_ids: frozenset[int] | None
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Where it is in the file, for `read_bytes`."""
+        return self.offset, self.length
 
 
 @dataclass
 class Container:
-    """What a file holds: channels and schemas by id, metadata records by name, regions in file order."""
+    """What a file holds: channels and schemas by id, metadata by name, regions in file order."""
 
     channels: dict[int, records.Channel] = field(default_factory=dict)
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     regions: list[Region] = field(default_factory=list)
-    message_counts: dict[int, int] = field(default_factory=dict)
-    whole: bool = True
-    lost_bytes: int = 0
+    message_counts: Counter[int] = field(default_factory=Counter)
+    damages: list[str] = field(default_factory=list)
 
 
-def open_container(path: Path) -> Container:
-    """Find out what `path` holds; a file that was cut off or damaged has `whole` False.
+class _Place(NamedTuple):
+    """One record of the data section, or a run of loose ones as if it were one message."""
+
+    opcode: int
+    offset: int
+    length: int
+
+    @property
+    def end(self) -> int:
+        """Where the next one starts."""
+        return self.offset + self.length
+
+
+class _Index(NamedTuple):
+    """What a summary says of the chunks, by their place in the file, and of the messages, by channel."""
+
+    chunks: dict[int, records.ChunkIndex]
+    message_counts: Counter[int]
+
+    def chunk(self, place: _Place) -> records.ChunkIndex | None:
+        """The entry of the chunk that stands there, where the index has it right."""
+        entry = self.chunks.get(place.offset)
+        if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
+            return None
+        return entry
+
+
+def open_container(path: Path, *, use_index: bool = True) -> Container:
+    """Find out what `path` holds; without the index every region is opened, and only whole ones kept.
 
     Raises BadInput where the file is missing, unreadable, or no MCAP at all.
     """
     try:
         with path.open("rb") as file:
-            magic = file.read(len(MAGIC))
-            if magic != MAGIC:
+            if file.read(len(MAGIC)) != MAGIC:
                 raise BadInput(f"{path}: not an MCAP file; give a log that starts with the MCAP magic")
-            file.seek(0)
-            return _summarised(file) or _walked(file)
+            return _opened(file, use_index)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _summarised(file: BinaryIO) -> Container | None:
-    """What the summary says, or None where it is absent, damaged, or lacks what the regions need."""
+def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
+    """The `length` bytes of `file` from `offset` on."""
+    file.seek(offset)
+    return file.read(length)
+
+
+def _opened(file: BinaryIO, use_index: bool) -> Container:
+    found, summary, index = Container(), [], _Index({}, Counter())
+    size = file.seek(0, io.SEEK_END)
+    damage_at_end = ""
     try:
-        reader = SeekingReader(file)
-        summary = reader.get_summary()
-        if summary is None or summary.statistics is None or not summary.channels:
-            return None
-        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-    except (McapError, ValueError, struct.error, KeyError, IndexError, MemoryError, OverflowError):
-        return None
-    if len(summary.chunk_indexes) != summary.statistics.chunk_count:
-        return None
-    if summary.statistics.chunk_count == 0 and summary.statistics.message_count:
-        return None
-    size = file.seek(0, io.SEEK_END)
-    regions = [
-        Region(
-            index.chunk_start_offset,
-            index.chunk_length,
-            index.message_start_time,
-            index.message_end_time,
-            True,
-            index.message_index_offsets,
-        )
-        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-    ]
-    if any(region.offset + region.length > size for region in regions):
-        return None
-    return Container(
-        channels=dict(summary.channels),
-        schemas=dict(summary.schemas),
-        metadata=metadata,
-        regions=regions,
-        message_counts=dict(summary.statistics.channel_message_counts),
-    )
-
-
-def _walked(file: BinaryIO) -> Container:
-    """Walk a file without a usable summary from its start to its last whole record."""
-    size = file.seek(0, io.SEEK_END)
-    found = Container(whole=False)
-    position = file.seek(len(MAGIC))
-    loose: list[tuple[int, int, int]] = []
-    while position + _HEAD.size <= size:
-        opcode, length = _HEAD.unpack(file.read(_HEAD.size))
-        end = position + _HEAD.size + length
-        if end > size:
-            break
+        summary = _summary(file, size)
+        _declare(found, summary)
+        index = _index(summary) if use_index else index
+    except Damaged as damage:
+        damage_at_end = str(damage)
+    place = _Place(0, 0, len(MAGIC))
+    for place in _data_section(file, size, index):
         try:
-            if opcode in _LOOSE:
-                loose.append(_note_loose(found, file, opcode, position, end))
-                if end - loose[0][0] > _LOOSE_BYTES:
-                    _close_loose(found, loose)
-            elif opcode == Opcode.CHUNK:
-                _close_loose(found, loose)
-                start_ns, end_ns = struct.unpack("<QQ", file.read(16))
-                found.regions.append(Region(position, end - position, start_ns, end_ns))
-                _note_declarations(found, file, found.regions[-1])
-            elif opcode == Opcode.MESSAGE_INDEX and found.regions:
-                (channel_id,) = struct.unpack("<H", file.read(2))
-                found.regions[-1].index_offsets[channel_id] = position
-            elif opcode == Opcode.METADATA:
-                record = records.Metadata.read(ReadDataStream(file))
-                found.metadata[record.name] = record.metadata
-            elif opcode == Opcode.DATA_END:
-                found.whole = _has_footer(file, size)
-                position = end
-                break
-        except (ValueError, struct.error):
+            _note(found, file, place, index)
+        except Damaged as damage:
+            found.damages.append(str(damage))
+    if place.opcode != Opcode.DATA_END:
+        damage_at_end = f"it was cut off: its last {size - place.end} bytes hold no whole record"
+    if damage_at_end:
+        found.damages.append(damage_at_end)
+    found.damages += _missing(found, summary, index)
+    if index.chunks:
+        found.message_counts = index.message_counts
+    return found
+
+
+def _missing(found: Container, summary: Sequence[Any], index: _Index) -> Iterator[str]:
+    """What the summary tells of and the data section has not."""
+    seen = {region.offset for region in found.regions}
+    for offset in index.chunks.keys() - seen:
+        yield f"there is no chunk at byte {offset}, where its index tells of one"
+    for entry in summary:
+        if isinstance(entry, records.MetadataIndex) and entry.name not in found.metadata:
+            yield f"its metadata record '{entry.name}' is missing"
+
+
+def _summary(file: BinaryIO, size: int) -> list[Any]:
+    """The records of the summary, none where the file has none. Raises Damaged."""
+    file.seek(max(size - _FOOTER.size, 0))
+    footer = file.read(_FOOTER.size)
+    if len(footer) < _FOOTER.size:
+        raise Damaged("its footer is missing")
+    opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
+    if (opcode, length, magic) != (Opcode.FOOTER, 20, MAGIC):
+        raise Damaged("its footer is missing")
+    if start == 0:
+        return []
+    if not len(MAGIC) <= start <= size - _FOOTER.size:
+        raise Damaged("its footer is damaged")
+    file.seek(start)
+    summary = file.read(size - _FOOTER.size - start)
+    if checksum not in (0, zlib.crc32(footer[:_FOOTER_CHECKED_BYTES], zlib.crc32(summary))):
+        raise Damaged("its summary is damaged (the checksum is wrong)")
+    return list(read_records(summary))
+
+
+def _index(summary: Sequence[Any]) -> _Index:
+    """What a summary says; nothing where a part of it is missing, so that every chunk is opened."""
+    by_kind: dict[type, list[Any]] = {}
+    for record in summary:
+        by_kind.setdefault(type(record), []).append(record)
+    chunks = {entry.chunk_start_offset: entry for entry in by_kind.get(records.ChunkIndex, [])}
+    channels = by_kind.get(records.Channel, [])
+    schema_ids = {0, *(schema.id for schema in by_kind.get(records.Schema, []))}
+    for statistics in by_kind.get(records.Statistics, []):
+        counts = Counter(statistics.channel_message_counts)
+        stated = (statistics.chunk_count, statistics.channel_count, statistics.message_count)
+        if (
+            stated == (len(chunks), len(channels), counts.total())
+            and counts.keys() <= {channel.id for channel in channels}
+            and schema_ids.issuperset(channel.schema_id for channel in channels)
+        ):
+            return _Index(chunks, counts)
+    return _Index({}, Counter())
+
+
+def _data_section(file: BinaryIO, size: int, index: _Index) -> Iterator[_Place]:
+    """Every whole record; the message indexes of indexed chunks are stepped over."""
+    run = position = len(MAGIC)
+    while position + RECORD_HEAD.size <= size:
+        opcode, length = RECORD_HEAD.unpack(read_bytes(file, position, RECORD_HEAD.size))
+        place = _Place(opcode, position, RECORD_HEAD.size + length)
+        if opcode == 0 or place.end > size:
             break
-        position = file.seek(end)
-    _close_loose(found, loose)
-    if not found.whole:
-        found.lost_bytes = size - position
-        if found.regions:  # the last chunk's indexes may be cut off
-            found.regions[-1].index_offsets.clear()
-    return found
+        is_loose = opcode in _LOOSE
+        if run < position and (not is_loose or place.end - run > _LOOSE_BYTES):
+            yield _Place(Opcode.MESSAGE, run, position - run)
+            run = position
+        position = place.end
+        if not is_loose:
+            yield place
+            if opcode == Opcode.DATA_END:
+                return
+            entry = index.chunk(place)
+            run = position = place.end + (entry.message_index_length if entry else 0)
+    if run < position <= size:
+        yield _Place(Opcode.MESSAGE, run, position - run)
 
 
-def _note_loose(
-    found: Container, file: BinaryIO, opcode: int, position: int, end: int
-) -> tuple[int, int, int]:
-    """Note a record outside chunks; returns its place and, for a message, its log time (else -1)."""
-    body = file.read(end - position - _HEAD.size)
-    if opcode == Opcode.MESSAGE:
-        return position, end, _MESSAGE.unpack_from(body)[2]
-    _declare(found, opcode, body)
-    return position, end, -1
+def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> None:
+    """Note what one place of the data section holds. Raises Damaged."""
+    entry = index.chunk(place)
+    if entry is not None:
+        span = Span(entry.message_start_time, entry.message_end_time)
+        channel_ids = frozenset(entry.message_index_offsets) or None
+        found.regions.append(Region(place.offset, place.length, {"log_time": span}, channel_ids))
+    elif place.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+        contents = open_region(read_bytes(file, place.offset, place.length), place.offset)
+        _declare(found, contents.declarations)
+        if contents.messages:
+            region = Region(place.offset, place.length, contents.spans, frozenset(contents.messages))
+            found.regions.append(region)
+            found.message_counts.update({key: len(each) for key, each in contents.messages.items()})
+    elif place.opcode in (Opcode.METADATA, Opcode.DATA_END):
+        for record in read_records(read_bytes(file, place.offset, place.length)):
+            if isinstance(record, records.Metadata):
+                found.metadata[record.name] = unseal(record.name, record.metadata)
+            elif not index.chunks and record.data_section_crc not in (0, _checksum(file, place.offset)):
+                raise Damaged("the checksum of its data section is wrong")
 
 
-def _close_loose(found: Container, loose: list[tuple[int, int, int]]) -> None:
-    times = [time for _, _, time in loose if time >= 0]
-    if times:
-        start, end = loose[0][0], loose[-1][1]
-        found.regions.append(Region(start, end - start, min(times), max(times), is_chunk=False))
-    loose.clear()
+def _declare(found: Container, declarations: Iterable[Any]) -> None:
+    """Note schemas and channels. Raises Damaged where one number means two things."""
+    known: dict[type, dict] = {records.Schema: found.schemas, records.Channel: found.channels}
+    for record in declarations:
+        kind = type(record)
+        if kind in known and known[kind].setdefault(record.id, record) != record:
+            raise Damaged(f"it declares {kind.__name__.lower()} {record.id} twice, differently")
 
 
-def _note_declarations(found: Container, file: BinaryIO, region: Region) -> None:
-    """Schemas and channels may be declared inside a chunk; a damaged one is met again when it is read."""
-    with suppress(Damaged, ValueError, struct.error):
-        for opcode, body in walk_records(read_region(file, region)):
-            if opcode != Opcode.MESSAGE:
-                _declare(found, opcode, bytes(body))
-
-
-def _declare(found: Container, opcode: int, body: bytes) -> None:
-    stream = ReadDataStream(io.BytesIO(body))
-    if opcode == Opcode.SCHEMA:
-        schema = records.Schema.read(stream)
-        found.schemas[schema.id] = schema
-    elif opcode == Opcode.CHANNEL:
-        channel = records.Channel.read(stream)
-        found.channels[channel.id] = channel
-
-
-def _has_footer(file: BinaryIO, size: int) -> bool:
-    file.seek(size - len(MAGIC))
-    return file.read(len(MAGIC)) == MAGIC
-
-
-def read_region(file: BinaryIO, region: Region) -> NDArray[np.uint8]:
-    """The uncompressed records of one region as bytes, with the checksum compared.
-
-    Raises Damaged where the region is damaged.
-    """
-    file.seek(region.offset)
-    raw = file.read(region.length)
-    if not region.is_chunk:
-        return np.frombuffer(raw, np.uint8)
-    try:
-        chunk = records.Chunk.read(ReadDataStream(io.BytesIO(raw[_HEAD.size :])))
-        if chunk.compression == "zstd":
-            data = zstandard.decompress(chunk.data, chunk.uncompressed_size)
-        elif chunk.compression == "lz4":
-            data = lz4.frame.decompress(chunk.data)
-        elif chunk.compression == "":
-            data = chunk.data
-        else:
-            raise Damaged(f"the compression '{chunk.compression}' is none of zstd, lz4 and none")
-    except (McapError, ValueError, RuntimeError, struct.error, zstandard.ZstdError) as error:
-        raise Damaged(f"the chunk at byte {region.offset} is damaged ({error})") from error
-    if len(data) != chunk.uncompressed_size:
-        raise Damaged(f"the chunk at byte {region.offset} is damaged (its size is wrong)")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise Damaged(f"the chunk at byte {region.offset} is damaged (its checksum is wrong)")
-    return np.frombuffer(data, np.uint8)
-
-
-def indexed_offsets(
-    file: BinaryIO, region: Region, channel_ids: Iterable[int]
-) -> dict[int, NDArray[np.int64]] | None:
-    """Where the messages of the channels start, in file order, by the region's indexes.
-
-    None where the region has no index, or one that is damaged: then the records must be walked.
-    """
-    if not region.index_offsets:
-        return None
-    found: dict[int, NDArray[np.int64]] = {}
-    for channel_id in channel_ids:
-        place = region.index_offsets.get(channel_id)
-        offsets = np.empty(0, np.int64) if place is None else _index_record(file, place, channel_id)
-        if offsets is None:
-            return None
-        found[channel_id] = offsets
-    return found
-
-
-def _index_record(file: BinaryIO, place: int, channel_id: int) -> NDArray[np.int64] | None:
-    file.seek(place)
-    head = file.read(_INDEX_HEAD.size)
-    if len(head) < _INDEX_HEAD.size:
-        return None
-    opcode, length, found_channel, entry_bytes = _INDEX_HEAD.unpack(head)
-    if opcode != Opcode.MESSAGE_INDEX or found_channel != channel_id or length != entry_bytes + 6:
-        return None
-    entries = file.read(entry_bytes)
-    if len(entries) != entry_bytes or entry_bytes % INDEX_ENTRY.itemsize:
-        return None
-    return np.sort(np.frombuffer(entries, INDEX_ENTRY)["offset"].astype(np.int64))
-
-
-def walked_offsets(data: NDArray[np.uint8]) -> dict[int, NDArray[np.int64]]:
-    """Where the messages of every channel start, found by walking the region's records."""
-    found: dict[int, list[int]] = {}
-    position = 0
-    for opcode, body in walk_records(data):
-        if opcode == Opcode.MESSAGE and len(body) >= _MESSAGE.size:
-            found.setdefault(_MESSAGE.unpack_from(body)[0], []).append(position)
-        position += _HEAD.size + len(body)
-    return {channel: np.array(offsets, np.int64) for channel, offsets in found.items()}
-
-
-def walk_records(data: NDArray[np.uint8]) -> Iterator[tuple[int, memoryview]]:
-    """The records of an uncompressed region: opcode and body. Raises Damaged where one overruns it."""
-    view = data.data
-    position = 0
-    while position < len(view):
-        if position + _HEAD.size > len(view):
-            raise Damaged("a record inside a chunk is cut off")
-        opcode, length = _HEAD.unpack_from(view, position)
-        begin = position + _HEAD.size
-        if begin + length > len(view):
-            raise Damaged("a record inside a chunk is longer than the chunk")
-        yield opcode, view[begin : begin + length]
-        position = begin + length
-
-
-def message_at(data: NDArray[np.uint8], offset: int) -> tuple[int, int, int, bytes]:
-    """Channel, log time, publish time and payload of the message record at `offset`."""
-    view = data.data
-    if offset < 0 or offset + _HEAD.size + _MESSAGE.size > len(view):
-        raise Damaged("a message index points outside its chunk")
-    opcode, length = _HEAD.unpack_from(view, offset)
-    begin = offset + _HEAD.size
-    if opcode != Opcode.MESSAGE or begin + length > len(view):
-        raise Damaged("a message index points at something else than a message")
-    channel, _, log_time, publish_time = _MESSAGE.unpack_from(view, begin)
-    return channel, log_time, publish_time, bytes(view[begin + _MESSAGE.size : begin + length])
+def _checksum(file: BinaryIO, end: int) -> int:
+    """The checksum of the file up to `end`."""
+    file.seek(0)
+    checksum = 0
+    for begin in range(0, end, _LOOSE_BYTES):
+        checksum = zlib.crc32(file.read(min(_LOOSE_BYTES, end - begin)), checksum)
+    return checksum

@@ -13,97 +13,72 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from recorders.log.loops import HEAD_BYTES, Pattern, agree, pattern_of
 from recorders.log.schemas import Field, Schema
+from recorders.log.streams import Stream
 
-RECORD_HEAD = [
-    ("opcode", "u1"),
-    ("length", "<u8"),
-    ("channel_id", "<u2"),
-    ("sequence", "<u4"),
-    ("log_time_ns", "<u8"),
-    ("publish_time_ns", "<u8"),
-]
-HEAD_BYTES = np.dtype(RECORD_HEAD).itemsize
-# An MCAP record's length does not count its own opcode and length.
-UNCOUNTED_BYTES = 9
-
+# No protobuf field can have a name with a space.
+RECORD_HEAD = np.dtype(
+    [
+        ("mcap opcode", "u1"),
+        ("mcap length", "<u8"),
+        ("mcap channel_id", "<u2"),
+        ("mcap sequence", "<u4"),
+        ("mcap log_time", "<i8"),
+        ("mcap publish_time", "<i8"),
+    ]
+)
 _WIRE_TYPES = {"time_ns": 1, "identifier": 5, "real": 1, "vector": 2}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The byte layout of one schema with given vector widths."""
+    """The byte layout of one schema with given vector widths, its constant bytes told apart.
 
-    schema: Schema
+    An empty vector is absent from the wire, as proto3 has it, and so from `dtype`.
+    """
+
     dtype: np.dtype
-    prefixes: Mapping[str, NDArray[np.uint8]]
+    template: NDArray[np.uint8]
+    pattern: Pattern
 
-    @property
-    def payload_length(self) -> int:
-        """The length that every record of this layout states."""
-        return self.dtype.itemsize - UNCOUNTED_BYTES
-
-    def build(
-        self,
-        channel_id: int,
-        first_sequence: int,
-        log_time_ns: NDArray[np.int64],
-        publish_time_ns: NDArray[np.int64],
-        columns: Mapping[str, NDArray],
-    ) -> NDArray[np.void]:
-        """Message records as a structured array (n,)."""
-        records = np.empty(len(log_time_ns), self.dtype)
-        records["opcode"] = Opcode.MESSAGE
-        records["length"] = self.payload_length
-        records["channel_id"] = channel_id
-        records["sequence"] = np.arange(first_sequence, first_sequence + len(records))
-        records["log_time_ns"] = log_time_ns
-        records["publish_time_ns"] = publish_time_ns
-        for name, prefix in self.prefixes.items():
-            records[_prefix_name(name)] = prefix
-            records[name] = columns[name]
+    def build(self, stream: Stream, channel_id: int, first_sequence: int) -> NDArray[np.void]:
+        """The stream's message records as a structured array (n,)."""
+        rows = np.repeat(self.template.view(_opaque(self.dtype.itemsize)), len(stream))
+        records = rows.view(self.dtype)
+        records["mcap channel_id"] = channel_id
+        records["mcap sequence"] = np.arange(first_sequence, first_sequence + len(records))
+        records["mcap log_time"] = stream.log_time_ns
+        records["mcap publish_time"] = stream.publish_time_ns
+        for name, column in stream.columns.items():
+            if name in (self.dtype.names or ()):
+                records[name] = column
         return records
 
-    def columns(self, records: NDArray[np.void]) -> dict[str, NDArray]:
-        """The schema's columns, copied out of records; an empty vector has shape (n, 0)."""
-        return {
-            field.name: np.ascontiguousarray(records[field.name])
-            if field.name in self.prefixes
-            else np.empty((len(records), 0))
-            for field in self.schema
-        }
+    def parse(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.void] | None:
+        """The message records (n,) at `offsets` of a chunk; None where one is laid out differently."""
+        if not agree(data, offsets, self.pattern):
+            return None
+        return windows(data, self.dtype.itemsize)[offsets].view(self.dtype)
 
-    def parse(
-        self, chunk: NDArray[np.uint8], offsets: NDArray[np.int64], channel_id: int
-    ) -> NDArray[np.void] | None:
-        """Message records at `offsets` of an uncompressed chunk, or None where a byte is not as expected."""
-        size = self.dtype.itemsize
-        if len(offsets) == 0:
-            return np.empty(0, self.dtype)
-        if offsets.min() < 0 or offsets.max() + size > len(chunk):
-            return None
-        if len(offsets) * size == offsets[-1] + size - offsets[0] and np.all(np.diff(offsets) == size):
-            records = chunk[offsets[0] : offsets[-1] + size].view(self.dtype)
-        else:
-            records = windows(chunk, size)[offsets].view(self.dtype)
-        head_is_ours = (
-            np.all(records["opcode"] == Opcode.MESSAGE)
-            and np.all(records["length"] == self.payload_length)
-            and np.all(records["channel_id"] == channel_id)
-        )
-        if not head_is_ours:
-            return None
-        for name, prefix in self.prefixes.items():
-            if not np.all(records[_prefix_name(name)] == prefix):
-                return None
-        return records
+
+def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
+    """The schema's columns, copied out of records; an empty vector has shape (n, 0)."""
+    return {
+        field.name: np.ascontiguousarray(records[field.name])
+        if field.name in (records.dtype.names or ())
+        else np.empty((len(records), 0))
+        for field in schema
+    }
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
     """Every run of `size` bytes of `data` as one opaque item, without a copy: gathers and scatters."""
-    return np.ndarray(
-        (len(data) - size + 1,), dtype=np.dtype((np.void, size)), buffer=data.data, strides=(1,)
-    )
+    return np.ndarray((len(data) - size + 1,), _opaque(size), data.data, strides=(1,))
+
+
+def _opaque(size: int) -> np.dtype:
+    return np.dtype((np.void, size))
 
 
 def layout_of(schema: Schema, widths: Mapping[str, int]) -> Layout:
@@ -113,16 +88,24 @@ def layout_of(schema: Schema, widths: Mapping[str, int]) -> Layout:
 
 @lru_cache(maxsize=256)
 def _layout(schema: Schema, widths: tuple[int, ...]) -> Layout:
-    members: list[tuple] = list(RECORD_HEAD)
-    prefixes: dict[str, NDArray[np.uint8]] = {}
+    members: list[tuple] = list(RECORD_HEAD.descr)
+    constants: dict[str, bytes | int] = {"mcap opcode": Opcode.MESSAGE}
     for number, (field, width) in enumerate(zip(schema, widths, strict=True), start=1):
         if field.kind == "vector" and width == 0:
-            continue  # an empty vector is absent from the wire, as proto3 has it
-        prefix = np.frombuffer(_prefix(number, field, width), np.uint8)
-        prefixes[field.name] = prefix
-        members.append((_prefix_name(field.name), "u1", prefix.shape))
+            continue
+        prefix = _prefix(number, field, width)
+        constants[f"before {field.name}"] = prefix
+        members.append((f"before {field.name}", f"V{len(prefix)}"))
         members.append((field.name, field.dtype, (width,) if field.kind == "vector" else ()))
-    return Layout(schema, np.dtype(members), prefixes)
+    dtype = np.dtype(members)
+    # An MCAP record's length does not count its own opcode and length.
+    constants["mcap length"] = dtype.itemsize - HEAD_BYTES
+    template, is_fixed = np.zeros(1, dtype), np.zeros(1, dtype)
+    for name, value in constants.items():
+        template[name] = value
+        is_fixed[name] = b"\xff" * len(value) if isinstance(value, bytes) else np.iinfo(dtype[name]).max
+    template_bytes = template.view(np.uint8)
+    return Layout(dtype, template_bytes, pattern_of(template_bytes, is_fixed.view(np.uint8)))
 
 
 def _prefix(number: int, field: Field, width: int) -> bytes:
@@ -138,7 +121,3 @@ def _varint(value: int) -> bytes:
         value >>= 7
     encoded.append(value)
     return bytes(encoded)
-
-
-def _prefix_name(name: str) -> str:
-    return f"before {name}"

@@ -8,7 +8,7 @@ to the end. The first field of every message is the sensor's own clock reading.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -60,7 +60,7 @@ class Schema:
     @property
     def full_name(self) -> str:
         """The protobuf name, such as `fuselog.Bearing`."""
-        return f"{self.package}.{self.name}"
+        return f"{self.package}.{self.name}" if self.package else self.name
 
     @cached_property
     def descriptor_set(self) -> bytes:
@@ -86,6 +86,7 @@ class Schema:
         return message_class(self.descriptor_set, self.full_name)
 
 
+@lru_cache(maxsize=256)
 def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message]:
     """Build the class `full_name` from a serialised FileDescriptorSet.
 
@@ -97,21 +98,24 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(full_name))
 
 
-def schema_from_descriptor(descriptor_set: bytes, full_name: str) -> Schema:
+def schema_of(message_type: type[message.Message]) -> Schema:
     """The numeric fields of a message of any origin; fields of other kinds are left out.
 
     Where the name is one of ours, what may be NaN is what we declare; else everything may.
-    Raises what `message_class` raises.
     """
-    ours = {field.name: field for field in SCHEMAS[full_name]} if full_name in SCHEMAS else {}
-    fields: list[Field] = []
-    for entry in message_class(descriptor_set, full_name).DESCRIPTOR.fields:
-        kind = _KINDS.get((entry.type, entry.is_repeated))
-        if kind is not None:
-            may_be_nan = ours[entry.name].may_be_nan if entry.name in ours else True
-            fields.append(Field(entry.name, kind, may_be_nan))
-    package, _, name = full_name.rpartition(".")
-    return Schema(name, "", tuple(fields), package)
+    descriptor = message_type.DESCRIPTOR
+    ours = {field.name: field for field in SCHEMAS.get(descriptor.full_name, ())}
+    fields = tuple(
+        Field(
+            entry.name,
+            _KINDS[entry.type, entry.is_repeated],
+            entry.name not in ours or ours[entry.name].may_be_nan,
+        )
+        for entry in descriptor.fields
+        if (entry.type, entry.is_repeated) in _KINDS
+    )
+    package, _, name = descriptor.full_name.rpartition(".")
+    return Schema(name, "", fields, package)
 
 
 _KINDS: dict[tuple[int, bool], Kind] = {

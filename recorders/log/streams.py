@@ -1,13 +1,16 @@
 """One topic of a log, held in memory as columns."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.log.schemas import Field, Schema
+from recorders.log.schemas import NUMPY_TYPES, Schema
+
+Clock = Literal["publish_time", "log_time"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,10 @@ class Stream:
         """The names of a state's or estimate's components, such as `x_m`."""
         return [name for name in self.metadata.get("components", "").split(",") if name]
 
+    def times(self, clock: Clock) -> NDArray[np.int64]:
+        """The stamps (n,) of one of the two clocks, in ns."""
+        return self.publish_time_ns if clock == "publish_time" else self.log_time_ns
+
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
         """The messages of `rows`, in that order."""
         return replace(
@@ -63,70 +70,90 @@ def make_stream(
     """Build a stream; clocks that are not given equal `publish_time_ns`.
 
     Raises BadInput where a column is missing or unknown, has another length, has the wrong number of
-    axes, holds NaN that its field does not allow, or a time is negative.
+    axes, holds NaN that its field does not allow or a number that its type cannot keep (a fraction of a
+    nanosecond, say), or a time is negative.
     """
-    published = np.asarray(publish_time_ns, dtype=np.int64)
-    logged = published if log_time_ns is None else np.asarray(log_time_ns, dtype=np.int64)
+    label, time = f"topic {topic}:", NUMPY_TYPES["time_ns"]
+    published = _as_column(f"{label} publish_time_ns", publish_time_ns, time)
+    logged = published if log_time_ns is None else _as_column(f"{label} log_time_ns", log_time_ns, time)
     clock = published if sensor_time_ns is None else sensor_time_ns
     given: dict[str, ArrayLike] = {"sensor_time_ns": clock, **columns}
     names = [entry.name for entry in schema]
     if set(given) != set(names):
         raise BadInput(
-            f"topic {topic}: {schema.full_name} has the fields {', '.join(names)}; "
-            f"got {', '.join(given)}"
+            f"{label} {schema.full_name} has the fields {', '.join(names)}; got {', '.join(given)}"
         )
-    stream = Stream(
-        topic,
-        schema,
-        published,
-        logged,
-        {entry.name: _as_column(topic, entry, given[entry.name]) for entry in schema},
-        np.arange(len(published), dtype=np.int64),
-        dict(metadata or {}),
-    )
+    found = {
+        entry.name: _as_column(
+            f"{label} field {entry.name}", given[entry.name], entry.dtype, 1 + (entry.kind == "vector")
+        )
+        for entry in schema
+    }
+    position = np.arange(len(published), dtype=np.int64)
+    stream = Stream(topic, schema, published, logged, found, position, dict(metadata or {}))
     check_stream(stream)
     return stream
 
 
-def _as_column(topic: str, entry: Field, values: ArrayLike) -> NDArray:
+def _as_column(what: str, values: ArrayLike, dtype: np.dtype, axes: int = 1) -> NDArray:
+    """The values as an array of this type, which must be able to keep every one of them."""
     try:
-        column = np.asarray(values, dtype=entry.dtype)
+        given = np.asarray(values)
+        with np.errstate(invalid="ignore"):
+            column = given.astype(dtype, copy=False)
+        is_kept = dtype.kind == "f" or np.array_equal(column, given)
     except (TypeError, ValueError, OverflowError) as error:
-        raise BadInput(f"topic {topic}: field {entry.name} is not numeric ({error})") from error
-    axes = 2 if entry.kind == "vector" else 1
+        raise BadInput(f"{what} is not numeric ({error})") from error
     if column.ndim != axes:
-        raise BadInput(f"topic {topic}: field {entry.name} wants {axes} axes, got shape {column.shape}")
+        raise BadInput(
+            f"{what} wants {axes} {'axis' if axes == 1 else 'axes'}, got shape {column.shape}"
+        )
+    if not is_kept:
+        lost = given[np.argmax(column != given)]
+        raise BadInput(
+            f"{what} holds {lost}, which {dtype.name} cannot keep; round it, or choose another range"
+        )
     return column
 
 
 def check_stream(stream: Stream, where: str = "") -> None:
-    """Raise BadInput where lengths differ, a time is negative, or NaN stands where none may."""
+    """Raise BadInput where lengths differ, a time is out of range, or NaN stands where none may."""
     label = f"{where}topic {stream.topic}"
-    clocks = {"publish_time": stream.publish_time_ns, "log_time": stream.log_time_ns}
-    for name, times in clocks.items():
+    for name, times in (("publish_time", stream.publish_time_ns), ("log_time", stream.log_time_ns)):
+        if len(times) != len(stream):
+            raise BadInput(f"{label}: {name} has {len(times)} values for {len(stream)} messages")
         if len(times) and times.min() < 0:
-            raise BadInput(f"{label}: {name} is negative; shift the run to an epoch after zero")
+            raise BadInput(
+                f"{label}: {name} is negative or past the year 2262; shift the run to an epoch between"
+            )
     for entry in stream.schema:
         column = stream.columns[entry.name]
         if len(column) != len(stream):
             raise BadInput(
                 f"{label}: field {entry.name} has {len(column)} values for {len(stream)} messages"
             )
-        if column.dtype.kind == "f" and not entry.may_be_nan:
-            bad = np.isnan(column) if column.ndim == 1 else np.isnan(column).any(axis=1)
-            if bad.any():
-                raise BadInput(
-                    f"{label}: field {entry.name} is NaN in message {int(np.argmax(bad))} "
-                    f"({int(bad.sum())} in all), which {stream.schema.full_name} does not allow; "
-                    "drop these messages before recording"
-                )
+        # The least of numbers with NaN among them is NaN: one quick pass.
+        if column.dtype.kind == "f" and not entry.may_be_nan and column.size and np.isnan(column.min()):
+            bad = np.isnan(column).reshape(len(column), -1).any(axis=1)
+            raise BadInput(
+                f"{label}: field {entry.name} is NaN in message {int(np.argmax(bad))} "
+                f"({int(bad.sum())} in all), which {stream.schema.full_name} does not allow; "
+                "drop these messages before recording"
+            )
 
 
-def concatenate(parts: Sequence[Stream]) -> Stream:
-    """Join parts of one topic, in the order given."""
-    if len(parts) == 1:
-        return parts[0]
+def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
+    """Join parts of one topic, in the order given; raises BadInput where a vector changes its width."""
     first = parts[0]
+    if len(parts) == 1:
+        return first
+    for name, column in first.columns.items():
+        widths = {part.columns[name].shape[1] for part in parts if column.ndim == 2}
+        if len(widths) > 1:
+            raise BadInput(
+                f"{where}topic {first.topic}: field {name} has vectors of different lengths "
+                f"{sorted(widths)}; a stream keeps one, split the topic"
+            )
     return replace(
         first,
         publish_time_ns=np.concatenate([part.publish_time_ns for part in parts]),
@@ -143,8 +170,3 @@ def empty_stream(topic: str, schema: Schema, metadata: Mapping[str, str]) -> Str
         entry.name: np.empty((0, 0) if entry.kind == "vector" else 0, entry.dtype) for entry in schema
     }
     return Stream(topic, schema, times, times, columns, times, metadata)
-
-
-def total_messages(streams: Iterable[Stream]) -> int:
-    """How many messages the streams have together."""
-    return sum(len(stream) for stream in streams)

@@ -12,6 +12,9 @@ import numpy as np
 
 from recorders.models.planar import Component, Components, wrap_angle
 
+# The shooter's position and the bullet's direction in a state.
+SHOT_COMPONENTS = ("x_m", "y_m", "trajectory_rad")
+
 
 class Medium(NamedTuple):
     """The air, and the bullet's constant speed in multiples of that of sound."""
@@ -129,3 +132,14 @@ def local_estimate_covariance_gradients(
         (-slope * noise.muzzle_blast_rad**2, distance / missing * noise.muzzle_blast_rad**2),
         (slope * noise.shockwave_rad**2, -distance / missing * noise.shockwave_rad**2),
     )
+
+
+def sensor_components(sensor: int) -> list[str]:
+    """The names of a sensor's coordinates in a state."""
+    return [f"sensor_{sensor}_{axis}_m" for axis in "xy"]
+
+
+def stated_metadata(noise: Noise, medium: Medium) -> dict[str, str]:
+    """How a channel of detections states noise (`sigma_muzzle_blast_rad`, ...) and medium."""
+    stated = {f"sigma_{name}": value for name, value in noise._asdict().items()} | medium._asdict()
+    return {name: repr(value) for name, value in stated.items()}

@@ -10,6 +10,7 @@ import numpy as np
 from recorders.models.planar import Component, Components
 
 Triple = tuple[Component, Component, Component]
+ANGLES = ("yaw", "pitch", "roll")
 
 
 def azimuth_elevation(x: Components) -> tuple[Component, Component]:
@@ -109,3 +110,13 @@ def _about_y(angle: Component, x: Components) -> Triple:
 def _about_z(angle: Component, x: Components) -> Triple:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * x[0] - sine * x[1], sine * x[0] + cosine * x[1], x[2]
+
+
+def target_components(target: int) -> list[str]:
+    """The names of a target's coordinates in a state."""
+    return [f"target_{target}_{axis}_m" for axis in "xyz"]
+
+
+def bias_components(sensor: int) -> list[str]:
+    """The names of a sensor's attitude biases in a state."""
+    return [f"sensor_{sensor}_{angle}_bias_rad" for angle in ANGLES]

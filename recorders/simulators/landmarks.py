@@ -134,10 +134,12 @@ def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generato
     density = [parameters.forward_noise_density, parameters.turn_noise_density]
     noise = rng.normal(size=(steps, 2)) * density / np.sqrt(step_s)
     scale = np.array([1 + parameters.forward_scale_error, 1.0])
-    true_velocity = odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    true_velocity: NDArray[np.float64] = (
+        odometry * scale + np.array([0.0, parameters.turn_bias_radps]) + noise
+    )
     start = rng.uniform(0, 2 * np.pi)
     turned = np.cumsum(true_velocity[:, 1] * step_s)
-    heading = start + np.pi / 2 + np.append(0.0, turned)
+    heading: NDArray[np.float64] = start + np.pi / 2 + np.append(0.0, turned)
     if number % 2:
         heading += np.pi
     origin = np.zeros((3, steps))
@@ -145,7 +147,7 @@ def _drive(parameters: LandmarksParameters, number: int, rng: np.random.Generato
     moves = drive(origin, true_velocity.T, step_s)
     x = radius_m * np.cos(start) + np.append(0.0, np.cumsum(moves[0]))
     y = radius_m * np.sin(start) + np.append(0.0, np.cumsum(moves[1]))
-    poses = np.stack([x, y, heading], axis=1)
+    poses: NDArray[np.float64] = np.stack([x, y, heading], axis=1)
     return Drive(times_s, poses, true_velocity, odometry)
 
 

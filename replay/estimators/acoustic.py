@@ -5,6 +5,7 @@ nothing about it) and, where they are estimated along, the sensors' positions. W
 position fix is taken as it is and its error is added to that of the sensor's measurements.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -66,14 +67,11 @@ class Detections(NamedTuple):
         return Detections(*(column[rows] for column in self))
 
 
-def parameter_names(setting: Setting, sensors: int) -> list[str]:
-    """Names of the parameters, with their units."""
-    names = ["shooter_x_m", "shooter_y_m"]
-    if setting.mode != Mode.BEARINGS_ONLY:
-        names.append("trajectory_rad")
-    if setting.estimate_sensors:
-        names += [f"sensor_{s}_{axis}_m" for s in range(1, sensors + 1) for axis in "xy"]
-    return names
+def parameter_names(setting: Setting, sensors: Sequence[int]) -> list[str]:
+    """Names of the parameters, with their units, for sensors of these numbers."""
+    shot = model.SHOT_COMPONENTS[: 2 if setting.mode == Mode.BEARINGS_ONLY else 3]
+    estimated = sensors if setting.estimate_sensors else []
+    return [*shot, *(name for sensor in estimated for name in model.sensor_components(sensor))]
 
 
 def estimate(setting: Setting, heard: Detections) -> Solution:

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
-from recorders.log import make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Topic, make_stream, schemas
 from recorders.models.planar import drive, range_bearing, range_bearing_jacobian, wrap_angle
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.covariance_intersection import inverted, multiply, sight
-from replay.estimators.gaussian import Floats, Function, correct, wrap
+from replay.estimators.gaussian import Floats, Function, Innovation, correct, wrap
 from replay.estimators.landmarks import (
     Landmarks,
     fill_motion_jacobians,
+    map_of_runs,
     rows_on_map,
     start,
     stated,
@@ -159,7 +159,7 @@ def improve(
     for row in range(2):
         for column in range(2):
             spread[row, column] += noise[row, column]
-    squared, _ = correct(mean, covariance, innovation, spread, cross, 2, gate)
+    squared, _ = correct(mean, covariance, Innovation(innovation, spread, cross), gate)
     return not np.isnan(squared)
 
 
@@ -282,19 +282,19 @@ def _compiled(mode: Mode) -> Function:
 
 def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> tuple[Carried, Landmarks]:
     """All robots at their priors, and the maps; raises BadInput as `landmarks.start` does."""
-    started = [start(whole, f"{prefix}/prior") for prefix in prefixes]
-    runs, size = len(started[0][0].mean), 3 * len(prefixes)
+    started = [start(whole, f"{prefix}/prior")[0] for prefix in prefixes]
+    runs, size = len(started[0].mean), 3 * len(prefixes)
     covariance = np.zeros((runs, size, size))
-    for index, (each, _) in enumerate(started):
+    for index, each in enumerate(started):
         covariance[:, 3 * index : 3 * index + 3, 3 * index : 3 * index + 3] = each.covariance
     carried = Carried(
-        np.concatenate([each.mean for each, _ in started], axis=1),
+        np.concatenate([each.mean for each in started], axis=1),
         covariance,
         np.zeros((runs, len(prefixes), 2)),
-        np.stack([each.time_ns for each, _ in started], axis=1),
+        np.stack([each.time_ns for each in started], axis=1),
         np.full(runs, -1),
     )
-    return carried, started[0][1]
+    return carried, map_of_runs(whole["/landmarks"])
 
 
 def run(
@@ -355,15 +355,10 @@ def _events(
 ) -> Events:
     """The block's events as columns; a robot's estimate is due at its odometry."""
     order = block.events
-    value = np.zeros((len(order.row), 2))
-    target_id = np.zeros(len(order.row), np.int64)
-    for index, ragged in enumerate(block.streams.values()):
-        at = order.topic == index
-        names = ("forward_mps", "turn_radps") if index % 2 == 0 else ("range_m", "bearing_rad")
-        for column, name in enumerate(names):
-            value[at, column] = ragged[name][order.row[at]]
-        if index % 2:
-            target_id[at] = ragged["target_id"][order.row[at]]
+    value = np.stack(
+        [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
+    )
+    target_id = block.column("target_id", missing=0).astype(np.int64)
     run_of = np.repeat(np.arange(len(order.offsets) - 1), np.diff(order.offsets))
     robot, sees = np.divmod(order.topic, 2)
     numbers = np.array([_number(prefix) for prefix in prefixes])

@@ -6,7 +6,7 @@ whose missing component is NaN.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
@@ -16,8 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Schema, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.planar import (
     drive,
     drive_jacobians,
@@ -26,22 +25,32 @@ from recorders.models.planar import (
     wrap_angle,
 )
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
+from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.gaussian import (
+    ALL_WELL,
+    FAILURES,
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
     Filter,
     Floats,
     Function,
+    Innovation,
     Models,
     correct,
+    is_finite,
     linearised,
+    no_innovation,
     sampled,
-    unscented_points,
 )
+from replay.sampling import Sampler, Sampling
+from replay.sampling.names import Unscented
+from replay.sampling.samplers import no_samples
+from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
+USES = 2  # of samples per event: prediction and update
 SENSORS = ("range_bearing", "range", "bearing")
-FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
 
 
 class DeadReckoningParameters(Parameters):
@@ -68,7 +77,7 @@ class UnscentedParameters(LocalizationParameters):
 
 
 class Carried(NamedTuple):
-    """What a filter carries from block to block; first axis = run. `failure` is -1 while all is well."""
+    """What a filter carries from block to block; first axis = run."""
 
     mean: Floats
     covariance: Floats
@@ -87,16 +96,14 @@ class Landmarks(NamedTuple):
 class Settings(NamedTuple):
     """What the filter is told.
 
-    Densities (2,) of the control, variance and bias (sensors, 2), the gate by the number of measured
-    components (3,), and the samples of a sampled filter.
+    Noise densities (2,) of the velocity, the sensors' bias (2,) and variances (sensors, 2), and the
+    gate by the number of measured components (3,).
     """
 
-    control_density: Floats
-    variance: Floats
+    velocity_density: Floats
     bias: Floats
+    variance: Floats
     gate: Floats
-    points: Floats
-    weights: Floats
 
 
 class Sightings(NamedTuple):
@@ -104,8 +111,6 @@ class Sightings(NamedTuple):
 
     Odometry has sensor -1 and value (forward, turn); a sighting has value (range, bearing) and, as
     target, the row of its target on the map, -1 if it is not there.
-
-    `emit` and `diagnose` say which row of the output an event fills, -1 for none.
     """
 
     offsets: NDArray[np.int64]
@@ -113,17 +118,25 @@ class Sightings(NamedTuple):
     sensor: NDArray[np.int64]
     value: Floats
     target: NDArray[np.int64]
-    emit: NDArray[np.int64]
-    diagnose: NDArray[np.int64]
+    is_last: NDArray[np.bool_]
 
 
-class Results(NamedTuple):
-    """What the kernel fills; NaN where a run failed before."""
+class Poses(NamedTuple):
+    """The estimates, as the kernel notes them: run r fills the rows from `end[r]` on, and moves it."""
 
+    end: NDArray[np.int64]
+    event: NDArray[np.int64]
     mean: Floats
     covariance: Floats
-    innovation: Floats
-    innovation_covariance: Floats
+
+
+class Looks(NamedTuple):
+    """The innovations, as the kernel notes them; see `Poses`."""
+
+    end: NDArray[np.int64]
+    event: NDArray[np.int64]
+    difference: Floats
+    covariance: Floats
     squared: Floats
     accepted: NDArray[np.int64]
 
@@ -152,12 +165,72 @@ def fill_sensor_jacobian(pose: Floats, target: Floats, rows: Floats) -> None:
         rows[1, column] = by_bearing[column]
 
 
-MODELS = Models(drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
+MODELS = Models(3, drive, fill_motion_jacobians, range_bearing, fill_sensor_jacobian, (False, True))
+
+
+def note_pose(poses: Poses, run: int, event: int, mean: Floats, covariance: Floats) -> None:
+    """Fill the next row of a run's poses."""
+    row = poses.end[run]
+    poses.event[row] = event
+    for i in range(3):
+        poses.mean[row, i] = mean[i]
+        for j in range(3):
+            poses.covariance[row, i, j] = covariance[i, j]
+    poses.end[run] = row + 1
+
+
+def note_look(looks: Looks, run: int, event: int, innovation: Innovation) -> int:
+    """Begin the next row of a run's looks, and return it; it counts when `end` is moved."""
+    row = looks.end[run]
+    looks.event[row] = event
+    for i in range(2):
+        looks.difference[row, i] = innovation.difference[i]
+        for j in range(2):
+            missing = np.isnan(innovation.difference[i] + innovation.difference[j])
+            looks.covariance[row, i, j] = np.nan if missing else innovation.covariance[i, j]
+    return row
 
 
 def localization(steps: Filter) -> Function:
-    """The loop over the events of one run, specialised to a filter; changes `carried` in place."""
-    predict, innovate = steps
+    """The loop over the events of one run, specialised to a filter."""
+    _, predict, innovate = steps
+
+    def take_in(
+        run: int,
+        event: int,
+        events: Sightings,
+        positions: Floats,
+        settings: Settings,
+        carried: Carried,
+        looks: Looks,
+        scratch: tuple[Innovation, Any],
+    ) -> int:
+        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did."""
+        mean, covariance, velocity = carried.mean[run], carried.covariance[run], carried.velocity[run]
+        sensor, target, value = events.sensor[event], events.target[event], events.value[event]
+        innovation, memory = scratch
+        duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
+        if duration_s > 0.0:
+            carried.time_ns[run] = events.time_ns[event]
+            if not predict(
+                mean, covariance, velocity, settings.velocity_density, duration_s, event, memory
+            ):
+                return NOT_POSITIVE_DEFINITE
+        if sensor < 0:
+            velocity[0], velocity[1] = value[0], value[1]
+        elif target >= 0 and duration_s >= 0.0:
+            variance = settings.variance[sensor]
+            if not innovate(
+                mean, covariance, positions[target], value, variance, innovation, event, memory
+            ):
+                return NOT_POSITIVE_DEFINITE
+            row = note_look(looks, run, event, innovation)
+            squared, accepted = correct(mean, covariance, innovation, settings.gate)
+            if np.isnan(squared):
+                return NOT_POSITIVE_DEFINITE
+            looks.squared[row], looks.accepted[row] = squared, accepted
+            looks.end[run] = row + 1
+        return ALL_WELL if is_finite(mean, covariance) else NOT_FINITE
 
     def localize(
         run: int,
@@ -165,92 +238,40 @@ def localization(steps: Filter) -> Function:
         positions: Floats,
         settings: Settings,
         carried: Carried,
-        results: Results,
+        poses: Poses,
+        looks: Looks,
+        scratch: tuple[Innovation, Any],
     ) -> None:
-        mean, covariance = carried.mean[run], carried.covariance[run]
-        velocity = carried.velocity[run]
-        measured, innovation = np.empty(2), np.empty(2)
-        innovation_covariance, cross_covariance = np.empty((2, 2)), np.empty((3, 2))
-        control_variance = np.empty(2)
+        """Move what is carried, and fill poses and looks, until the events end or the filter fails."""
+        start_ns = carried.time_ns[run]
         for event in range(events.offsets[run], events.offsets[run + 1]):
-            duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
-            if carried.failure[run] >= 0 or duration_s < 0.0:
-                continue  # failed, or before the prior
-            if duration_s > 0.0:
-                # white noise on the velocity: its mean over a time T has variance density^2 / T
-                for k in range(2):
-                    control_variance[k] = settings.control_density[k] ** 2 / duration_s
-                if not predict(
-                    mean,
-                    covariance,
-                    velocity,
-                    control_variance,
-                    duration_s,
-                    settings.points,
-                    settings.weights,
-                ):
-                    carried.failure[run] = 0
-                    continue
-                carried.time_ns[run] = events.time_ns[event]
-            sensor = events.sensor[event]
-            if sensor < 0:
-                velocity[0], velocity[1] = events.value[event, 0], events.value[event, 1]
-            elif events.target[event] >= 0:
-                for k in range(2):
-                    measured[k] = events.value[event, k] - settings.bias[sensor, k]
-                used = innovate(
-                    mean,
-                    covariance,
-                    positions[events.target[event]],
-                    measured,
-                    settings.variance[sensor],
-                    settings.points,
-                    settings.weights,
-                    innovation,
-                    innovation_covariance,
-                    cross_covariance,
-                )
-                if used < 0:
-                    carried.failure[run] = 0
-                    continue
-                squared, accepted = correct(
-                    mean,
-                    covariance,
-                    innovation,
-                    innovation_covariance,
-                    cross_covariance,
-                    used,
-                    settings.gate,
-                )
-                row = events.diagnose[event]
-                results.squared[row] = squared
-                results.accepted[row] = accepted
-                first = 1 if np.isnan(measured[0]) else 0
-                for i in range(used):
-                    results.innovation[row, first + i] = innovation[i]
-                    for j in range(used):
-                        results.innovation_covariance[row, first + i, first + j] = innovation_covariance[
-                            i, j
-                        ]
-            if not np.isfinite(mean.sum()):
-                carried.failure[run] = 1
-            elif events.emit[event] >= 0:
-                results.mean[events.emit[event]] = mean
-                results.covariance[events.emit[event]] = covariance
+            if carried.failure[run] != ALL_WELL:
+                break
+            carried.failure[run] = take_in(
+                run, event, events, positions, settings, carried, looks, scratch
+            )
+            due = events.is_last[event] and events.time_ns[event] >= start_ns
+            if due and carried.failure[run] == ALL_WELL:
+                note_pose(poses, run, event, carried.mean[run], carried.covariance[run])
 
     return localize
 
 
+State = tuple[Carried, Landmarks, Generators]
+
+
 @lru_cache(maxsize=8)
-def _compiled(kind: str) -> Function:
-    makers = {"linearised": linearised, "sampled": sampled}
-    return compile_over_runs(localization(makers[kind](MODELS)))
+def _compiled(kind: str) -> tuple[Function, Function]:
+    """The loop over the runs, and what makes the filter's memory."""
+    steps = {"linearised": linearised, "sampled": sampled}[kind](MODELS)
+    return compile_over_runs(localization(steps), allocates=False), steps.memory
 
 
-def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landmarks]:
+def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
     """The state at every run's prior, and the maps.
 
-    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance.
+    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance,
+    or the map is not planar.
     """
     prior = whole[prior_topic]
     rows = prior.offsets[:-1]
@@ -269,65 +290,70 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> tuple[Carried, Landm
         prior.stream.publish_time_ns[rows],
         np.full(prior.runs, -1),
     )
-    return carried, _landmarks(whole["/landmarks"])
+    return carried, map_of_runs(whole["/landmarks"]), (None,) * prior.runs
 
 
-def _landmarks(landmarks: Ragged) -> Landmarks:
+def map_of_runs(landmarks: Ragged) -> Landmarks:
+    """The maps of all runs, from their topic; raises BadInput where they are not planar."""
+    positions = landmarks["position_m"]
+    if len(landmarks) and positions.shape[1] < 2:
+        raise BadInput("topic /landmarks: positions in the plane need two coordinates")
     run = np.repeat(np.arange(landmarks.runs), np.diff(landmarks.offsets))
     keys = (run << 32) + landmarks["landmark_id"]
     order = np.argsort(keys, kind="stable")
-    positions = landmarks["position_m"].reshape(len(keys), -1)[:, :2]
-    return Landmarks(keys[order], np.ascontiguousarray(positions[order]))
+    return Landmarks(keys[order], np.ascontiguousarray(positions[order, :2]))
 
 
 def run(
-    state: tuple[Carried, Landmarks],
+    state: State,
     block: Block,
     *,
     kind: str,
+    sampler: Sampler,
+    seed: int,
     settings: Settings,
     outputs: "Outputs",
-) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
+) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
-    before, landmarks = state
+    before, landmarks, generators = state
     carried = copy.deepcopy(before)
-    events, target_id = _sightings(block, landmarks, carried.time_ns)
-    results = _blank_results(events)
-    _compiled(kind)(len(carried.mean), events, landmarks.positions, settings, carried, results)
-    return (carried, landmarks), outputs.of(events, target_id, results, before, carried)
-
-
-def _sightings(
-    block: Block, landmarks: Landmarks, start_ns: NDArray[np.int64]
-) -> tuple[Sightings, NDArray[np.int64]]:
-    """The block's events as columns, and the targets' numbers (0 for odometry)."""
     order = block.events
-    count = len(order.row)
-    value = np.full((count, 2), np.nan)
-    target_id = np.zeros(count, np.int64)
-    for index, ragged in enumerate(block.streams.values()):
-        at = order.topic == index
-        row = order.row[at]
-        names = ("forward_mps", "turn_radps") if index == 0 else ("range_m", "bearing_rad")
-        for column, name in enumerate(names):
-            if name in ragged.stream.columns:
-                value[at, column] = ragged[name][row]
-        if index > 0:
-            target_id[at] = ragged["target_id"][row]
-    run_of = np.repeat(np.arange(len(order.offsets) - 1), np.diff(order.offsets))
-    sensor = order.topic - 1
+    run_of = np.repeat(np.arange(len(before.failure)), np.diff(order.offsets))
+    target_id = block.column("target_id", missing=0).astype(np.int64)
     target = rows_on_map(landmarks, (run_of << 32) + target_id)
-    started = order.time_ns >= start_ns[run_of]
-    seen = (sensor >= 0) & (target >= 0) & started
-    return Sightings(
-        order.offsets,
-        order.time_ns,
-        sensor,
-        value,
-        target,
-        _numbered(order.is_last & started),
-        _numbered(seen),
-    ), target_id
+    sensor = order.topic - 1
+    value = np.stack(
+        [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
+    )
+    value[sensor >= 0] -= settings.bias
+    events = Sightings(order.offsets, order.time_ns, sensor, value, target, order.is_last)
+    started = order.time_ns >= before.time_ns[run_of]
+    pose_rows = ragged_rows(order.is_last & started, order.offsets)
+    look_rows = ragged_rows((target >= 0) & started, order.offsets)
+    poses, looks = _no_poses(pose_rows), _no_looks(look_rows)
+    loop, memory = _compiled(kind)
+    if sampler.redrawn:
+        generators = seeded_by_data(generators, before.mean, np.arange(len(before.mean) + 1), seed)
+    for runs, sets in sets_by_runs(sampler, generators, USES * order.offsets):
+        loop(
+            runs.stop - runs.start,
+            events._replace(offsets=order.offsets[runs.start : runs.stop + 1]),
+            landmarks.positions,
+            settings,
+            of_runs(carried, runs),
+            poses._replace(end=poses.end[runs]),
+            looks._replace(end=looks.end[runs]),
+            scratch=partial(_scratch, memory, sets),
+        )
+    return (carried, landmarks, generators), [
+        outputs.poses(poses, pose_rows, events),
+        outputs.innovations(looks, look_rows, events, target_id),
+        outputs.failures(before, carried),
+    ]
+
+
+def _scratch(memory: Function, sets: SampleSets) -> tuple[Innovation, Any]:
+    return no_innovation(3, 2), memory(3, 2, 2, sets)
 
 
 def rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -338,94 +364,92 @@ def rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int
     return np.where(landmarks.keys[rows] == keys, rows, -1)
 
 
-def _numbered(chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """0, 1, 2, ... where chosen, -1 elsewhere."""
-    return np.where(chosen, np.cumsum(chosen) - 1, -1)
+def _no_poses(offsets: NDArray[np.int64]) -> Poses:
+    rows = offsets[-1]
+    return Poses(
+        offsets[:-1].copy(), np.empty(rows, np.int64), np.empty((rows, 3)), np.empty((rows, 3, 3))
+    )
 
 
-def _blank_results(events: Sightings) -> Results:
-    estimates = int(events.emit.max(initial=-1)) + 1
-    looks = int(events.diagnose.max(initial=-1)) + 1
-    return Results(
-        np.full((estimates, 3), np.nan),
-        np.full((estimates, 3, 3), np.nan),
-        np.full((looks, 2), np.nan),
-        np.full((looks, 2, 2), np.nan),
-        np.full(looks, np.nan),
-        np.zeros(looks, np.int64),
+def _no_looks(offsets: NDArray[np.int64]) -> Looks:
+    rows = offsets[-1]
+    return Looks(
+        offsets[:-1].copy(),
+        np.empty(rows, np.int64),
+        np.empty((rows, 2)),
+        np.empty((rows, 2, 2)),
+        np.empty(rows),
+        np.empty(rows, np.int64),
     )
 
 
 class Outputs(NamedTuple):
-    """The output topics of one bound filter, and how results become their streams."""
+    """The output topics of one bound filter: the parts of their names, and how results fill them."""
 
     name: str
     truth: str
 
-    def of(
-        self,
-        events: Sightings,
-        target_id: NDArray[np.int64],
-        results: Results,
-        before: Carried,
-        after: Carried,
-    ) -> list[Ragged]:
-        """The estimates at every distinct stamp, the innovations, and the failures of this block."""
-        at = events.emit >= 0
-        valid = np.isfinite(results.mean[:, 0])
-        mean = results.mean[valid]
+    def poses(self, poses: Poses, offsets: NDArray[np.int64], events: Sightings) -> Ragged:
+        """The estimates at every distinct stamp."""
+        rows, offsets = filled_rows(offsets, poses.end)
+        mean = poses.mean[rows]
         mean[:, 2] = wrap_angle(mean[:, 2])
-        estimates = self._ragged(
+        return self._ragged(
             "pose",
             schemas.GAUSSIAN_ESTIMATE,
-            events,
-            np.flatnonzero(at)[valid],
+            offsets,
+            events.time_ns[poses.event[rows]],
             {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
             mean=mean,
-            covariance=results.covariance[valid].reshape(-1, 9),
+            covariance=poses.covariance[rows].reshape(-1, 9),
         )
-        looks = np.flatnonzero(events.diagnose >= 0)
-        done = np.isfinite(results.squared)
-        innovations = self._ragged(
+
+    def innovations(
+        self,
+        looks: Looks,
+        offsets: NDArray[np.int64],
+        events: Sightings,
+        target_id: NDArray[np.int64],
+    ) -> Ragged:
+        """How every sighting of the map fitted."""
+        rows, offsets = filled_rows(offsets, looks.end)
+        return self._ragged(
             "innovation",
             schemas.INNOVATION,
-            events,
-            looks[done],
+            offsets,
+            events.time_ns[looks.event[rows]],
             {"components": "range_m,bearing_rad", "kinds": "linear,angle"},
-            target_id=target_id[looks[done]],
-            accepted=results.accepted[done],
-            innovation=results.innovation[done],
-            covariance=results.innovation_covariance[done].reshape(-1, 4),
-            normalised_innovation_squared=results.squared[done],
+            target_id=target_id[looks.event[rows]],
+            accepted=looks.accepted[rows],
+            innovation=looks.difference[rows],
+            covariance=looks.covariance[rows].reshape(-1, 4),
+            normalised_innovation_squared=looks.squared[rows],
         )
-        failed = np.flatnonzero((after.failure >= 0) & (before.failure < 0))
-        offsets = np.searchsorted(failed, np.arange(len(after.failure) + 1))
-        failure = make_stream(
-            f"/estimates/{self.name}/failure",
+
+    def failures(self, before: Carried, after: Carried) -> Ragged:
+        """The runs that failed in this block."""
+        failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
+        return self._ragged(
+            "failure",
             schemas.FAILURE,
+            np.searchsorted(failed, np.arange(len(after.failure) + 1)),
             after.time_ns[failed],
-            metadata={"reasons": "; ".join(FAILURES)},
+            {"reasons": "; ".join(FAILURES)},
             reason=after.failure[failed],
         )
-        return [estimates, innovations, Ragged(failure, offsets)]
 
     def _ragged(
         self,
         leaf: str,
         schema: Schema,
-        events: Sightings,
-        at: NDArray[np.int64],
+        offsets: NDArray[np.int64],
+        time_ns: NDArray[np.int64],
         metadata: Mapping[str, str],
         **columns: NDArray[Any],
     ) -> Ragged:
-        stream = make_stream(
-            f"/estimates/{self.name}/{leaf}",
-            schema,
-            events.time_ns[at],
-            metadata={**metadata, "truth": self.truth},
-            **columns,
-        )
-        return Ragged(stream, np.searchsorted(at, events.offsets))
+        topic = f"/estimates/{self.name}/{leaf}"
+        metadata = {**metadata, "truth": self.truth}
+        return Ragged(make_stream(topic, schema, time_ns, metadata=metadata, **columns), offsets)
 
 
 def stated(topic: Topic, name: str, given: float | None) -> float:
@@ -446,8 +470,8 @@ def _bind(
     parameters: DeadReckoningParameters,
     *,
     kind: str,
-    points: Floats,
-    weights: Floats,
+    sampler_at: Callable[[int], Sampler],
+    seed: int = 0,
 ) -> list[Bound]:
     """One filter for every robot that has odometry, a prior and, unless it only reckons, a sensor."""
     bound: list[Bound] = []
@@ -462,7 +486,7 @@ def _bind(
             continue
         if isinstance(parameters, LocalizationParameters) and not sensed:
             continue
-        settings = _settings(topics, topic, sensed, parameters, points, weights)
+        settings = _settings(topics, topic, sensed, parameters)
         bound.append(
             Recursive(
                 f"{name}{prefix}",
@@ -472,6 +496,8 @@ def _bind(
                 partial(
                     run,
                     kind=kind,
+                    sampler=sampler_at(3),
+                    seed=seed,
                     settings=settings,
                     outputs=Outputs(f"{name}{prefix}", f"{prefix}/truth"),
                 ),
@@ -485,8 +511,6 @@ def _settings(
     odometry: Topic,
     sensed: list[str],
     parameters: DeadReckoningParameters,
-    points: Floats,
-    weights: Floats,
 ) -> Settings:
     density = [
         stated(odometry, "forward_noise_density", parameters.forward_noise_density),
@@ -505,21 +529,31 @@ def _settings(
                 variance[row, 1] = sigma**2
         bias = np.array([parameters.bias_range_m, parameters.bias_bearing_rad])
         gate[1:] = chi2.ppf(parameters.gate_probability, [1, 2])
-    return Settings(np.array(density), variance, np.tile(bias, (len(sensed), 1)), gate, points, weights)
+    return Settings(np.array(density), bias, variance, gate)
 
 
 def _bind_linearised(
     name: str, topics: Mapping[str, Topic], parameters: DeadReckoningParameters
 ) -> list[Bound]:
-    none = np.empty((0, 3))
-    return _bind(name, topics, parameters, kind="linearised", points=none, weights=none[:, 0])
+    return _bind(name, topics, parameters, kind="linearised", sampler_at=no_samples)
 
 
 def _bind_unscented(
     name: str, topics: Mapping[str, Topic], parameters: UnscentedParameters
 ) -> list[Bound]:
-    points, weights = unscented_points(3, parameters.kappa)
-    return _bind(name, topics, parameters, kind="sampled", points=points, weights=weights)
+    sampling = Unscented(kappa=parameters.kappa)
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at)
+
+
+def bind_robots(
+    name: str,
+    topics: Mapping[str, Topic],
+    parameters: LocalizationParameters,
+    sampling: Sampling,
+    seed: int,
+) -> list[Bound]:
+    """Bind the filter with this sampling to every robot of the log; the seed is for randomised ones."""
+    return _bind(name, topics, parameters, kind="sampled", sampler_at=sampling.at, seed=seed)
 
 
 DEAD_RECKONING = Estimator(

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Topic, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
@@ -444,9 +443,9 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters)
     components = topics["/prior"].metadata.get("components", "").split(",")
     if len(components) % 2:
         raise BadInput("topic /prior: the state must be positions and as many velocities")
-    read = ("/prior", "/links", *(topic.name for topic in sensors.values()))
+    read = ("/links", *(topic.name for topic in sensors.values()))
     work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
-    return [Batch(name, read, work)]
+    return [Batch(name, read, ("/prior",), work)]
 
 
 NETWORK = Estimator(

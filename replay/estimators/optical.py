@@ -5,13 +5,21 @@ pitch, roll of each sensor) that are not known. Scheme 3 knows none of them; sch
 zero, which in scheme 2 they are not.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.models.optical import direction, line_of_sight, line_of_sight_gradients, turning_vector
+from recorders.models.optical import (
+    bias_components,
+    direction,
+    line_of_sight,
+    line_of_sight_gradients,
+    target_components,
+    turning_vector,
+)
 from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
 from replay.least_squares import (
@@ -61,14 +69,10 @@ class Observability(NamedTuple):
     sentence: str
 
 
-def parameter_names(scene: Scene, targets: int) -> list[str]:
-    """Names of the parameters, with their units."""
-    places = [f"target_{t}_{axis}_m" for t in range(1, targets + 1) for axis in "xyz"]
-    biases = [
-        f"sensor_{s}_{angle}_bias_rad"
-        for s in range(1, len(scene.position_m) + 1)
-        for angle in ("yaw", "pitch", "roll")
-    ]
+def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]) -> list[str]:
+    """Names of the parameters, with their units, for targets and sensors of these numbers."""
+    places = [name for target in targets for name in target_components(target)]
+    biases = [name for sensor in sensors for name in bias_components(sensor)]
     return places + [name for name, wanted in zip(biases, scene.wanted, strict=True) if wanted]
 
 
@@ -77,28 +81,41 @@ def predict(scene: Scene, parameters: Array) -> Array:
     return np.stack(line_of_sight(*_geometry(scene, parameters)), axis=-1)
 
 
-def estimate(scene: Scene, measured: Array) -> Solution:
+def estimate(scene: Scene, measured: Array, start: Array | None = None) -> Solution:
     """Positions and wanted biases from lines of sight (runs, targets, sensors, 2), NaN where not seen.
 
-    Raises BadInput where shapes do not fit or a noise is not positive.
+    The search begins at `start` (runs, n), else where the rays meet. Raises BadInput where shapes do not
+    fit or a noise is not positive.
     """
     _check(scene, measured)
     return solve(
         lambda parameters, rows: linearize(scene, measured[rows], parameters),
-        starting_point(scene, measured),
+        starting_point(scene, measured) if start is None else start,
     )
 
 
 def starting_point(scene: Scene, measured: Array) -> Array:
-    """Where the rays of each target meet, biases taken as zero, (runs, n).
-
-    Eqs (21)-(23) name their results wrongly (z, x, y in truth), and hang on the difference of two
-    azimuths: where all is nearly in one upright plane, as in the paper's three-sensor scenes, they start
-    most runs too far off.
-    """
+    """Where the rays of each target meet, biases taken as zero, (runs, n)."""
     attitude = scene.nominal_attitude_rad + np.nan_to_num(scene.known_bias_rad)
     unit = np.stack(direction(measured[..., 0], measured[..., 1], attitude.T[:, None]), axis=-1)
     targets = intersect_rays(scene.position_m, unit).reshape(len(measured), -1)
+    return np.concatenate([targets, np.zeros((len(measured), scene.wanted.sum()))], axis=1)
+
+
+def printed_starting_point(scene: Scene, measured: Array) -> Array:
+    """Eqs (21)-(23) for the first two sensors, nominal attitudes zero; the print has z, x, y as x, y, z.
+
+    They hang on the difference of two azimuths: where all is nearly in one upright plane, as in the
+    paper's three-sensor scenes, they start too far off. Only to try them.
+    """
+    first, second = scene.position_m[:2]
+    azimuth_1, azimuth_2 = measured[:, :, 0, 0], measured[:, :, 1, 0]
+    slope_1, slope_2 = np.tan(azimuth_1), np.tan(azimuth_2)
+    z = (second[0] - first[0] + first[2] * slope_1 - second[2] * slope_2) / (slope_1 - slope_2)
+    x = first[0] + (z - first[2]) * slope_1
+    base = (first[0] - second[0]) * np.cos(azimuth_2) + (second[2] - first[2]) * np.sin(azimuth_2)
+    y = first[1] + np.tan(measured[:, :, 0, 1]) * np.abs(base / np.sin(azimuth_1 - azimuth_2))
+    targets = np.stack([x, y, z], axis=-1).reshape(len(measured), -1)
     return np.concatenate([targets, np.zeros((len(measured), scene.wanted.sum()))], axis=1)
 
 
@@ -130,7 +147,8 @@ def observability(scene: Scene, measured: Array, parameters: Array) -> Observabi
 
     `measured` only says which lines of sight there are: NaN where none.
     """
-    names = parameter_names(scene, len(measured))
+    counted = (range(1, count + 1) for count in measured.shape[:2])
+    names = parameter_names(scene, *counted)
     [unseen] = unobservable_directions(linearize(scene, measured[None], parameters[None]))
     n, angles = len(parameters), int(np.isfinite(measured).sum())
     rank = n - unseen.shape[1]

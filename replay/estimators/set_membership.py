@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt
 
 from recorders.errors import BadInput
-from recorders.log import Stream, make_stream, schemas
-from recorders.log.reader import Topic
+from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
@@ -212,7 +211,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> 
             bound_rad=_bound_rad(topic, parameters),
             parameters=parameters,
         )
-        bound.append(Batch(f"{name}{prefix}", ("/landmarks", topic.name), work))
+        bound.append(Batch(f"{name}{prefix}", (topic.name,), ("/landmarks",), work))
     return bound
 
 

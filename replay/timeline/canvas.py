@@ -60,7 +60,8 @@ class Scene:
     @property
     def estimators(self) -> list[str]:
         """The estimators' labels, in the order they were given."""
-        return list(dict.fromkeys(split_topic(topic)[0] for topic in self.outputs))
+        names = [split_topic(topic)[0] for topic in self.outputs]
+        return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
     @property
     def cases(self) -> list[str]:
@@ -124,7 +125,7 @@ class Canvas:
         recording: where it goes.
         epoch_ns: the run's time zero.
         end_ns: when the last estimate or truth is.
-        steps_ns: the distinct estimate times that `step` counts.
+        steps_ns: the distinct times of estimates, which `step` counts.
     """
 
     recording: rr.RecordingStream
@@ -166,7 +167,7 @@ def draw_cases(
     return rrb.Tabs(*layouts, active_tab=scene.cases.index(scene.focus or scene.cases[0]))
 
 
-def beside(board: rrb.Container, plots: Sequence[rrb.View], case: str) -> rrb.Container:
+def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
     """A case's board, and to its right its plots if there are any."""
     columns = [board, rrb.Vertical(*plots)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
@@ -187,7 +188,7 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     span_ns = max((time_ns[-1] - time_ns[0]) / rows, 1.0)
-    of_span = ((time_ns - time_ns[0]) / span_ns).astype(np.int64)
+    of_span = np.minimum((time_ns - time_ns[0]) / span_ns, rows - 1).astype(np.int64)
     return np.flatnonzero(np.append(of_span[1:] != of_span[:-1], True))
 
 

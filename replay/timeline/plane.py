@@ -20,6 +20,7 @@ from replay.timeline.canvas import (
     Canvas,
     Colour,
     Times,
+    escaped,
     gap_limit_ns,
     nice,
     thin,
@@ -75,6 +76,12 @@ def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(group == each) for each in np.unique(group)]
 
 
+def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
+    """A point (n, 2) at each time, such as a measurement."""
+    canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
+    canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
     """The way of a point (n, 2): each row the segment from the place before."""
     segments = np.stack([places[:-1], places[1:]], axis=1).astype(np.float32)
@@ -97,7 +104,11 @@ def draw_ellipses(
     canvas: Canvas, entity: str, time_ns: Times, means: Floats, covariances: Floats, stroke: Stroke
 ) -> None:
     """The 95 % ellipse of each Gaussian (n, 2), (n, 2, 2)."""
-    outlines = ellipses(means, covariances)
+    draw_outlines(canvas, entity, time_ns, ellipses(means, covariances), stroke)
+
+
+def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats, stroke: Stroke) -> None:
+    """The outline of a thing at each time, closed or not: (n, vertices, 2), left out where NaN."""
     good = np.isfinite(outlines).all(axis=(1, 2))
     times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
     columns = rr.LineStrips2D.columns(strips=outlines[good].astype(np.float32))
@@ -150,9 +161,9 @@ def _until_stale(
 
 
 def plane_view(
-    canvas: Canvas, root: str, contents: list[str], paths: list[str], places: Floats
+    canvas: Canvas, root: str, others: list[str], paths: list[str], places: Floats
 ) -> rrb.Spatial2DView:
-    """A view of all below `root` and of `contents` that shows at least the places (n, 2), on a grid.
+    """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
 
     Of the `paths` it shows what lies up to a minute before the cursor.
     """
@@ -173,9 +184,9 @@ def plane_view(
     )
     return rrb.Spatial2DView(
         origin="/",
-        contents=[f"{root}/**", *contents],
+        contents=[f"{escaped(each)}/**" for each in (root, *others)],
         name=f"Map, grid {step_m:g} m",
-        overrides={path: [trail] for path in paths},
+        overrides={escaped(path): [trail] for path in paths},
         # the bounds are outside the transform that turns y up
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )

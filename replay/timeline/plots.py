@@ -4,7 +4,9 @@ Every function sends its columns and returns the views that show them. A band is
 which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -13,19 +15,47 @@ import rerun.blueprint as rrb
 from recorders.log import schemas
 from replay.blocks import gather
 from replay.evaluation import Errors, Floats, chi_square_interval, innovations_of
-from replay.timeline.canvas import MUTED, TRUTH, Canvas, Colour, Scene, Times, entity_path, nice, thin
+from replay.timeline.canvas import (
+    MUTED,
+    TRUTH,
+    Canvas,
+    Colour,
+    Scene,
+    Times,
+    entity_path,
+    escaped,
+    nice,
+    thin,
+)
 
 SIGMAS = 2.0
 WHOLE_RUN = rrb.TimeAxis(
     view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
 )
-Curve = tuple[str, Times, Floats]
+Style = Callable[..., rr.AsComponents]
+LINE: Style = partial(rr.SeriesLines, widths=[1.5])
+POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
+
+
+class Squares(NamedTuple):
+    """Chi-square values of an estimator and their degrees of freedom."""
+
+    degrees: int
+    estimator: str
+    time_ns: Times
+    values: Floats
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """Errors, NEES and NIS of a case: no plots where there is nothing to judge."""
     parts = (draw_errors, draw_nees, draw_nis)
     return [view for part in parts for view in part(canvas, scene, case)]
+
+
+def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Tabs]:
+    """NEES and errors of a case of many components: of each kind of plot one at a time."""
+    kinds = (draw_nees(canvas, scene, case)[::-1], draw_errors(canvas, scene, case))
+    return [rrb.Tabs(*views) for views in kinds if views]
 
 
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
@@ -54,7 +84,7 @@ def _draw_error(
             values=np.stack([error, zero], axis=1).ravel(),
             variances=np.stack([zero, bound**2], axis=1).ravel(),
         )
-        entity = entity_path(plot, errors.estimator)
+        entity = f"{plot}/{errors.estimator}"
         canvas.send(entity, errors.time_ns[rows], columns.partition([2] * len(rows)))
         names = [errors.estimator, f"{errors.estimator} band"]
         colour = scene.colour(errors.estimator)
@@ -70,87 +100,77 @@ def _draw_error(
 
 def draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """NEES of each estimator with the bounds of a single run; one plot per number of components."""
-    by_degrees: dict[int, list[Curve]] = {}
-    for errors in scene.errors_of(case):
-        rows = thin(errors.time_ns)
-        curve = (errors.estimator, errors.time_ns[rows], errors.nees[rows])
-        by_degrees.setdefault(len(errors.components), []).append(curve)
-    return [
-        _draw_squares(canvas, scene, entity_path("plots", case), "NEES", degrees, by_degrees[degrees])
-        for degrees in sorted(by_degrees)
+    found = [
+        Squares(len(errors.components), errors.estimator, errors.time_ns, errors.nees)
+        for errors in scene.errors_of(case)
     ]
+    return _draw_squares(canvas, scene, case, "NEES", found, LINE)
 
 
 def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """NIS of each estimator, a point per measurement; one plot per number of measured components."""
-    by_degrees: dict[int, list[Curve]] = {}
+    found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
-        found = innovations_of(gather([stream]))
-        for degrees in np.unique(found.degrees).tolist():
-            rows = np.flatnonzero(found.degrees == degrees)
-            rows = rows[thin(found.time_ns[rows])]
-            curve = (estimator, found.time_ns[rows], found.squared[rows])
-            by_degrees.setdefault(degrees, []).append(curve)
-    return [
-        _draw_squares(canvas, scene, entity_path("plots", case), "NIS", degrees, by_degrees[degrees])
-        for degrees in sorted(by_degrees)
-    ]
+        innovations = innovations_of(gather([stream]))
+        for degrees in np.unique(innovations.degrees[innovations.degrees > 0]).tolist():
+            rows = innovations.degrees == degrees
+            of_degrees = (innovations.time_ns[rows], innovations.squared[rows])
+            found.append(Squares(degrees, estimator, *of_degrees))
+    return _draw_squares(canvas, scene, case, "NIS", found, POINTS)
 
 
 def _draw_squares(
-    canvas: Canvas, scene: Scene, root: str, name: str, degrees: int, curves: Sequence[Curve]
-) -> rrb.TimeSeriesView:
+    canvas: Canvas, scene: Scene, case: str, name: str, found: Sequence[Squares], style: Style
+) -> list[rrb.TimeSeriesView]:
     """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
-    plot = f"{root}/{name.lower()}_{degrees}"
-    low, high = chi_square_interval(degrees, 1)
-    times = np.concatenate([time_ns for _, time_ns, _ in curves])
-    band = rr.Measurements.columns(
-        values=[0.5 * (low + high)] * 2, variances=[0.25 * (high - low) ** 2] * 2
-    )
-    canvas.send(f"{plot}/bounds", np.array([times.min(), times.max()]), band)
-    canvas.fix(
-        f"{plot}/bounds", rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
-    )
-    for estimator, time_ns, values in curves:
-        entity = entity_path(plot, estimator)
-        canvas.send(entity, time_ns, rr.Scalars.columns(scalars=values))
-        names, colours = [estimator], [scene.colour(estimator)]
-        if name == "NIS":  # several at one time
-            canvas.fix(entity, rr.SeriesPoints(names=names, colors=colours, marker_sizes=[1.5]))
-        else:
-            canvas.fix(entity, rr.SeriesLines(names=names, colors=colours, widths=[1.5]))
-    return plot_view(plot, f"{name} of {degrees} components", (0.0, 2.5 * high))
+    views = []
+    for degrees in sorted({each.degrees for each in found}):
+        plot = entity_path("plots", case, f"{name.lower()}_{degrees}")
+        low, high = chi_square_interval(degrees, 1)
+        alike = [each for each in found if each.degrees == degrees]
+        ends = [min(each.time_ns[0] for each in alike), max(each.time_ns[-1] for each in alike)]
+        band = rr.Measurements.columns(
+            values=[0.5 * (low + high)] * 2, variances=[0.25 * (high - low) ** 2] * 2
+        )
+        look = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
+        canvas.send(f"{plot}/bounds", np.array(ends), band)
+        canvas.fix(f"{plot}/bounds", look)
+        for _, estimator, time_ns, values in alike:
+            _draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
+        views.append(plot_view(plot, f"{name} of {degrees} components", (-0.3 * high, 2.5 * high)))
+    return views
 
 
 def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """One plot per component of a case's Gaussian estimates: every estimator's mean, and the truth."""
-    curves: dict[str, list[tuple[Curve, Colour]]] = {}
-    drawn = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
+    found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
-        drawn.append((estimator, scene.colour(estimator), stream, stream["mean"]))
-    for name, colour, stream, values in drawn:
-        rows = thin(stream.publish_time_ns)
+        found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
+    views: dict[str, rrb.TimeSeriesView] = {}
+    for name, colour, stream, values in found:
         for column, component in enumerate(stream.components):
-            curve = (name, stream.publish_time_ns[rows], values[rows, column])
-            curves.setdefault(component, []).append((curve, colour))
-    views = []
-    for component, found in curves.items():
-        quantity, unit, scale = shown_unit(component)
-        plot = entity_path("plots", case, component)
-        for (name, time_ns, values), colour in found:
-            entity = entity_path(plot, name)
-            canvas.send(entity, time_ns, rr.Scalars.columns(scalars=scale * values))
-            canvas.fix(entity, rr.SeriesLines(names=[name], colors=[colour], widths=[1.5]))
-        views.append(plot_view(plot, f"{quantity.capitalize()} ({unit})"))
-    return views
+            quantity, unit, scale = shown_unit(component)
+            plot = entity_path("plots", case, component)
+            shown = scale * values[:, column]
+            _draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
+            views[component] = plot_view(plot, f"{quantity.capitalize()} ({unit})")
+    return list(views.values())
+
+
+def _draw_curve(
+    canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, values: Floats, style: Style
+) -> None:
+    rows = thin(time_ns)
+    canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
+    canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
 
 
 def plot_view(
     entity: str, name: str, extent: tuple[float, float] | None = None, *, legend: bool = True
 ) -> rrb.TimeSeriesView:
-    """A plot of everything below an entity; all plots share one time axis."""
+    """A plot of everything below an entity, over the whole run."""
     return rrb.TimeSeriesView(
-        origin=entity,
+        origin=escaped(entity),
         name=name,
         axis_x=WHOLE_RUN,
         axis_y=rrb.ScalarAxis(range=extent, zoom_lock=extent is not None),

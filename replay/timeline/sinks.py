@@ -34,7 +34,7 @@ def open_recording(
         connect: a receiver, `rerun+http://HOST:PORT/proxy`.
 
     Raises BadInput where neither is given, the file cannot be written, or the receiver is not there or
-    goes away.
+    goes away; then no file is left.
     """
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if connect is not None:
@@ -53,7 +53,7 @@ def open_recording(
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         yield recording
-        _finish(recording, connect)
+        _finish(recording, save, connect)
         if part is not None and save is not None:
             part.replace(save)
     finally:
@@ -62,13 +62,18 @@ def open_recording(
             part.unlink(missing_ok=True)
 
 
-def _finish(recording: rr.RecordingStream, connect: str | None) -> None:
+def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:
     """Hand over everything that is still queued, and close."""
+    failure = None
     try:
         recording.flush(timeout_sec=_FLUSH_S)
     except RuntimeError as error:
-        raise BadInput(f"--connect {connect}: the receiver went away; start it again") from error
+        failure = error
     recording.disconnect()
+    if connect is not None and not _answers(connect):  # which a flush does not always notice
+        raise BadInput(f"--connect {connect}: the receiver went away; start it again") from failure
+    if failure is not None:
+        raise BadInput(f"{save or connect}: the timeline could not be written ({failure})") from failure
 
 
 def _require_writable(part: Path) -> None:
@@ -81,24 +86,34 @@ def _require_writable(part: Path) -> None:
 
 
 def _require_receiver(url: str) -> None:
-    """Raises BadInput unless an HTTP/2 server, as Rerun's receivers are, answers there."""
-    try:
-        parts = urlsplit(url)
-        address = (parts.hostname, parts.port)
-    except ValueError:
-        parts, address = urlsplit(""), (None, None)
-    host, port = address
-    if parts.scheme != "rerun+http" or parts.path != "/proxy" or host is None or port is None:
+    """Raises BadInput unless a receiver answers there."""
+    host, port = _address(url)
+    if host is None or port is None:
         raise BadInput(
             f"--connect {url}: expected rerun+http://HOST:PORT/proxy, as a running Rerun viewer shows it"
         )
-    try:
-        with socket.create_connection((host, port), timeout=_ANSWER_S) as connection:
-            connection.sendall(_HTTP2_GREETING)
-            answer = connection.recv(9)
-    except OSError:
-        answer = b""
-    if len(answer) < 4 or answer[3] != _SETTINGS:
+    if not _answers(url):
         raise BadInput(
             f"--connect {url}: no Rerun receiver answers there; start one: rerun --port {port}"
         )
+
+
+def _address(url: str) -> tuple[str | None, int | None]:
+    """Host and port; None where the URL is not that of a receiver."""
+    try:
+        parts = urlsplit(url)
+        is_receiver = parts.scheme == "rerun+http" and parts.path == "/proxy"
+        return (parts.hostname, parts.port) if is_receiver else (None, None)
+    except ValueError:
+        return None, None
+
+
+def _answers(url: str) -> bool:
+    """Whether an HTTP/2 server, as Rerun's receivers are, greets back."""
+    try:
+        with socket.create_connection(_address(url), timeout=_ANSWER_S) as connection:
+            connection.sendall(_HTTP2_GREETING)
+            answer = connection.recv(9)
+    except OSError:
+        return False
+    return len(answer) > 3 and answer[3] == _SETTINGS

@@ -22,12 +22,13 @@ from rerun.experimental import ViewerClient
 from recorders.errors import BadInput
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-RERUN = (sys.executable, "-m", "rerun_cli")
+# `python -m rerun_cli` loses the exit code
+RERUN = (sys.executable, "-c", "import sys, rerun_cli.__main__ as cli; sys.exit(cli.main())")
 _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0
-# For so long the viewer shows messages of its own on top of everything.
-_MESSAGES_S = 4.0
+# The viewer's own messages lie on top of the first three or four pictures, however long that takes.
+_PICTURES = 7
 
 
 class Listener(NamedTuple):
@@ -64,9 +65,8 @@ def screenshot(
             _load(client, rrd)
             _set_cursor(client, rrd, at_s)
             picture = str(folder / "picture.png")
-            client.save_screenshot(picture)  # makes the views load what they show
-            time.sleep(_MESSAGES_S)
-            client.save_screenshot(picture)
+            for _ in range(_PICTURES):
+                client.save_screenshot(picture)
             views = client.get_state().views
         move(picture, png)
     return [f"{view.name}: {report}" for view in views for report in view.reports]

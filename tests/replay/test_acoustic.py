@@ -205,7 +205,7 @@ def test_estimating_sensors_along_is_not_negligible() -> None:
     """Refuted: sensor 4 of scenario 1 gains 29 % in y."""
     chosen = setting(Mode.NATIVE_MEASUREMENTS)
     covariance = acoustic.bound(chosen, *shot(1)).covariance[0]
-    index = acoustic.parameter_names(chosen, 5).index("sensor_4_y_m")
+    index = acoustic.parameter_names(chosen, range(1, 6)).index("sensor_4_y_m")
     assert np.sqrt(covariance[index, index]) == pytest.approx(1.42, abs=0.005)
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from recorders.errors import BadInput
 from replay.consistency import (
     component_error_squared,
     dilution_of_precision,
@@ -29,9 +28,11 @@ def test_infinite_variance_counts_nothing_and_nan_stays_nan() -> None:
     assert np.isnan(nees[1])
 
 
-def test_singular_covariance_is_refused() -> None:
-    with pytest.raises(BadInput, match="singular"):
-        normalized_error_squared(np.ones(2), np.ones((2, 2)))
+def test_singular_covariance_is_nan_and_the_rest_goes_on() -> None:
+    covariance = np.array([np.ones((2, 2)), np.diag([1.0, -1.0]), np.diag([1e-9, 4.0]), np.eye(2)])
+    nees = normalized_error_squared(np.array([[1.0, 2.0]]), covariance)
+    np.testing.assert_allclose(nees, [np.nan, np.nan, 1e9 + 1.0, 5.0])
+    assert np.isnan(normalized_error_squared(np.empty((1, 0)), np.empty((1, 0, 0)))).all()
 
 
 def test_ellipse_area() -> None:

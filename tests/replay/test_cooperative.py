@@ -10,8 +10,8 @@ from replay.sources import memory_source
 
 
 @pytest.fixture(scope="module")
-def judged(real_data):
-    sources = [memory_source(*import_run("mrclam", real_data("mrclam6"), {}))]
+def judged(mrclam6):
+    sources = [memory_source(*import_run("mrclam", mrclam6, {}))]
     found = {}
     for mode in ("alone", "naive", "ci"):
         estimators = {mode: {"kind": f"cooperative:{mode}"}}

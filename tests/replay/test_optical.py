@@ -262,16 +262,7 @@ def test_printed_starting_point_misses_scenario_1() -> None:
     """Eqs (21)-(23), put right, bring no run of scenario 1 to the estimate; the rays bring all."""
     scene, truth = three_sensors(1, *REPRODUCING)
     measured = simulate(scene, truth, 200, seed=1)
-    first, second = scene.position_m[:2]
-    azimuth_1, azimuth_2 = measured[:, :, 0, 0], measured[:, :, 1, 0]
-    slope_1, slope_2 = np.tan(azimuth_1), np.tan(azimuth_2)
-    z = (second[0] - first[0] + first[2] * slope_1 - second[2] * slope_2) / (slope_1 - slope_2)
-    x = first[0] + (z - first[2]) * slope_1
-    base = (first[0] - second[0]) * np.cos(azimuth_2) + (second[2] - first[2]) * np.sin(azimuth_2)
-    height = np.tan(measured[:, :, 0, 1]) * np.abs(base / np.sin(azimuth_1 - azimuth_2))
-    start = np.zeros((200, 18))
-    start[:, :9] = np.stack([x, first[1] + height, z], axis=-1).reshape(200, 9)
-    found = solve(lambda p, rows: optical.linearize(scene, measured[rows], p), start)
+    found = optical.estimate(scene, measured, optical.printed_starting_point(scene, measured))
     right = optical.estimate(scene, measured).parameters
     assert (np.abs(found.parameters / right - 1.0).max(axis=1) < 1e-3).sum() == 0
 

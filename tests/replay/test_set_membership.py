@@ -71,16 +71,16 @@ def test_a_misidentified_landmark_is_a_fault_with_its_pair():
     assert len(spoilt) == len(true)
 
 
-def test_a_log_without_a_bound_asks_for_it(real_data):
-    recording, run = import_run("mrclam", real_data("mrclam6"), {})
+def test_a_log_without_a_bound_asks_for_it(mrclam6):
+    recording, run = import_run("mrclam", mrclam6, {})
     source = memory_source(recording, run)
     with pytest.raises(BadInput, match="bound_deg"):
         bind("set-membership:exact", [source], {})
 
 
-def test_mrclam_fixes(real_data):
+def test_mrclam_fixes(mrclam6):
     """The sheet's shares and areas at two bounds; the misses are robot 3's misidentifications."""
-    recording, run = import_run("mrclam", real_data("mrclam6"), {})
+    recording, run = import_run("mrclam", mrclam6, {})
     sources = [memory_source(recording, run)]
     for bound_deg, share, area in ((1.5, 0.978, 1.28), (3.0, 0.9975, 4.5)):
         replayed = replay_ensemble(

@@ -1,0 +1,138 @@
+"""What there is to choose from: scenarios, estimators, metrics, experiments; lists and details."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from pipeline.experiment import Experiment, load_scenario, read_toml, shipped
+from pipeline.terminal import print_json, print_table, say
+from recorders.errors import BadInput, choices
+from recorders.parameters import build, describe
+from recorders.recording import Importer, Recorder
+from recorders.registry import available, load
+from replay.engine import Estimator
+from replay.metrics import Metric
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing to choose: what it is in a line, more facts, its parameters, and values it sets."""
+
+    name: str
+    what: str
+    facts: Mapping[str, str] = field(default_factory=dict)
+    parameters: type[BaseModel] | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+def scenarios() -> list[Entry]:
+    """Recorders, and the scenario files that ship."""
+    files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
+    return _registered("recorders", _recorder) + files
+
+
+def estimators() -> list[Entry]:
+    """Estimators with what they need of a log."""
+    return _registered("estimators", _estimator)
+
+
+def metrics() -> list[Entry]:
+    """Metrics that judge estimates."""
+    return _registered("metrics", _metric)
+
+
+def experiments() -> list[Entry]:
+    """Shipped experiments."""
+    return [_experiment(name, read_toml(path)) for name, path in shipped("experiments").items()]
+
+
+def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) -> None:
+    """Print a list, or all about one of its entries."""
+    if name is not None:
+        known = {entry.name: entry for entry in entries}
+        if name not in known:
+            raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
+        entries = [known[name]]
+    if as_json:
+        print_json([_as_json(entry) for entry in entries])
+    elif name is None:
+        print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
+        say(f"All about one of them: fuselog {kind}s NAME")
+    else:
+        _print_details(entries[0])
+
+
+def _registered(kind: str, described: Callable[[str, Any], Entry]) -> list[Entry]:
+    """An entry for every registered name."""
+
+    def make(name: str) -> Entry:
+        return described(name, load(kind, name))
+
+    return [_entry(name, partial(make, name)) for name in available(kind)]
+
+
+def _entry(name: str, make: Callable[[], Entry]) -> Entry:
+    """An entry, or where it cannot be had, why."""
+    try:
+        return make()
+    except BadInput as error:
+        return Entry(name, str(error))
+
+
+def _scenario(name: str, path: Path) -> Entry:
+    recorder, values, _ = load_scenario(name)
+    kind = load("recorders", recorder, Recorder).parameters
+    facts = {"record with": f"fuselog record {name}"}
+    return Entry(name, read_toml(path).get("title", ""), facts, kind, values)
+
+
+def _recorder(name: str, recorder: Recorder[Any]) -> Entry:
+    is_import = isinstance(recorder, Importer)
+    command = f"fuselog import {name} PATH" if is_import else f"fuselog record {name}"
+    return Entry(name, recorder.summary, {"record with": command}, recorder.parameters)
+
+
+def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
+    facts = {"needs": estimator.needs}
+    if estimator.variant:
+        facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
+    return Entry(name, estimator.summary, facts, estimator.parameters)
+
+
+def _metric(name: str, metric: Metric[Any]) -> Entry:
+    return Entry(name, metric.summary, {"judges": metric.judges.__name__})
+
+
+def _experiment(name: str, values: Mapping[str, Any]) -> Entry:
+    experiment = build(Experiment, values, f"experiment {name}")
+    facts = {"study": experiment.study, "estimators": ", ".join(experiment.estimators)}
+    if experiment.record:
+        facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
+    if experiment.import_:
+        facts["imports"] = f"{experiment.import_.source}; give its place with --data"
+    return Entry(name, experiment.title, facts)
+
+
+def _as_json(entry: Entry) -> dict[str, Any]:
+    schema = entry.parameters.model_json_schema() if entry.parameters else None
+    return {
+        "name": entry.name,
+        "what": entry.what,
+        **{key.replace(" ", "_"): fact for key, fact in entry.facts.items()},
+        "parameters": schema,
+        "values": dict(entry.values),
+    }
+
+
+def _print_details(entry: Entry) -> None:
+    say(f"{entry.name}: {entry.what}")
+    for key, fact in entry.facts.items():
+        say(f"{key}: {fact}")
+    if entry.parameters:
+        table = [list(each) for each in describe(entry.parameters, entry.values)]
+        if table:
+            print_table(["parameter", "default", "accepts"], table)

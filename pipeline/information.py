@@ -1,0 +1,94 @@
+"""What a log holds, for a person and for machines."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.terminal import print_json, print_table, say, warn
+from recorders.errors import BadInput
+from recorders.log import Log, RunMetadata, open_log
+from recorders.parameters import describe
+from recorders.recording import Recorder
+from recorders.registry import load
+from replay.sources import log_span_ns
+
+
+def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
+    """Print what a log holds: the run, how long it is, its topics."""
+    log = open_log(path, recover=recover)
+    if as_json:
+        print_json(_as_json(log))
+        return
+    first_ns, last_ns = log_span_ns(log)
+    duration_s = (last_ns - first_ns) * 1e-9
+    begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
+    size_mb = path.stat().st_size / 1e6
+    say(f"{path}: {size_mb:.1f} MB, {duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC")
+    if log.run:
+        _say_run(log.run)
+    rows = [
+        [topic.name, topic.schema_name, topic.messages, _rate(topic.messages, duration_s)]
+        for topic in log.topics.values()
+    ]
+    print_table(["topic", "schema", "messages", "per second"], rows)
+    if log.loss_statement:
+        warn(log.loss_statement)
+
+
+def _as_json(log: Log) -> dict[str, Any]:
+    first_ns, last_ns = log_span_ns(log)
+    topics = [
+        {
+            "topic": topic.name,
+            "schema": topic.schema_name,
+            "messages": topic.messages,
+            "metadata": dict(topic.metadata),
+        }
+        for topic in log.topics.values()
+    ]
+    return {
+        "path": str(log.path),
+        "first_log_time_ns": first_ns,
+        "last_log_time_ns": last_ns,
+        "run": asdict(log.run) if log.run else None,
+        "topics": topics,
+        "lost": log.loss_statement,
+    }
+
+
+def _rate(messages: int | None, duration_s: float) -> float | None:
+    return messages / duration_s if messages is not None and messages > 1 and duration_s > 0 else None
+
+
+def _say_run(run: RunMetadata) -> None:
+    seed = "imported" if run.seed is None else f"seed {run.seed}, run {run.run}"
+    say(f"{run.scenario}, {seed}")
+    for name, value in _changed(run).items():
+        say(f"  {name} = {json.dumps(value)}")
+    for subject, fact in run.notes.items():
+        say(f"{subject}: {fact}")
+
+
+def _changed(run: RunMetadata) -> dict[str, Any]:
+    """The parameters that are not the recorder's defaults; all where the recorder is not here."""
+    try:
+        described = describe(load("recorders", run.scenario, Recorder).parameters)
+    except BadInput:
+        return run.parameters
+    defaults = {each.name: each.default for each in described}
+    values = dict(_flat(run.parameters))
+    return {name: value for name, value in values.items() if defaults.get(name) != value}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
+    """Nested values by their full names."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, Mapping) and value:
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat

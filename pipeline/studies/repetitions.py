@@ -1,0 +1,78 @@
+"""A paper's Monte Carlo experiment, repeated: step k over all runs of an ensemble is one repetition.
+
+A log that holds the same experiment several times over, with fresh noise, gives one estimate each. So an
+ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a rule that a paper states
+for its 100 runs can be tried as often.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import norm
+
+from pipeline.ensemble import Replayed
+from pipeline.results import Verdict
+from replay.evaluation import Errors
+
+Floats = NDArray[np.float64]
+
+
+def errors_named(replayed: Replayed, estimator: str) -> Errors:
+    """The errors of an estimator that has one estimate stream."""
+    [errors] = [each for each in replayed.errors if each.estimator == estimator]
+    return errors
+
+
+def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
+    """Values (n, ...) of every estimate as (repetitions, runs, ...), NaN where a solution failed."""
+    repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
+    repeated[errors.step, errors.run] = values
+    return repeated
+
+
+def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
+    """Over one axis or several, leaving out what is NaN."""
+    return np.sqrt(np.nanmean(values**2, axis=axis))
+
+
+def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:
+    """How far printed RMSEs (k,) of `runs` runs are from ours, in standard errors, and what is allowed.
+
+    `squared` (n, k) are our squared errors. The worst of k is allowed what it exceeds with 5 %.
+    """
+    mean = np.nanmean(squared, axis=0)
+    error = np.nanstd(squared, axis=0) * np.sqrt(1.0 / runs + 1.0 / len(squared))
+    allowed = float(norm.ppf(1.0 - 0.025 / len(printed)))
+    return float(np.max(np.abs(printed**2 - mean) / error)), allowed
+
+
+def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
+    """Whether a share of `independent` trials is, within two standard errors, at least as expected."""
+    return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
+
+
+def verdict(holds: bool) -> Verdict:
+    """What a claim comes to where it can be tried."""
+    return "confirmed" if holds else "refuted"
+
+
+def listed(values: ArrayLike, digits: int = 2) -> str:
+    """Numbers for a sentence."""
+    return " ".join(f"{value:.{digits}f}" for value in np.ravel(values))
+
+
+def draw_interval(axes: Axes, low: float, high: float) -> None:
+    """Where a mean NEES lies with 95 % if all is well."""
+    axes.axhspan(low, high, color="0.88", zorder=0, label="95 % if efficient")
+
+
+def draw_groups(
+    axes: Axes, groups: Sequence[Sequence[float]], labels: Sequence[str], marker: str
+) -> None:
+    """Values side by side in groups: a marker each, a colour per place in the group."""
+    size = max(len(group) for group in groups)
+    for place in range(size):
+        x = np.arange(len(groups)) + (place - 0.5 * (size - 1)) * 0.8 / size
+        axes.plot(x, [group[place] for group in groups], marker, ms=4, label=labels[place])

@@ -1,0 +1,174 @@
+"""Regions of an MCAP file as bytes: packing a chunk, opening one, and the small records around them.
+
+A region is a chunk, or a run of records outside chunks, which is laid out like an uncompressed chunk.
+Source: the MCAP specification (mcap.dev/spec).
+"""
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from recorders.log.loops import HEAD_BYTES, scan
+from recorders.log.streams import Clock
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")
+# The span of log time, size and checksum when uncompressed, length of the compression's name.
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+
+# zstd -1 because it leaves 69 % of noisy doubles and 25 % of MRCLAM's odometry; lz4 leaves 78 and 39 %
+# and packs 1.3 times as fast, zstd 3 leaves 66 and 18 % at half the speed both ways.
+_COMPRESS: Mapping[str, Callable[[memoryview], bytes]] = {
+    "zstd": lambda data: zstandard.compress(data, -1),
+    "lz4": lz4.frame.compress,
+    "none": bytes,
+}
+COMPRESSIONS = tuple(_COMPRESS)
+
+_UNREADABLE = (
+    McapError,
+    ValueError,
+    RuntimeError,
+    struct.error,
+    zstandard.ZstdError,
+    MemoryError,
+    OverflowError,
+)
+_RECORDS: dict[int, Any] = {
+    Opcode.SCHEMA: records.Schema,
+    Opcode.CHANNEL: records.Channel,
+    Opcode.CHUNK_INDEX: records.ChunkIndex,
+    Opcode.STATISTICS: records.Statistics,
+    Opcode.METADATA: records.Metadata,
+    Opcode.METADATA_INDEX: records.MetadataIndex,
+    Opcode.DATA_END: records.DataEnd,
+}
+
+
+class Damaged(ValueError):
+    """A part of a file that cannot be read; says which and why."""
+
+
+class Span(NamedTuple):
+    """From the first to the last time, both included."""
+
+    first_ns: int
+    last_ns: int
+
+    def holds(self, other: "Span") -> bool:
+        """Whether the other lies inside this one."""
+        return self.first_ns <= other.first_ns and other.last_ns <= self.last_ns
+
+    def meets(self, other: "Span") -> bool:
+        """Whether they have a time in common."""
+        return self.first_ns <= other.last_ns and other.first_ns <= self.last_ns
+
+
+class Contents(NamedTuple):
+    """An opened region: its bytes, where in them the messages of each channel start, what it declares.
+
+    `spans` is empty where there are no messages.
+    """
+
+    data: NDArray[np.uint8]
+    messages: dict[int, NDArray[np.int64]]
+    declarations: list[records.Schema | records.Channel]
+    spans: dict[Clock, Span]
+
+
+def chunk_record(data: memoryview, log_time: Span, compression: str) -> tuple[bytes, bytes]:
+    """The Chunk record that holds `data`: all that stands before the compressed bytes, and these."""
+    packed = _COMPRESS[compression](data)
+    name = b"" if compression == "none" else compression.encode()
+    head = _CHUNK_HEAD.pack(*log_time, len(data), zlib.crc32(data), len(name))
+    head += name + _LENGTH.pack(len(packed))
+    return RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(packed)) + head, packed
+
+
+def open_region(raw: bytes, offset: int) -> Contents:
+    """Open the region that stands at byte `offset` of a file, its checksum compared.
+
+    Raises Damaged.
+    """
+    try:
+        data = np.frombuffer(_uncompressed(raw) if raw[0] == Opcode.CHUNK else raw, np.uint8)
+        found = scan(data)
+        if found.end != len(data):
+            raise ValueError("a record inside it is not whole")
+        declarations = [next(read_records(data.data, place)) for place in found.declarations.tolist()]
+    except _UNREADABLE as error:
+        raise Damaged(f"the chunk at byte {offset} is damaged ({error})") from error
+    channel_ids = np.flatnonzero(found.counts)
+    borders = np.cumsum(found.counts[channel_ids])[:-1]
+    messages = dict(zip(channel_ids.tolist(), np.split(found.messages, borders), strict=False))
+    spans: dict[Clock, Span] = {}
+    if messages:
+        spans = {"log_time": Span(*found.log_time_ns), "publish_time": Span(*found.publish_time_ns)}
+    return Contents(data, messages, declarations, spans)
+
+
+def _uncompressed(chunk: bytes) -> bytes | memoryview:
+    """The records inside a Chunk record."""
+    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(chunk, HEAD_BYTES)
+    place = HEAD_BYTES + _CHUNK_HEAD.size
+    compression = str(chunk[place : place + name_length], "utf-8")
+    place += name_length
+    (packed_length,) = _LENGTH.unpack_from(chunk, place)
+    packed = memoryview(chunk)[place + _LENGTH.size :]
+    if len(packed) != packed_length:
+        raise ValueError("its length is wrong")
+    data: bytes | memoryview
+    if compression == "zstd":
+        if zstandard.frame_content_size(packed) not in (-1, size):
+            raise ValueError("its size is wrong")
+        data = zstandard.decompress(packed, size)
+    elif compression == "lz4":
+        data = lz4.frame.decompress(packed)
+    elif compression == "":
+        data = packed
+    else:
+        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
+    if len(data) != size:
+        raise ValueError("its size is wrong")
+    if checksum not in (0, zlib.crc32(data)):
+        raise ValueError("its checksum is wrong")
+    return data
+
+
+def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
+    """The small records in `data`, those of other kinds left out.
+
+    Raises Damaged where one is not whole or cannot be understood.
+    """
+    while start < len(data):
+        try:
+            opcode, length = RECORD_HEAD.unpack_from(data, start)
+            start += RECORD_HEAD.size + length
+            if start > len(data):
+                raise EndOfFile
+            if opcode in _RECORDS:
+                yield _RECORDS[opcode].read(ReadDataStream(_Whole(data[start - length : start])))
+        except _UNREADABLE as error:
+            raise Damaged(f"a record is damaged ({error or 'it is not whole'})") from error
+
+
+class _Whole(io.BytesIO):
+    """Bytes that never read short, as mcap's records would let pass."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        found = super().read(size)
+        if size is not None and len(found) < size:
+            raise EndOfFile
+        return found

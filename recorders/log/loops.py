@@ -1,0 +1,127 @@
+"""The compiled loops over the bytes of a chunk: find its records, and compare messages with a layout.
+
+The loops see the bytes as 64-bit words, one of which starts at every byte, so that they compare eight
+bytes at a time.
+Source: the MCAP specification (mcap.dev/spec), records Message, Schema and Channel.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from numba import njit
+from numpy.typing import NDArray
+
+# Opcode and length of a record; then channel, sequence and two clocks of a message.
+HEAD_BYTES = 9
+MESSAGE_HEAD_BYTES = HEAD_BYTES + 22
+
+_MESSAGE = int(Opcode.MESSAGE)
+_SCHEMA = int(Opcode.SCHEMA)
+_CHANNEL = int(Opcode.CHANNEL)
+
+
+class Scan(NamedTuple):
+    """What a walk over a chunk's records finds; offsets in bytes, times in ns.
+
+    `messages` are channel by channel, each in file order, and `counts` says how many each channel has.
+    `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
+    """
+
+    messages: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    declarations: NDArray[np.int64]
+    log_time_ns: tuple[int, int]
+    publish_time_ns: tuple[int, int]
+    end: int
+
+
+class Pattern(NamedTuple):
+    """The bytes that all records of one layout share: words at `places` within its `size` bytes."""
+
+    size: int
+    places: NDArray[np.int64]
+    expected: NDArray[np.uint64]
+    mask: NDArray[np.uint64]
+
+
+def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
+    """The pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
+    size = len(record)
+    places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
+    mask = _words(is_fixed)[places]
+    places, mask = places[mask != 0], mask[mask != 0]
+    return Pattern(size, places, _words(record)[places] & mask, mask)
+
+
+def scan(data: NDArray[np.uint8]) -> Scan:
+    """Walk the records of a chunk."""
+    return Scan(*_scan(_words(data), len(data)))
+
+
+def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
+    """Whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
+    if offsets[-1] + pattern.size > len(data):
+        return False
+    return bool(_agree(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
+
+
+def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """The words that start at every byte of `data` but the last seven, without a copy."""
+    count = max(len(data) - 7, 0)
+    return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
+
+
+@njit(cache=True, nogil=True)
+def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
+    found = np.empty(size // MESSAGE_HEAD_BYTES, np.int64)
+    channel_ids = np.empty(len(found), np.uint16)
+    declarations = np.empty(size // HEAD_BYTES, np.int64)
+    count, declared, position = 0, 0, np.int64(0)
+    highest = np.uint64(0xFFFFFFFFFFFFFFFF)
+    first_log, last_log, first_publish, last_publish = highest, np.uint64(0), highest, np.uint64(0)
+    while position + HEAD_BYTES <= size:
+        opcode = words[position] & np.uint64(0xFF)
+        end = position + HEAD_BYTES + np.int64(words[position + 1])
+        if end > size or end <= position:
+            break
+        if opcode == _MESSAGE:
+            if end - position < MESSAGE_HEAD_BYTES:
+                break
+            found[count] = position
+            channel_ids[count] = words[position + 8] >> np.uint64(8) & np.uint64(0xFFFF)
+            count += 1
+            log, publish = words[position + 15], words[position + 23]
+            first_log, last_log = min(first_log, log), max(last_log, log)
+            first_publish, last_publish = min(first_publish, publish), max(last_publish, publish)
+        elif opcode in (_SCHEMA, _CHANNEL):
+            declarations[declared] = position
+            declared += 1
+        position = end
+    counts = np.zeros(channel_ids[:count].max() + 1 if count else 0, np.int64)
+    for channel_id in channel_ids[:count]:
+        counts[channel_id] += 1
+    messages = np.empty(count, np.int64)
+    places = np.cumsum(counts) - counts
+    for row in range(count):
+        messages[places[channel_ids[row]]] = found[row]
+        places[channel_ids[row]] += 1
+    return (
+        messages,
+        counts,
+        declarations[:declared].copy(),
+        (first_log, last_log),
+        (first_publish, last_publish),
+        position,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _agree(words, offsets, places, expected, mask):  # type: ignore[no-untyped-def]
+    for offset in offsets:
+        wrong = np.uint64(0)
+        for k in range(len(places)):
+            wrong |= (words[offset + places[k]] ^ expected[k]) & mask[k]
+        if wrong:
+            return False
+    return True

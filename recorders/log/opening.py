@@ -1,0 +1,100 @@
+"""Opening a log: what it holds, by topic, and what is missing from it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from mcap import records
+
+from recorders.errors import BadInput
+from recorders.log.container import Container, open_container
+from recorders.log.run import RECORD_NAME, RunMetadata
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a log; MCAP allows several channels to share it. `metadata` is what they agree on."""
+
+    name: str
+    schema_name: str
+    encoding: str
+    channel_ids: tuple[int, ...]
+    metadata: Mapping[str, str]
+    messages: int
+
+
+@dataclass(frozen=True)
+class Log:
+    """An opened log: what it holds, not the messages themselves."""
+
+    path: Path
+    container: Container
+
+    @cached_property
+    def run(self) -> RunMetadata | None:
+        """What the run was, where the log says so."""
+        record = self.container.metadata.get(RECORD_NAME)
+        return None if record is None else RunMetadata.from_record(record, self.path)
+
+    @cached_property
+    def topics(self) -> dict[str, Topic]:
+        """The topics by name, sorted."""
+        grouped: dict[str, list[records.Channel]] = {}
+        for channel in self.container.channels.values():
+            grouped.setdefault(channel.topic, []).append(channel)
+        return {name: self._topic(name, grouped[name]) for name in sorted(grouped)}
+
+    def _topic(self, name: str, channels: list[records.Channel]) -> Topic:
+        first, *others = channels
+        schema = self.container.schemas.get(first.schema_id)
+        return Topic(
+            name,
+            schema.name if schema else "",
+            first.message_encoding,
+            tuple(channel.id for channel in channels),
+            {
+                key: value
+                for key, value in first.metadata.items()
+                if all(other.metadata.get(key) == value for other in others)
+            },
+            sum(self.container.message_counts[channel.id] for channel in channels),
+        )
+
+    def require(self, topic: str) -> Topic:
+        """The topic of this name; raises BadInput that lists what there is."""
+        if topic not in self.topics:
+            raise BadInput(
+                f"{self.path}: no topic {topic}; it has {', '.join(self.topics) or 'no topics'}"
+            )
+        return self.topics[topic]
+
+    @property
+    def loss_statement(self) -> str | None:
+        """What is missing from a recovered log, in one sentence; None where nothing is."""
+        return f"{self.path}: {_listed(self.container.damages)}" if self.container.damages else None
+
+
+def open_log(path: str | Path, *, recover: bool = False) -> Log:
+    """Open a log.
+
+    Args:
+        path: an MCAP file.
+        recover: read what is whole of a file that was cut off or damaged; its index is not believed.
+
+    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+    """
+    log = Log(Path(path), open_container(Path(path), use_index=not recover))
+    if log.loss_statement and not recover:
+        count = len(log.container.regions)
+        raise BadInput(
+            f"{log.loss_statement}; {count} whole {'chunk is' if count == 1 else 'chunks are'} "
+            "readable with --recover"
+        )
+    return log
+
+
+def _listed(damages: Sequence[str]) -> str:
+    """The first few, in one sentence."""
+    more = f", and {len(damages) - 3} more damages" if len(damages) > 3 else ""
+    return f"{', '.join(damages[:3])}{more}"

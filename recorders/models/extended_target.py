@@ -1,0 +1,25 @@
+"""An axis-aligned rectangle of which a sensor sees one noisy point at a time.
+
+Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
+section VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION
+2012. Target = (half_x_m, half_y_m, x_m, y_m): half lengths of the sides, and the centre.
+"""
+
+from recorders.models.planar import Component, Components
+
+SCALE_VARIANCE = 1.0 / 3.0  # of a scale that is uniform in [-1, 1]
+
+
+def surface_point(target: Components, scale: Components) -> tuple[Component, Component]:
+    """The point of the rectangle at `scale` times the half sides, each in [-1, 1], from the centre."""
+    return scale[0] * target[0] + target[2], scale[1] * target[1] + target[3]
+
+
+def quadratic(point: Components) -> tuple[Component, Component, Component, Component]:
+    """A point and its squares: without these a filter that is linear in y learns nothing of the size."""
+    return point[0], point[1], point[0] * point[0], point[1] * point[1]
+
+
+def area_m2(target: Components) -> Component:
+    """The rectangle's area; the sign of a half side means nothing to the sensor, but changes this."""
+    return 4.0 * target[0] * target[1]

@@ -1,0 +1,84 @@
+"""Axes in the plane and orientations in space as unit complex numbers and quaternions, x and -x alike.
+
+The algebra of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014,
+section 5.3. Quaternions are (w, x, y, z); all arrays keep their components on the last axis.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recorders.errors import BadInput
+
+# Basis elements multiply as e_j e_k = SIGNS[j, k] e_(j xor k). The complex numbers are the first two.
+SIGNS = np.array(
+    [[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]
+)
+XOR = np.bitwise_xor.outer(np.arange(4), np.arange(4))
+
+
+def left_matrix(left: ArrayLike) -> NDArray[np.float64]:
+    """The matrix (..., d, d) of y -> left (+) y, for `left` (..., d) with d = 2 or 4."""
+    left = np.asarray(left, float)
+    d = left.shape[-1]
+    other = XOR[:d, :d]
+    return left[..., other] * SIGNS[other, np.arange(d)]
+
+
+def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
+    """The matrix (..., d, d) of x -> x (+) right, for `right` (..., d) with d = 2 or 4."""
+    right = np.asarray(right, float)
+    d = right.shape[-1]
+    other = XOR[:d, :d]
+    return right[..., other] * SIGNS[np.arange(d), other]
+
+
+def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
+    """The complex product (24) of left and right (..., 2), or Hamilton's product (34) of (..., 4)."""
+    return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
+
+
+def conjugate(x: ArrayLike) -> NDArray[np.float64]:
+    """The inverse of a unit complex number or quaternion (..., d)."""
+    x = np.asarray(x, float)
+    return x * np.where(np.arange(x.shape[-1]) == 0, 1.0, -1.0)
+
+
+def from_rotation_vector(rotation_rad: ArrayLike) -> NDArray[np.float64]:
+    """The quaternions (..., 4) of rotations about the vectors (..., 3) by their length, (32)."""
+    half = 0.5 * np.asarray(rotation_rad, float)
+    angle = np.linalg.norm(half, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle), half * np.sinc(angle / np.pi)], axis=-1)
+
+
+def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
+    """The vectors (..., 3) turned by the orientations (..., 4), (33)."""
+    vector = np.asarray(vector, float)
+    pure = np.concatenate([np.zeros_like(vector[..., :1]), vector], axis=-1)
+    return compose(compose(orientation, pure), conjugate(orientation))[..., 1:]
+
+
+def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
+    """The angle in rad, 0 to pi/2, between the axes of a and b (..., d), (67)-(68).
+
+    For quaternions it is half the angle of the rotation from one orientation to the other.
+    """
+    relative = compose(conjugate(a), b)
+    return np.arctan2(np.linalg.norm(relative[..., 1:], axis=-1), np.abs(relative[..., 0]))
+
+
+def require_unit(x: ArrayLike, what: str, tolerance: float = 1e-6) -> NDArray[np.float64]:
+    """`x` (..., d) with every vector scaled to exactly unit length.
+
+    Raises BadInput where d is not 2 or 4, or a length differs from 1 by more than `tolerance`.
+    """
+    x = np.asarray(x, float)
+    if x.ndim == 0 or x.shape[-1] not in (2, 4):
+        raise BadInput(f"{what}: shape {x.shape}; give vectors of 2 or 4 components on the last axis")
+    length = np.linalg.norm(x, axis=-1)
+    wrong = ~(np.abs(length - 1.0) <= tolerance)
+    if wrong.any():
+        index = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise BadInput(
+            f"{what}: the vector at {index} has length {length[index]:.9g}; scale it to unit length"
+        )
+    return x / length[..., None]

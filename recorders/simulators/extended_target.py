@@ -1,0 +1,83 @@
+"""A rectangle that stands still, of which one noisy surface point is seen per time step.
+
+Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
+section VI.B: points are uniform over the surface, their noise is Gaussian.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.log import make_stream, schemas
+from recorders.models.extended_target import surface_point
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+COMPONENTS = {
+    "components": "half_x_m,half_y_m,x_m,y_m",
+    "kinds": "linear,linear,linear,linear",
+}
+Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
+
+
+class ExtendedTargetParameters(Parameters):
+    """The scenario; a target is (half_x_m, half_y_m, x_m, y_m), its drift what a filter supposes."""
+
+    points: PositiveInt = 150
+    step_s: PositiveFloat = 1.0
+    target: Target = (4.0, 2.0, 3.0, 5.0)
+    point_variance_m2: PositiveFloat = 1.0
+    size_drift_m2: NonNegativeFloat = 1e-4
+    position_drift_m2: NonNegativeFloat = 1e-3
+    prior_mean: Target = (1.0, 1.0, 0.0, 0.0)
+    prior_variance_m2: PositiveFloat = 1.0
+
+
+def simulate(parameters: ExtendedTargetParameters, rng: np.random.Generator) -> Recording:
+    """Record one run."""
+    target = np.array(parameters.target)
+    scale = rng.uniform(-1, 1, (2, parameters.points))
+    seen = np.stack(surface_point(target, scale), axis=1)
+    seen += rng.normal(size=seen.shape) * np.sqrt(parameters.point_variance_m2)
+    step_ns = round(parameters.step_s * 1e9)
+    stamps_ns = SIMULATION_EPOCH_NS + np.arange(parameters.points + 1) * step_ns
+    return Recording(
+        [
+            make_stream(
+                "/prior",
+                schemas.GAUSSIAN_ESTIMATE,
+                stamps_ns[:1],
+                metadata=COMPONENTS,
+                mean=np.array([parameters.prior_mean]),
+                covariance=(parameters.prior_variance_m2 * np.eye(4)).reshape(1, 16),
+            ),
+            make_stream(
+                "/truth",
+                schemas.TRUTH_STATE,
+                stamps_ns,
+                metadata=COMPONENTS,
+                state=np.tile(target, (len(stamps_ns), 1)),
+            ),
+            make_stream(
+                "/surface_point",
+                schemas.POSITION_FIX,
+                stamps_ns[1:],
+                metadata={
+                    "system": "extended-target",
+                    "size_drift_m2": repr(parameters.size_drift_m2),
+                    "position_drift_m2": repr(parameters.position_drift_m2),
+                    "point_variance_m2": repr(parameters.point_variance_m2),
+                },
+                position_m=seen,
+                covariance_m2=np.tile(parameters.point_variance_m2 * np.eye(2).ravel(), (len(seen), 1)),
+            ),
+        ]
+    )
+
+
+EXTENDED_TARGET = Simulator(
+    "a rectangle stands still; noisy points of its surface are seen, one at a time",
+    ExtendedTargetParameters,
+    simulate,
+)

@@ -1,0 +1,75 @@
+"""A batch reactor whose total pressure is read once per time step.
+
+Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
+section VI.A. The prior is the paper's, far from the truth and the same in every run.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.log import make_stream, schemas
+from recorders.models.reactor import react, total_pressure
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+COMPONENTS = {"components": "pressure_a,pressure_b", "kinds": "linear,linear"}
+Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
+
+
+class ReactorParameters(Parameters):
+    """The scenario; variances are per time step."""
+
+    steps: PositiveInt = 50
+    step_s: PositiveFloat = 0.1
+    start: Pair = (3.0, 1.0)
+    process_variance: NonNegativeFloat = 1e-5
+    pressure_variance: PositiveFloat = 0.1
+    prior_mean: Pair = (0.5, 3.5)
+    prior_variance: PositiveFloat = 10.0
+
+
+def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recording:
+    """Record one run."""
+    state = np.empty((parameters.steps + 1, 2))
+    state[0] = parameters.start
+    noise = rng.normal(size=(parameters.steps, 2)) * np.sqrt(parameters.process_variance)
+    for step in range(parameters.steps):
+        state[step + 1] = np.array(react(state[step], parameters.step_s)) + noise[step]
+    (total,) = total_pressure(state[1:].T)
+    read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)
+    step_ns = round(parameters.step_s * 1e9)
+    stamps_ns = SIMULATION_EPOCH_NS + np.arange(parameters.steps + 1) * step_ns
+    prior_covariance = parameters.prior_variance * np.eye(2)
+    return Recording(
+        [
+            make_stream(
+                "/prior",
+                schemas.GAUSSIAN_ESTIMATE,
+                stamps_ns[:1],
+                metadata=COMPONENTS,
+                mean=np.array([parameters.prior_mean]),
+                covariance=prior_covariance.reshape(1, 4),
+            ),
+            make_stream("/truth", schemas.TRUTH_STATE, stamps_ns, metadata=COMPONENTS, state=state),
+            make_stream(
+                "/pressure",
+                schemas.VECTOR_MEASUREMENT,
+                stamps_ns[1:],
+                metadata={
+                    "system": "batch-reactor",
+                    "components": "total_pressure",
+                    "step_s": repr(parameters.step_s),
+                    "process_variance": repr(parameters.process_variance),
+                    "pressure_variance": repr(parameters.pressure_variance),
+                },
+                value=read[:, None],
+            ),
+        ]
+    )
+
+
+BATCH_REACTOR = Simulator(
+    "a gas reacts in a closed vessel; its total pressure is read", ReactorParameters, simulate
+)

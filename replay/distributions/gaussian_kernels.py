@@ -1,0 +1,56 @@
+"""Compiled kernels of the Gaussian distribution: small definite systems and direct measurements."""
+
+import math
+
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True, error_model="numpy")
+def solve_in_place(matrix: NDArray, right: NDArray) -> None:
+    """Right = matrix^-1 right, (n, m), by the Cholesky factor of the leading (n, n) block, overwritten.
+
+    A block that is not positive definite gives NaN.
+    """
+    n, columns = right.shape
+    for i in range(n):
+        for j in range(i):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+            matrix[i, i] -= matrix[i, j] ** 2
+        matrix[i, i] = math.sqrt(matrix[i, i])
+    for column in range(columns):
+        for i in range(n):
+            for j in range(i):
+                right[i, column] -= matrix[i, j] * right[j, column]
+            right[i, column] /= matrix[i, i]
+        for i in range(n - 1, -1, -1):
+            for k in range(i + 1, n):
+                right[i, column] -= matrix[k, i] * right[k, column]
+            right[i, column] /= matrix[i, i]
+
+
+@njit(cache=True, error_model="numpy")
+def condition(mean: NDArray, covariance: NDArray, innovation: NDArray, noise: NDArray) -> None:
+    """Kalman's update in place for a measurement of the state itself, z = x + v.
+
+    Args:
+        mean: (d,).
+        covariance: (d, d).
+        innovation: z minus the mean, (d,).
+        noise: the covariance of v, (d, d).
+    """
+    d = len(mean)
+    innovation_covariance = covariance + noise
+    gain = covariance.copy()
+    solve_in_place(innovation_covariance, gain)
+    for i in range(d):
+        for j in range(d):
+            mean[i] += gain[j, i] * innovation[j]
+    # gain holds S^-1 P, the transpose of the gain: P - P S^-1 P
+    prior = covariance.copy()
+    for i in range(d):
+        for j in range(d):
+            for k in range(d):
+                covariance[i, j] -= prior[i, k] * gain[k, j]

@@ -1,0 +1,295 @@
+"""Compiled kernels of the bivariate wrapped normal distribution: fits to samples and products.
+
+Component-first functions are plain Python, to run on arrays as well; what loops is compiled here. A
+covariance is handed on as c11, c12, c22.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recorders.models.planar import Component, Components, wrap_angle
+
+TURN = 2.0 * math.pi
+# exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.
+UNIFORM = 80.0
+# exp(-REACH^2 / 2) is below the rounding of 1
+_REACH = 8.6
+_MLE_WRAPS = 3
+_MLE_GRID = 64
+_MLE_REFINEMENTS = 34
+# the five samples are the mean plus these multiples of (a, b)
+DIRAC_SIGNS = ((-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (0.0, 0.0))
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+def circular_correlation(c11: Component, c12: Component, c22: Component) -> Component:
+    """r_c of a wrapped normal: sinh(c12) / sqrt(sinh(c11) sinh(c22)), without overflow.
+
+    The print's definition in section II lacks the square root of the denominator.
+    """
+    scale = np.exp(abs(c12) - 0.5 * (c11 + c22)) * np.sign(c12)
+    return -scale * np.expm1(-2.0 * abs(c12)) / np.sqrt(np.expm1(-2.0 * c11) * np.expm1(-2.0 * c22))
+
+
+def covariance_of(correlation: Component, c11: Component, c22: Component) -> Component:
+    """The c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
+    return np.arcsinh(correlation * np.sqrt(np.sinh(c11) * np.sinh(c22)))
+
+
+def diracs(c11: Component, c22: Component, correlation: Component, w5: Component) -> Components:
+    """Algorithm 1 about the mean 0: offsets a, b in (0, pi) and weights w1 = w2, w3 = w4.
+
+    cos a = 1 - (1 - m) / (2 w~) where 1 - m = 1 - exp(-c11 / 2); the print misplaces the bracket. It is
+    taken by half angles, which keeps all digits of small variances.
+    """
+    w = 0.5 - 0.5 * w5
+    a = 2.0 * np.arcsin(np.sqrt(-np.expm1(-0.5 * c11) / (4.0 * w)))
+    b = 2.0 * np.arcsin(np.sqrt(-np.expm1(-0.5 * c22) / (4.0 * w)))
+    return a, b, 0.5 * w * (1.0 + correlation), 0.5 * w * (1.0 - correlation)
+
+
+_wrap, _diracs, _correlation, _covariance_of = (
+    njit(cache=True, error_model="numpy")(function)
+    for function in (wrap_angle, diracs, circular_correlation, covariance_of)
+)
+
+
+@njit(cache=True, error_model="numpy")
+def five_samples(mean: NDArray, covariance: NDArray, central_weight: float) -> Components:
+    """Positions (5, 2) and weights (5,) of algorithm 1 for a wrapped normal."""
+    c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    a, b, w1, w3 = _diracs(c11, c22, _correlation(c11, c12, c22), central_weight)
+    x = np.empty((5, 2))
+    for n, (sign1, sign2) in enumerate(DIRAC_SIGNS):
+        x[n, 0], x[n, 1] = mean[0] + sign1 * a, mean[1] + sign2 * b
+    return x, np.array([w1, w1, w3, w3, central_weight])
+
+
+@njit(cache=True, error_model="numpy")
+def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Components:
+    """Circular means, circular variances -2 ln|m|, and r_c of a wrapped Gaussian mixture.
+
+    Args:
+        x: means of the components (n, 2), or samples.
+        weights: (n,), with sum 1.
+        spread: the covariance (2, 2) of every component; 0 for samples.
+
+    Nothing is taken as a difference from 1, so that small variances keep their digits.
+    """
+    means, variances, fading, squares = np.empty(2), np.empty(2), np.empty(2), np.empty(2)
+    for k in range(2):
+        sine, cosine = 0.0, 0.0
+        for n in range(len(weights)):
+            sine += weights[n] * math.sin(x[n, k])
+            cosine += weights[n] * math.cos(x[n, k])
+        means[k] = math.atan2(sine, cosine)
+        shortfall, square = 0.0, 0.0
+        for n in range(len(weights)):
+            shortfall += weights[n] * 2.0 * math.sin(0.5 * (x[n, k] - means[k])) ** 2
+            square += weights[n] * math.sin(x[n, k] - means[k]) ** 2
+        variances[k] = min(spread[k, k] - 2.0 * math.log1p(-min(shortfall, 1.0)), UNIFORM)
+        fading[k] = math.exp(-2.0 * spread[k, k])
+        squares[k] = fading[k] * square - 0.5 * math.expm1(-2.0 * spread[k, k])
+    sines, cosines = 0.0, 0.0
+    for n in range(len(weights)):
+        first, second = x[n, 0] - means[0], x[n, 1] - means[1]
+        sines += weights[n] * math.sin(first) * math.sin(second)
+        cosines += weights[n] * math.cos(first) * math.cos(second)
+    cross = math.cosh(spread[0, 1]) * sines + math.sinh(spread[0, 1]) * cosines
+    correlation = cross * math.sqrt(math.sqrt(fading[0] * fading[1]) / (squares[0] * squares[1]))
+    return means[0], means[1], variances[0], variances[1], correlation
+
+
+@njit(cache=True, error_model="numpy")
+def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c22: float) -> float:
+    """The c12 that maximises the weighted likelihood of samples (n, 2), the rest given by moments.
+
+    Kurz and Hanebeck, CDC 2015. The likelihood has several maxima, so that a grid over the whole range
+    comes first. Its wraps are cut at three, as in the source.
+    """
+    deviations = np.empty(x.shape)
+    for n in range(len(x)):
+        deviations[n, 0] = _wrap(x[n, 0] - m1) / math.sqrt(c11)
+        deviations[n, 1] = _wrap(x[n, 1] - m2) / math.sqrt(c22)
+    turns = TURN / math.sqrt(c11), TURN / math.sqrt(c22)
+    # correlation = sin(position): the grid is dense where the likelihood is narrow, at -1 and 1
+    spacing = math.pi / (_MLE_GRID + 1)
+    best, centre = -np.inf, 0.0
+    for n in range(1, _MLE_GRID + 1):
+        position = n * spacing - 0.5 * math.pi
+        value = _log_likelihood(math.sin(position), deviations, weights, turns)
+        if value > best:
+            best, centre = value, position
+    low, high = centre - spacing, centre + spacing
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left = _log_likelihood(math.sin(left), deviations, weights, turns)
+    at_right = _log_likelihood(math.sin(right), deviations, weights, turns)
+    for _ in range(_MLE_REFINEMENTS):
+        if at_left > at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = _log_likelihood(math.sin(left), deviations, weights, turns)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = _log_likelihood(math.sin(right), deviations, weights, turns)
+    return math.sin(0.5 * (low + high)) * math.sqrt(c11 * c22)
+
+
+@njit(cache=True, error_model="numpy")
+def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float, float]) -> float:
+    """Of samples (n, 2) in standard deviations, up to a constant; `turns` is 2 pi in these units."""
+    scale = 0.5 / (1.0 - rho * rho)
+    total = 0.5 * math.log(scale)
+    for n in range(len(weights)):
+        density = 0.0
+        for j in range(-_MLE_WRAPS, _MLE_WRAPS + 1):
+            first = x[n, 0] + j * turns[0]
+            for k in range(-_MLE_WRAPS, _MLE_WRAPS + 1):
+                second = x[n, 1] + k * turns[1]
+                density += math.exp(
+                    -scale * (first * first - 2.0 * rho * first * second + second * second)
+                )
+        # a sample beyond the reach of doubles must not hide the others
+        total += weights[n] * math.log(density + 1e-300)
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def fit_samples(x: NDArray, weights: NDArray) -> Components:
+    """Mean and covariance (m1, m2, c11, c12, c22) with the circular moments and r_c of samples (n, 2).
+
+    Where no positive definite covariance has them, c12 is the mixed maximum-likelihood estimate.
+    """
+    m1, m2, c11, c22, correlation = circular_moments(x, weights, np.zeros((2, 2)))
+    c12 = _covariance_of(correlation, c11, c22)
+    if not c12 * c12 < c11 * c22:
+        c12 = mixed_mle(x, weights, m1, m2, c11, c22)
+    return m1, m2, c11, c12, c22
+
+
+@njit(cache=True, error_model="numpy")
+def product_mixture(
+    mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray
+) -> Components:
+    """The product of two wrapped normal densities: exactly a wrapped Gaussian mixture.
+
+    It has a component for every number of turns between the two means, with Kalman's update each.
+
+    Returns:
+        The components' means (n, 2), their weights (n,), and the covariance (2, 2) that they share.
+    """
+    first, second = _limited(covariance), _limited(other)
+    total = first + second
+    determinant = total[0, 0] * total[1, 1] - total[0, 1] * total[1, 0]
+    inverse = np.array([[total[1, 1], -total[0, 1]], [-total[1, 0], total[0, 0]]]) / determinant
+    gain = first @ inverse
+    turns0, turns1 = _turns(total[0, 0]), _turns(total[1, 1])
+    wide = 2 * turns1 + 1
+    means = np.empty(((2 * turns0 + 1) * wide, 2))
+    exponents = np.empty(len(means))
+    for n in range(len(means)):
+        innovation0 = _wrap(other_mean[0] - mean[0]) + (n // wide - turns0) * TURN
+        innovation1 = _wrap(other_mean[1] - mean[1]) + (n % wide - turns1) * TURN
+        exponents[n] = -0.5 * (
+            inverse[0, 0] * innovation0**2
+            + 2.0 * inverse[0, 1] * innovation0 * innovation1
+            + inverse[1, 1] * innovation1**2
+        )
+        for k in range(2):
+            means[n, k] = mean[k] + gain[k, 0] * innovation0 + gain[k, 1] * innovation1
+    weights = np.exp(exponents - exponents.max())
+    return means, weights / weights.sum(), gain @ second
+
+
+@njit(cache=True, error_model="numpy")
+def _limited(covariance: NDArray) -> NDArray:
+    """The covariance, or where it stands for a uniform distribution, the least one that does."""
+    c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    least = 0.5 * (c11 + c22) - math.hypot(0.5 * (c11 - c22), c12)
+    return UNIFORM * np.eye(2) if least > UNIFORM else covariance
+
+
+@njit(cache=True, error_model="numpy")
+def _turns(variance: float) -> int:
+    """How many turns either way a normal density reaches to the last digit of its wrapped sum."""
+    return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
+
+
+@njit(cache=True, error_model="numpy")
+def fit_product(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> Components:
+    """The wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
+
+    Where no positive definite covariance has them (modes far apart), the components' correlation stays.
+    """
+    means, weights, spread = product_mixture(mean, covariance, other_mean, other)
+    m1, m2, c11, c22, correlation = circular_moments(means, weights, spread)
+    c12 = _covariance_of(correlation, c11, c22)
+    if not c12 * c12 < c11 * c22:
+        c12 = spread[0, 1] * math.sqrt(c11 * c22 / (spread[0, 0] * spread[1, 1]))
+    return m1, m2, c11, c12, c22
+
+
+@njit(cache=True, error_model="numpy")
+def density(x1: float, x2: float, covariance: NDArray) -> float:
+    """The density at a deviation (rad) from the mean: the wrapped sum, or Fourier's where shorter."""
+    c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    least = 0.5 * (c11 + c22) - math.hypot(0.5 * (c11 - c22), c12)
+    total = 0.0
+    if least > 1.0:
+        most = int(_REACH / math.sqrt(least)) + 1
+        for j in range(-most, most + 1):
+            for k in range(-most, most + 1):
+                decay = math.exp(-0.5 * (j * j * c11 + 2.0 * j * k * c12 + k * k * c22))
+                total += decay * math.cos(j * x1 + k * x2)
+        return max(total, 0.0) / TURN**2
+    determinant = c11 * c22 - c12 * c12
+    turns1, turns2 = _turns(c11), _turns(c22)
+    x1, x2 = _wrap(x1), _wrap(x2)
+    for j in range(-turns1, turns1 + 1):
+        first = x1 + j * TURN
+        for k in range(-turns2, turns2 + 1):
+            second = x2 + k * TURN
+            square = c22 * first * first - 2.0 * c12 * first * second + c11 * second * second
+            total += math.exp(-0.5 * square / determinant)
+    return total / (TURN * math.sqrt(determinant))
+
+
+@njit(cache=True, error_model="numpy")
+def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
+    """`density` (n,) at every deviation (n, 2) under its covariance (n, 2, 2)."""
+    out = np.empty(len(deviation))
+    for n in range(len(out)):
+        out[n] = density(deviation[n, 0], deviation[n, 1], covariance[n])
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
+    """`circular_moments` (n, 5) of sample sets (n, samples, 2) with weights (n, samples)."""
+    out = np.empty((len(x), 5))
+    for n in range(len(out)):
+        out[n] = circular_moments(x[n], weights[n], np.zeros((2, 2)))
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
+    """Moments and `mixed_mle` (n, 5) as m1, m2, c11, c12, c22 of sample sets (n, samples, 2)."""
+    out = np.empty((len(x), 5))
+    for n in range(len(out)):
+        m1, m2, c11, c22, _ = circular_moments(x[n], weights[n], np.zeros((2, 2)))
+        out[n] = m1, m2, c11, mixed_mle(x[n], weights[n], m1, m2, c11, c22), c22
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def fit_product_each(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> NDArray:
+    """`fit_product` (n, 5) of pairs (n, ...)."""
+    out = np.empty((len(mean), 5))
+    for n in range(len(out)):
+        out[n] = fit_product(mean[n], covariance[n], other_mean[n], other[n])
+    return out

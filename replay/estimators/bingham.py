@@ -1,0 +1,187 @@
+"""Filters for axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
+
+The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
+Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in
+compiled loops, parallel over runs.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.models.orientation import require_unit
+from replay.distributions import bingham
+from replay.distributions.bingham import Bingham
+from replay.distributions.bingham_kernels import compose, framed, predict, turn_columns, update
+from replay.distributions.gaussian_kernels import condition
+
+
+class Steps(NamedTuple):
+    """The steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
+
+    A row is a prediction with a known increment u, then an update with a measurement z; a row of NaN
+    in either leaves that half of the step out.
+
+    Attributes:
+        offsets: (runs + 1,).
+        increment: unit vectors u (rows, d), the identity (1, 0, ...) where there is no control input.
+        measurement: unit vectors z (rows, d).
+    """
+
+    offsets: NDArray[np.int64]
+    increment: NDArray[np.float64]
+    measurement: NDArray[np.float64]
+
+
+def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
+    """Steps with every vector at exactly unit length; BadInput where one is neither unit nor NaN."""
+    if not len(increment) == len(measurement) == offsets[-1]:
+        raise BadInput(
+            f"{len(increment)} increments and {len(measurement)} measurements for {offsets[-1]} steps; "
+            "give a row of each for every step, NaN for none"
+        )
+    return Steps(offsets, _unit_or_nan(increment, "increment"), _unit_or_nan(measurement, "measurement"))
+
+
+def _unit_or_nan(x: NDArray, what: str) -> NDArray[np.float64]:
+    missing = np.isnan(x).all(axis=-1, keepdims=True)
+    unit = require_unit(np.where(missing, np.eye(x.shape[-1])[0], x), what)
+    return np.ascontiguousarray(np.where(missing, np.nan, unit))
+
+
+class BinghamNoise(NamedTuple):
+    """System noise w and measurement noise v, without batch axes, with modes at or near the identity."""
+
+    system: Bingham
+    measurement: Bingham
+
+
+class Gaussian(NamedTuple):
+    """Gaussian states: mean (..., d) and covariance (..., d, d)."""
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+class GaussianNoise(NamedTuple):
+    """Covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
+
+    system: NDArray[np.float64]
+    measurement: NDArray[np.float64]
+
+
+def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tuple[Bingham, Bingham]:
+    """The recursive Bingham filter: algorithms 1 and 2.
+
+    Args:
+        noise: see there.
+        state: the distributions before the first row, batch axis (runs,).
+        steps: see there.
+
+    Returns:
+        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
+        fit does not converge, the run is NaN from there on and the others go on.
+    """
+    rows, d = steps.measurement.shape
+    identity = np.eye(d)[0]
+    state = Bingham(state.axes.copy(), state.concentrations.copy())
+    estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
+    _bingham_filter(
+        steps,
+        bingham.covariance(noise.system),
+        bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
+        state,
+        estimates,
+    )
+    return state, estimates
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _bingham_filter(
+    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
+) -> None:
+    for run in prange(len(steps.offsets) - 1):
+        _bingham_run(steps, system, inverse_noise, state, estimates, run)
+
+
+@njit(cache=True, error_model="numpy")
+def _bingham_run(
+    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham, run: int
+) -> None:
+    axes, z = state.axes[run], state.concentrations[run]
+    for row in range(steps.offsets[run], steps.offsets[run + 1]):
+        if not math.isnan(steps.increment[row, 0]):
+            turn_columns(axes, steps.increment[row])
+            if not predict(axes, z, system):
+                z[:] = np.nan
+        if not math.isnan(steps.measurement[row, 0]):
+            update(axes, z, inverse_noise, steps.measurement[row])
+        if math.isnan(z[0]):
+            # NaN stays: all later rows of the run are NaN as well
+            axes[:] = np.nan
+        estimates.axes[row] = axes
+        estimates.concentrations[row] = z
+
+
+def run_kalman_filter(
+    noise: GaussianNoise, state: Gaussian, steps: Steps, *, rotated: bool
+) -> tuple[Gaussian, Gaussian]:
+    """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
+
+    Args:
+        noise: see there; the paper adds it as it is, wherever the state points.
+        state: the Gaussians before the first row, batch axis (runs,).
+        steps: see there.
+        rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
+
+    Returns:
+        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
+        covariance loses its definiteness is NaN from there on.
+    """
+    rows, d = steps.measurement.shape
+    state = Gaussian(state.mean.copy(), state.covariance.copy())
+    estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
+    noise = GaussianNoise(*map(np.ascontiguousarray, noise))
+    _kalman_filter(steps, noise, rotated, state, estimates)
+    return state, estimates
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _kalman_filter(
+    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
+) -> None:
+    for run in prange(len(steps.offsets) - 1):
+        _kalman_run(steps, noise, rotated, state, estimates, run)
+
+
+@njit(cache=True, error_model="numpy")
+def _kalman_run(
+    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian, run: int
+) -> None:
+    x, p = state.mean[run], state.covariance[run]
+    for row in range(steps.offsets[run], steps.offsets[run + 1]):
+        if not math.isnan(steps.increment[row, 0]):
+            compose(x.copy(), steps.increment[row], x)
+            turn_columns(p, steps.increment[row])
+            turn_columns(p.T, steps.increment[row])
+            p += framed(noise.system, _frame(x, rotated))
+        if not math.isnan(steps.measurement[row, 0]):
+            # z and -z are one axis: take the one on the side of the state
+            side = math.copysign(1.0, (x * steps.measurement[row]).sum())
+            innovation = side * steps.measurement[row] - x
+            condition(x, p, innovation, framed(noise.measurement, _frame(x, rotated)))
+            x /= math.sqrt((x * x).sum())
+        estimates.mean[row] = x
+        estimates.covariance[row] = p
+
+
+@njit(cache=True, error_model="numpy")
+def _frame(state: NDArray, rotated: bool) -> NDArray:
+    """The state scaled to unit length where `rotated`, else the identity."""
+    frame = np.zeros(len(state))
+    frame[0] = 1.0
+    return state / math.sqrt((state * state).sum()) if rotated else frame

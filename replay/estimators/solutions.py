@@ -1,0 +1,116 @@
+"""What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Topic, make_stream, schemas
+from recorders.models.states import state_metadata
+from replay.blocks import Ragged
+from replay.least_squares import SENTENCES, Solution
+
+
+class Batches(NamedTuple):
+    """Which measurements are solved together: the run of each batch, in order, and its last stamp."""
+
+    runs: int
+    run: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+
+    def ragged(
+        self,
+        topic: str,
+        schema: Schema,
+        rows: NDArray[np.bool_],
+        metadata: Mapping[str, str],
+        **columns: NDArray[Any],
+    ) -> Ragged:
+        """An output stream with a message for each of these batches."""
+        stream = make_stream(topic, schema, self.time_ns[rows], metadata=metadata, **columns)
+        return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
+
+
+def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
+    """The messages of all sensors in one table: run, sensor (its place among them), time_ns, fields."""
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+                    "sensor": sensor,
+                    "time_ns": ragged.stream.publish_time_ns,
+                    **{field: ragged[field] for field in fields},
+                }
+            )
+            for sensor, ragged in enumerate(streams)
+        ],
+        ignore_index=True,
+    )
+
+
+def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, NDArray[np.int64]]:
+    """The batches of a table, one for each value of `key` in each run, and which one each row is of."""
+    groups = table.groupby(["run", key])
+    last = groups["time_ns"].max()
+    run = last.index.get_level_values("run").to_numpy()
+    return Batches(runs, run, last.to_numpy()), np.asarray(groups.ngroup(), np.int64)
+
+
+def solution_streams(
+    topic: str, truth: str, components: Sequence[str], batches: Batches, solution: Solution
+) -> list[Ragged]:
+    """The streams TOPIC/state, TOPIC/solution and TOPIC/failure of one solution for each batch.
+
+    A batch that failed has no state; its failure is one of `SENTENCES`.
+    """
+    found, every = solution.converged, np.ones(len(solution.cost), bool)
+    size = len(components)
+    return [
+        batches.ragged(
+            f"{topic}/state",
+            schemas.GAUSSIAN_ESTIMATE,
+            found,
+            state_metadata(components) | {"truth": truth},
+            mean=solution.parameters[found],
+            covariance=solution.covariance[found].reshape(-1, size**2),
+        ),
+        batches.ragged(
+            f"{topic}/solution",
+            schemas.SOLUTION,
+            every,
+            {"parameters": str(size)},
+            iterations=solution.iterations,
+            converged=found,
+            rank=solution.rank,
+            cost=np.nan_to_num(solution.cost, nan=0.0, posinf=np.finfo(float).max),
+        ),
+        batches.ragged(
+            f"{topic}/failure",
+            schemas.FAILURE,
+            ~found,
+            {"reasons": "; ".join(SENTENCES.values())},
+            reason=solution.status[~found],
+        ),
+    ]
+
+
+def sensor_numbers(topics: Mapping[str, Topic], leaf: str, schema: Schema) -> list[int]:
+    """The numbers of the sensors whose /sensorN/LEAF has this schema."""
+    names = [name for name, topic in topics.items() if topic.schema_name == schema.full_name]
+    split = [name.removeprefix("/sensor").partition("/") for name in names if name.startswith("/sensor")]
+    return sorted(int(number) for number, _, rest in split if rest == leaf and number.isdigit())
+
+
+def stated(topic: Topic, name: str) -> float:
+    """A positive number that the channel's metadata states; raises BadInput where it does not."""
+    try:
+        value = float(topic.metadata[name])
+    except (KeyError, ValueError):
+        value = np.nan
+    if not 0.0 < value < np.inf:
+        raise BadInput(f"topic {topic.name} does not state {name}; record it with its sensor's noise")
+    return value

@@ -1,0 +1,223 @@
+"""Filters for two headings that turn together, x+ = turn_together(x) + w and z = x + v, modulo 2 pi.
+
+The recursive toroidal filter that Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate
+Circular Estimation", 2016, announce, and beside it the unscented Kalman filter with their UKF samples.
+All take an ensemble as ragged rows, run r owning offsets[r]:offsets[r + 1]; a row is a prediction, then
+an update with its measurement (2,) unless that is NaN.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from recorders.errors import BadInput
+from recorders.models.headings import turn_together
+from recorders.models.planar import wrap_angle
+from replay.distributions.gaussian_kernels import condition
+from replay.distributions.wrapped_normal import (
+    WrappedNormal,
+    make_wrapped_normal,
+    require_central_weight,
+)
+from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+
+# Functions with a parallel loop hold calls only: numba would turn array statements in them into loops of
+# their own, which is slow to compile and was seen to go wrong.
+_turn_together, _wrap_angle = (njit(cache=True)(model) for model in (turn_together, wrap_angle))
+
+
+class HeadingModel(NamedTuple):
+    """The system and its noise.
+
+    Attributes:
+        coupling_rad: c in `turn_together`.
+        drift_rad: what is added in every step, (2,).
+        system: covariance of w, (2, 2), rad^2.
+        measurement: covariance of v, (2, 2), rad^2.
+    """
+
+    coupling_rad: float
+    drift_rad: NDArray[np.float64]
+    system: NDArray[np.float64]
+    measurement: NDArray[np.float64]
+
+
+def make_heading_model(
+    coupling_rad: float, drift_rad: ArrayLike, system: ArrayLike, measurement: ArrayLike
+) -> HeadingModel:
+    """A checked model; BadInput where a covariance is not positive definite or a number not finite."""
+    if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
+        raise BadInput("coupling and drift of a heading model must be finite, the drift two numbers")
+    covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
+    return HeadingModel(
+        float(coupling_rad), np.array(drift_rad, float), *map(np.ascontiguousarray, covariances)
+    )
+
+
+def run_toroidal_filter(
+    model: HeadingModel,
+    state: WrappedNormal,
+    offsets: NDArray[np.int64],
+    measurement: NDArray[np.float64],
+    *,
+    central_weight: float = 0.2,
+) -> tuple[WrappedNormal, WrappedNormal]:
+    """The recursive toroidal filter.
+
+    A prediction moves five samples and refits by circular moments and r_c (by mixed maximum likelihood
+    where these allow no covariance), then adds the system noise; an update refits the exact product.
+
+    Args:
+        model: see there.
+        state: the distributions before the first row, batch axis (runs,).
+        offsets: (runs + 1,).
+        measurement: (rows, 2), rad.
+        central_weight: w5 of the five samples.
+
+    Returns:
+        The state after the last row, and the estimates of all rows, batch axis (rows,). A run that
+        fails is NaN from there on.
+    """
+    require_central_weight(central_weight)
+    return _run(_toroidal_filter, model, state, offsets, measurement, central_weight)
+
+
+def run_unscented_filter(
+    model: HeadingModel,
+    state: WrappedNormal,
+    offsets: NDArray[np.int64],
+    measurement: NDArray[np.float64],
+    *,
+    wrapped: bool,
+) -> tuple[WrappedNormal, WrappedNormal]:
+    """The unscented Kalman filter with the paper's five equally weighted samples.
+
+    Args as `run_toroidal_filter`, and
+        wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.
+    """
+    return _run(_unscented_filter, model, state, offsets, measurement, wrapped)
+
+
+def _run(
+    filter_all: Callable[..., None],
+    model: HeadingModel,
+    state: WrappedNormal,
+    offsets: NDArray[np.int64],
+    measurement: NDArray[np.float64],
+    option: float | bool,
+) -> tuple[WrappedNormal, WrappedNormal]:
+    if measurement.shape != (offsets[-1], 2):
+        raise BadInput(f"heading measurements of shape {measurement.shape}; give ({offsets[-1]}, 2)")
+    state = WrappedNormal(state.mean.copy(), state.covariance.copy())
+    estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
+    filter_all(model, option, offsets, np.ascontiguousarray(measurement), state, estimates)
+    return state, estimates
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _toroidal_filter(
+    model: HeadingModel,
+    central_weight: float,
+    offsets: NDArray,
+    measurement: NDArray,
+    state: WrappedNormal,
+    estimates: WrappedNormal,
+) -> None:
+    for run in prange(len(offsets) - 1):
+        for row in range(offsets[run], offsets[run + 1]):
+            _toroidal_step(model, central_weight, measurement[row], state, run)
+            _record(state, run, estimates, row)
+
+
+@njit(cache=True, error_model="numpy")
+def _toroidal_step(
+    model: HeadingModel, central_weight: float, z: NDArray, state: WrappedNormal, run: int
+) -> None:
+    mean, covariance = state.mean[run], state.covariance[run]
+    x, weights = five_samples(mean, covariance, central_weight)
+    _move(model, x)
+    _store(fit_samples(x, weights), mean, covariance)
+    covariance += model.system
+    if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
+        # no distribution: NaN stays, all later rows of the run are NaN as well
+        mean[:], covariance[:] = np.nan, np.nan
+    elif not math.isnan(z[0]):
+        _store(fit_product(mean, covariance, z, model.measurement), mean, covariance)
+
+
+@njit(cache=True, error_model="numpy")
+def _record(state: WrappedNormal, run: int, estimates: WrappedNormal, row: int) -> None:
+    estimates.mean[row] = state.mean[run]
+    estimates.covariance[row] = state.covariance[run]
+
+
+@njit(cache=True, error_model="numpy")
+def _move(model: HeadingModel, x: NDArray) -> None:
+    for n in range(len(x)):
+        x[n, 0], x[n, 1] = _turn_together(
+            x[n, 0], x[n, 1], model.coupling_rad, model.drift_rad[0], model.drift_rad[1]
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _store(
+    parameters: tuple[float, float, float, float, float], mean: NDArray, covariance: NDArray
+) -> None:
+    mean[0], mean[1], covariance[0, 0], covariance[0, 1], covariance[1, 1] = parameters
+    covariance[1, 0] = covariance[0, 1]
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _unscented_filter(
+    model: HeadingModel,
+    wrapped: bool,
+    offsets: NDArray,
+    measurement: NDArray,
+    state: WrappedNormal,
+    estimates: WrappedNormal,
+) -> None:
+    for run in prange(len(offsets) - 1):
+        for row in range(offsets[run], offsets[run + 1]):
+            _unscented_step(model, wrapped, measurement[row], state, run)
+            _record(state, run, estimates, row)
+
+
+@njit(cache=True, error_model="numpy")
+def _unscented_step(
+    model: HeadingModel, wrapped: bool, z: NDArray, state: WrappedNormal, run: int
+) -> None:
+    mean, covariance = state.mean[run], state.covariance[run]
+    x = _sigma_points(mean, covariance)
+    _move(model, x)
+    if not wrapped:
+        x %= TURN
+    for k in range(2):
+        mean[k] = x[:, k].mean()
+    for i in range(2):
+        for j in range(2):
+            spread = ((x[:, i] - mean[i]) * (x[:, j] - mean[j])).mean()
+            covariance[i, j] = spread + model.system[i, j]
+    if not math.isnan(z[0]):
+        innovation = z - mean
+        condition(
+            mean, covariance, _wrap_angle(innovation) if wrapped else innovation, model.measurement
+        )
+    for k in range(2):
+        mean[k] = _wrap_angle(mean[k]) if wrapped else mean[k] % TURN
+
+
+@njit(cache=True, error_model="numpy")
+def _sigma_points(mean: NDArray, covariance: NDArray) -> NDArray:
+    """The mean, and the mean plus and minus sqrt(5 / 2) times the columns of the Cholesky factor."""
+    first = math.sqrt(2.5 * covariance[0, 0])
+    below = 2.5 * covariance[0, 1] / first
+    second = math.sqrt(2.5 * covariance[1, 1] - below * below)
+    x = np.empty((5, 2))
+    for n, (along, across) in enumerate(((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))):
+        x[n, 0] = mean[0] + along * first
+        x[n, 1] = mean[1] + along * below + across * second
+    return x

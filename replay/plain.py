@@ -1,0 +1,460 @@
+"""Estimators from plain functions: what is alike in all of them, written once.
+
+`recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
+`batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix
+that has them, name the outputs, and tell of a run that failed while the others go on.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Generic, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream, Topic, make_stream, schemas
+from recorders.models.planar import wrap_angle
+from recorders.parameters import ParametersType
+from replay.blocks import Block, Ragged
+from replay.compile import compile_over_runs
+from replay.engine import Batch, Bound, Estimator, Recursive
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Components = Mapping[str, Literal["linear", "angle"]]
+
+DIVERGED = "the estimate is not finite: no usable prior, or the filter diverged"
+
+
+@dataclass(frozen=True)
+class Given(Generic[ParametersType]):
+    """What a recursion starts from; topics go by the names under which it asked for them."""
+
+    parameters: ParametersType
+    topics: Mapping[str, Topic]
+    whole: Mapping[str, Ragged]
+
+    def stated(self, topic: str, name: str) -> float:
+        """The parameter `name`, or where it is None the number that the topic's channel states.
+
+        Raises BadInput where neither does.
+        """
+        value = getattr(self.parameters, name)
+        try:
+            return float(self.topics[topic].metadata[name] if value is None else value)
+        except (KeyError, ValueError):
+            raise BadInput(
+                f"topic {self.topics[topic].name} does not state {name}; give it with --set {name}=..."
+            ) from None
+
+    def prior(self, topic: str, components: int) -> tuple[Integers, Floats, Floats]:
+        """The first Gaussian of every run: stamps (runs,), means (runs, d), covariances (runs, d, d).
+
+        NaN where a run has none or its covariance is not positive definite: that run has failed.
+        Raises BadInput where no run has one that can be used.
+        """
+        ragged = self.whole[topic]
+        runs = np.flatnonzero(np.diff(ragged.offsets))
+        rows = ragged.offsets[runs]
+        time_ns = np.zeros(ragged.runs, np.int64)
+        mean = np.full((ragged.runs, components), np.nan)
+        covariance = np.full((ragged.runs, components, components), np.nan)
+        if ragged["mean"].shape[1] == components:
+            stated = ragged["covariance"][rows].reshape(-1, components, components)
+            usable = np.linalg.eigvalsh(stated)[:, 0] > 0
+            runs, rows = runs[usable], rows[usable]
+            time_ns[runs] = ragged.stream.publish_time_ns[rows]
+            mean[runs], covariance[runs] = ragged["mean"][rows], stated[usable]
+        if np.isnan(mean).all():
+            raise BadInput(
+                f"topic {ragged.stream.topic}: no prior of {components} components with a positive "
+                "definite covariance; the filter cannot start"
+            )
+        return time_ns, mean, covariance
+
+
+class Messages(NamedTuple):
+    """The messages of all runs in time order: run r owns the rows offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns: (n,).
+        topic: (n,) which stream, in the order in which they were asked for.
+        value: (n, width) the fields after the sensor's clock, in order of declaration; NaN beyond.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    topic: Integers
+    value: Floats
+
+
+class Results(NamedTuple):
+    """What a recursion fills, one row for every message; a row of NaN says nothing.
+
+    Attributes:
+        mean, covariance: (n, d), (n, d, d) the estimate after the message.
+        innovation, innovation_covariance: (n, m), (n, m, m) of the message.
+        squared: (n,) the normalised innovation squared.
+        accepted: (n,) whether a gate let the message in; 1 unless set.
+        target: (n,) what the message was about; 0 unless set.
+    """
+
+    mean: Floats
+    covariance: Floats
+    innovation: Floats
+    innovation_covariance: Floats
+    squared: Floats
+    accepted: Integers
+    target: Integers
+
+
+class Solution(NamedTuple):
+    """How the solutions ended, (n,) each; the cost is what was minimised."""
+
+    iterations: Integers
+    converged: Integers
+    rank: Integers
+    cost: Floats
+
+
+class Estimates(NamedTuple):
+    """What streams were solved to: stamps (n,), means (n, d), covariances (n, d, d), how it ended."""
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    solution: Solution | None = None
+
+
+class Failure(NamedTuple):
+    """When and why a run failed."""
+
+    time_ns: int
+    reason: str
+
+
+class Solved(NamedTuple):
+    """The estimates of all runs end to end, run r owning offsets[r]:offsets[r + 1]; failures by run."""
+
+    offsets: Integers
+    estimates: Estimates
+    failures: Mapping[int, Failure]
+
+
+def recursive(
+    summary: str,
+    *,
+    parameters: type[ParametersType],
+    streams: Mapping[str, Schema],
+    whole: Mapping[str, Schema],
+    components: Components,
+    truth: str = "",
+    measured: Components | None = None,
+    start: Callable[[Given[ParametersType]], tuple[Any, Any]],
+    follow: Callable[[int, Any, Messages, Any, Results], None],
+    compiled: bool = True,
+) -> Estimator[ParametersType]:
+    """An estimator that follows its messages in time.
+
+    Args:
+        summary: what it is, in one line.
+        parameters: their type.
+        streams: the topics to follow, with their schemas; see `bindings` for their names.
+        whole: the topics that `start` needs whole, such as a map or a prior.
+        components: the estimate's components by name, each "linear" or an "angle".
+        truth: the topic with the truth of what is estimated.
+        measured: the components of the innovations, where `follow` tells of them.
+        start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
+            runs. A run has failed where its row in the first of them is not finite.
+        follow: follow(run, settings, messages, state, results) takes one run through a block of its
+            messages: it changes that run's rows of `state`, and fills `results`, in place.
+        compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
+    """
+
+    @cache
+    def loop() -> Callable[..., None]:
+        return compile_over_runs(follow) if compiled else partial(_over_runs, follow)
+
+    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+        outputs = _Outputs(name, _resolved(truth, prefix), components, measured or {})
+
+        def begin(given: dict[str, Ragged]) -> _Carried:
+            maps = {each: given[found[each].name] for each in whole}
+            settings, state = start(Given(values, found, maps))
+            return _Carried(settings, state, np.zeros(len(state[0]), bool))
+
+        def advance(carried: _Carried, block: Block) -> tuple[_Carried, list[Ragged]]:
+            settings, before, told = carried
+            state = type(before)(*(array.copy() for array in before))
+            messages = _messages(block)
+            results = outputs.blank(len(messages.time_ns))
+            loop()(len(told), settings, messages, state, results)
+            is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
+            failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
+            made = outputs.of_block(messages, results, np.flatnonzero(failing))
+            return _Carried(settings, state, told | failing), made
+
+        return Recursive(name, _topics(found, streams), _topics(found, whole), begin, advance)
+
+    return _estimator(summary, parameters, {**streams, **whole}, bind)
+
+
+def batch(
+    summary: str,
+    *,
+    parameters: type[ParametersType],
+    streams: Mapping[str, Schema],
+    whole: Mapping[str, Schema],
+    components: Components,
+    truth: str = "",
+    solve: Callable[[Mapping[str, Ragged], ParametersType], Solved],
+) -> Estimator[ParametersType]:
+    """An estimator that solves whole streams.
+
+    Args as for `recursive`, and:
+        solve: solve(given, parameters) gets the streams and whole topics of all runs, by the names
+            asked for; `each_run` makes it of a function of one run.
+    """
+
+    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+        outputs = _Outputs(name, _resolved(truth, prefix), components, {})
+
+        def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
+            return outputs.of_solved(solve({each: given[found[each].name] for each in found}, values))
+
+        return Batch(name, _topics(found, streams), _topics(found, whole), solve_all)
+
+    return _estimator(summary, parameters, {**streams, **whole}, bind)
+
+
+def each_run(
+    solve: Callable[[Mapping[str, Stream], ParametersType], Estimates],
+) -> Callable[[Mapping[str, Ragged], ParametersType], Solved]:
+    """Solve run by run, for `batch`.
+
+    Where `solve` raises BadInput or meets a singular matrix, that run has failed; where all do, it is
+    the input that is bad.
+    """
+
+    def solve_all(given: Mapping[str, Ragged], parameters: ParametersType) -> Solved:
+        solved: list[Estimates] = []
+        failures: dict[int, Failure] = {}
+        counts = [0]
+        for run in range(next(iter(given.values())).runs):
+            streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+            try:
+                solved.append(solve(streams, parameters))
+                counts.append(len(solved[-1].time_ns))
+            except (BadInput, np.linalg.LinAlgError) as error:
+                end_ns = max(stream.publish_time_ns.max(initial=0) for stream in streams.values())
+                failures[run] = Failure(int(end_ns), str(error))
+                counts.append(0)
+        if not solved:
+            raise BadInput(failures[0].reason)
+        return Solved(np.cumsum(counts), _joined(solved), failures)
+
+    return solve_all
+
+
+def _joined(parts: Sequence[Estimates]) -> Estimates:
+    solutions = [part.solution for part in parts if part.solution]
+    return Estimates(
+        np.concatenate([part.time_ns for part in parts]),
+        np.concatenate([part.mean for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        Solution(*map(np.concatenate, zip(*solutions, strict=True))) if solutions else None,
+    )
+
+
+def bindings(
+    topics: Mapping[str, Topic], asked: Mapping[str, Schema]
+) -> Iterator[tuple[str, dict[str, Topic]]]:
+    """Where a log has all the topics asked for, with their schemas: prefix, and topics as asked for.
+
+    A name with a slash in front, such as `/landmarks`, is a topic for all; others, such as `odometry`,
+    are looked for under every prefix: `/robot1/odometry`, `/robot2/odometry`.
+    """
+    own = [name for name in asked if not name.startswith("/")]
+    end = f"/{own[0]}" if own else ""
+    prefixes = [name.removesuffix(end) for name in topics if name.endswith(end)] if own else [""]
+    for prefix in prefixes:
+        found = {
+            name: topics[full]
+            for name, schema in asked.items()
+            if (full := _resolved(name, prefix)) in topics
+            and topics[full].schema_name == schema.full_name
+        }
+        if len(found) == len(asked):
+            yield prefix, found
+
+
+def _resolved(name: str, prefix: str) -> str:
+    return name if name.startswith("/") or not name else f"{prefix}/{name}"
+
+
+def _topics(found: Mapping[str, Topic], names: Mapping[str, Schema]) -> tuple[str, ...]:
+    return tuple(found[name].name for name in names)
+
+
+def _estimator(
+    summary: str,
+    parameters: type[ParametersType],
+    asked: Mapping[str, Schema],
+    bind_one: Callable[[str, str, Mapping[str, Topic], ParametersType], Bound],
+) -> Estimator[ParametersType]:
+    def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
+        return [
+            bind_one(f"{label}{prefix}", prefix, found, values)
+            for prefix, found in bindings(topics, asked)
+        ]
+
+    needs = [f"{_resolved(name, '...')} ({schema.full_name})" for name, schema in asked.items()]
+    return Estimator(summary, ", ".join(needs), parameters, bind)
+
+
+class _Carried(NamedTuple):
+    """What a recursion carries from block to block; `told` (runs,) says whose failure was told."""
+
+    settings: Any
+    state: Any
+    told: NDArray[np.bool_]
+
+
+def _over_runs(follow: Callable[..., None], runs: int, *arguments: Any) -> None:
+    """What `compile_over_runs` makes, in plain Python."""
+    for run in range(runs):
+        follow(run, *arguments)
+
+
+def _messages(block: Block) -> Messages:
+    """A block's messages, their fields as numbers."""
+    events = block.events
+    tables = [_numbers(ragged.stream) for ragged in block.streams.values()]
+    width = max(table.shape[1] for table in tables)
+    padded = [
+        np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan) for table in tables
+    ]
+    value = np.concatenate(padded)[events.source]
+    return Messages(events.offsets, events.time_ns, events.topic, value)
+
+
+def _numbers(stream: Stream) -> Floats:
+    """The fields after the sensor's clock, side by side."""
+    columns = [stream[entry.name] for entry in stream.schema if entry.name != "sensor_time_ns"]
+    wide = [column if column.ndim == 2 else column[:, None] for column in columns]
+    return np.concatenate(wide, axis=1, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """The output topics of one bound estimator: state, failures and, where told, innovations."""
+
+    name: str
+    truth: str
+    components: Components
+    measured: Components
+
+    def blank(self, rows: int) -> Results:
+        """Results that say nothing."""
+        d, m = len(self.components), len(self.measured)
+        return Results(
+            np.full((rows, d), np.nan),
+            np.full((rows, d, d), np.nan),
+            np.full((rows, m), np.nan),
+            np.full((rows, m, m), np.nan),
+            np.full(rows, np.nan),
+            np.ones(rows, np.int64),
+            np.zeros(rows, np.int64),
+        )
+
+    def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
+        """The outputs of one block; of several estimates at a stamp the last stands."""
+        said = np.isfinite(results.mean.sum(axis=1) + results.covariance.sum(axis=(1, 2)))
+        rows = np.flatnonzero(said)
+        run = np.searchsorted(messages.offsets, rows, side="right")
+        is_last = np.ones(len(rows), bool)
+        is_last[:-1] = (np.diff(messages.time_ns[rows]) != 0) | (np.diff(run) != 0)
+        rows = rows[is_last]
+        estimates = Estimates(messages.time_ns[rows], results.mean[rows], results.covariance[rows])
+        ends = np.empty(len(failing), np.int64)
+        for index, run_number in enumerate(failing):
+            begin, end = messages.offsets[run_number : run_number + 2]
+            last = np.flatnonzero(said[begin:end]).max(initial=-1)
+            ends[index] = min(begin + last + 1, end - 1)
+        failures = [Failure(int(messages.time_ns[row]), DIVERGED) for row in ends]
+        made = [
+            Ragged(self._state(estimates), np.searchsorted(rows, messages.offsets)),
+            Ragged(self._failure(failures, [DIVERGED]), np.searchsorted(ends, messages.offsets)),
+        ]
+        return [*made, self._innovations(messages, results)] if self.measured else made
+
+    def of_solved(self, solved: Solved) -> list[Ragged]:
+        """The outputs of a batch."""
+        offsets, estimates, failures = solved
+        failed = sorted(failures)
+        reasons = sorted({failure.reason for failure in failures.values()})
+        failure = self._failure([failures[run] for run in failed], reasons)
+        made = [
+            Ragged(self._state(estimates), offsets),
+            Ragged(failure, np.searchsorted(failed, np.arange(len(offsets)))),
+        ]
+        if estimates.solution:
+            columns = estimates.solution._asdict()
+            solution = self._stream("solution", schemas.SOLUTION, estimates.time_ns, {}, **columns)
+            made.append(Ragged(solution, offsets))
+        return made
+
+    def _state(self, estimates: Estimates) -> Stream:
+        mean = np.array(estimates.mean, dtype=float)
+        angular = [index for index, kind in enumerate(self.components.values()) if kind == "angle"]
+        mean[:, angular] = wrap_angle(mean[:, angular])
+        return self._stream(
+            "state",
+            schemas.GAUSSIAN_ESTIMATE,
+            estimates.time_ns,
+            _named(self.components),
+            mean=mean,
+            covariance=np.reshape(estimates.covariance, (len(mean), len(self.components) ** 2)),
+        )
+
+    def _failure(self, failures: Sequence[Failure], reasons: Sequence[str]) -> Stream:
+        return self._stream(
+            "failure",
+            schemas.FAILURE,
+            np.array([failure.time_ns for failure in failures], np.int64),
+            {"reasons": "; ".join(reasons)},
+            reason=[reasons.index(failure.reason) for failure in failures],
+        )
+
+    def _innovations(self, messages: Messages, results: Results) -> Ragged:
+        rows = np.flatnonzero(np.isfinite(results.squared))
+        stream = self._stream(
+            "innovation",
+            schemas.INNOVATION,
+            messages.time_ns[rows],
+            _named(self.measured),
+            target_id=results.target[rows],
+            accepted=results.accepted[rows],
+            innovation=results.innovation[rows],
+            covariance=results.innovation_covariance[rows].reshape(len(rows), len(self.measured) ** 2),
+            normalised_innovation_squared=results.squared[rows],
+        )
+        return Ragged(stream, np.searchsorted(rows, messages.offsets))
+
+    def _stream(
+        self, leaf: str, schema: Schema, time_ns: Integers, metadata: Mapping[str, str], **columns: Any
+    ) -> Stream:
+        return make_stream(
+            f"/estimates/{self.name}/{leaf}",
+            schema,
+            time_ns,
+            metadata={**metadata, "truth": self.truth},
+            **columns,
+        )
+
+
+def _named(components: Components) -> dict[str, str]:
+    return {"components": ",".join(components), "kinds": ",".join(components.values())}

@@ -1,0 +1,205 @@
+"""One step of the UKF and of the S2KF with 50 samples beside peers and beside C, in one run.
+
+The batch reactor: a sampled prediction and a linear update. Ours starts from columns in memory and ends
+with the output streams, everything included; the peers get ready-made arrays, samples of ours, and the
+same linear update in NumPy. Stone Soup takes no samples of one's own. All estimates agree to 1e-6. Needs
+the extra `bench`, and a C compiler. Run it with `make bench`, or `python -m tests.bench lrkf`.
+"""
+
+import ctypes
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from filterpy.kalman import UnscentedKalmanFilter
+from pyrecest.distributions import GaussianDistribution
+from pyrecest.filters import UnscentedKalmanFilter as PyRecEstFilter
+from stonesoup.base import Property
+from stonesoup.models.base import GaussianModel
+from stonesoup.models.measurement.linear import LinearGaussian
+from stonesoup.models.transition.base import TransitionModel
+from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+from stonesoup.types.detection import Detection
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.state import GaussianState
+from stonesoup.updater.kalman import KalmanUpdater
+
+from pipeline.ensemble import record_ensemble
+from recorders.models.reactor import react
+from replay.engine import bind, collect, replay
+from replay.sampling import Samples, parse_sampling
+
+STEP_S, PROCESS, PRESSURE = 0.1, 1e-5, 0.1
+H = np.array([[1.0, 1.0]])
+MEAN, COVARIANCE = np.array([0.5, 3.5]), 10 * np.eye(2)
+STEPS = 2000
+TOLERANCE = 1e-6
+SOURCE = """
+#include <math.h>
+void filter(int steps, const double *z, int count, const double *s, const double *w, double *out) {
+  double m[2] = {.5, 3.5}, P[4] = {10, 0, 0, 10}, v[count][2];
+  for (int k = 0; k < steps; k++) {
+    double a = sqrt(P[0]), b = P[2] / a, c = sqrt(P[3] - b * b), mm[2] = {0, 0};
+    for (int i = 0; i < count; i++) {
+      double x = m[0] + a * s[2 * i], y = m[1] + b * s[2 * i] + c * s[2 * i + 1], r = .1 * x * x;
+      v[i][0] = x - .32 * r; v[i][1] = y + .16 * r;
+      for (int j = 0; j < 2; j++) mm[j] += w[i] * v[i][j];
+    }
+    P[0] = P[3] = 1e-5; P[1] = 0;
+    for (int i = 0; i < count; i++) {
+      double d = v[i][0] - mm[0], e = v[i][1] - mm[1];
+      P[0] += w[i] * d * d; P[1] += w[i] * d * e; P[3] += w[i] * e * e;
+    }
+    double g = P[0] + P[1], h = P[1] + P[3], S = g + h + .1, n = z[k] - mm[0] - mm[1];
+    m[0] = out[2 * k] = mm[0] + g / S * n; m[1] = out[2 * k + 1] = mm[1] + h / S * n;
+    P[0] -= g * g / S; P[1] -= g * h / S; P[2] = P[1]; P[3] -= h * h / S;
+  }
+}
+"""
+
+
+def main() -> list[tuple[str, str, str, str]]:
+    """Rows of what was measured: our microseconds per step, theirs, and how many times ours that is."""
+    (log,) = record_ensemble("batch-reactor", {"steps": STEPS}, 1, 1)
+    many = record_ensemble("batch-reactor", {}, 1, 1000)
+    read = log.streams["/pressure"]["value"][:, 0]
+    rows = []
+    for name in ("ukf", "s2kf-50"):
+        samples = parse_sampling(name).at(2).draw(np.random.default_rng(), ())
+        peers = {"FilterPy": filterpy, "PyRecEst": pyrecest, "C, gcc -O3": compiled_c()}
+        if name == "ukf":
+            peers["Stone Soup"] = stonesoup
+        mine, wanted = timed(lambda name=name: ours(name, [log]), STEPS)
+        together, _ = timed(lambda name=name: ours(name, many), 1000 * 50)
+        for peer, run in peers.items():
+            theirs, found = timed(lambda run=run, samples=samples: run(read, samples), STEPS)
+            apart = np.max(np.abs(found - wanted))
+            assert apart < TOLERANCE, f"{peer}'s {name} and ours are {apart} apart"
+            rows.append(row(f"{name}, one log; {peer}", mine, theirs))
+            rows.append(row(f"{name}, 1000 runs; {peer}, one", together, theirs))
+    return rows
+
+
+def row(name: str, mine: float, theirs: float) -> tuple[str, str, str, str]:
+    return name, f"{mine:.3g} us", f"{theirs:.3g} us", f"{theirs / mine:.2g}"
+
+
+def timed(action: Callable[[], np.ndarray], steps: int, repeats: int = 5) -> tuple[float, np.ndarray]:
+    """The least microseconds per step, and the result; the first call compiles."""
+    result, taken = action(), []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        action()
+        taken.append(time.perf_counter() - begin)
+    return min(taken) / steps * 1e6, result
+
+
+def ours(name: str, sources: list) -> np.ndarray:
+    estimator = f"lrkf:{name}"
+    outputs = collect(replay(sources, bind(estimator, sources, {})))
+    return outputs[f"/estimates/{estimator}/state"]["mean"]
+
+
+def moved(state: np.ndarray, _: float) -> np.ndarray:
+    return np.array(react(state, STEP_S))
+
+
+def linear_update(mean: np.ndarray, covariance: np.ndarray, read: float) -> tuple:
+    gain = covariance @ H.T / (H @ covariance @ H.T + PRESSURE)
+    return mean + gain[:, 0] * (read - mean.sum()), covariance - gain @ H @ covariance
+
+
+def sigma_points(samples: Samples) -> SimpleNamespace:
+    """Our samples, as FilterPy and what PyRecEst is built on take them."""
+    points, weights = samples
+    return SimpleNamespace(
+        num_sigmas=lambda: len(weights),
+        sigma_points=lambda mean, covariance: mean + points @ np.linalg.cholesky(covariance).T,
+        Wm=weights,
+        Wc=weights,
+        n=2,
+    )
+
+
+def filterpy(read: np.ndarray, samples: Samples) -> np.ndarray:
+    ukf = UnscentedKalmanFilter(2, 1, STEP_S, None, moved, sigma_points(samples))
+    ukf.x, ukf.P, ukf.Q = MEAN.copy(), COVARIANCE.copy(), PROCESS * np.eye(2)
+    found = []
+    for each in read:
+        ukf.predict()
+        ukf.x, ukf.P = linear_update(ukf.x, ukf.P, each)
+        found.append(ukf.x)
+    return np.array(found)
+
+
+def pyrecest(read: np.ndarray, samples: Samples) -> np.ndarray:
+    start = GaussianDistribution(MEAN, COVARIANCE)
+    ukf = PyRecEstFilter(start, STEP_S, moved, points=sigma_points(samples), dim_z=1)
+    inner, found = ukf._filter_state, []
+    for each in read:
+        ukf.predict_nonlinear(moved, PROCESS * np.eye(2), STEP_S)
+        inner.x, inner.P = linear_update(inner.x, inner.P, each)
+        found.append(inner.x)
+    return np.array(found)
+
+
+class Reaction(TransitionModel, GaussianModel):
+    """The reactor in Stone Soup's terms."""
+
+    ndim_state: int = Property(default=2)
+
+    def covar(self, **_):
+        """Of the noise."""
+        return PROCESS * np.eye(2)
+
+    def function(self, state, noise=False, **_):
+        """One step; Stone Soup asks for one without noise."""
+        del noise
+        return np.array(react(state.state_vector, STEP_S)).reshape(2, -1).view(type(state.state_vector))
+
+
+def stonesoup(read: np.ndarray, _: Samples) -> np.ndarray:
+    predictor = UnscentedKalmanPredictor(Reaction(), alpha=1.0, beta=0.0, kappa=0.5)
+    model = LinearGaussian(2, [0], np.array([[PRESSURE]]))
+    model.matrix = lambda **_: H
+    updater = KalmanUpdater(model)
+    at, found = datetime(2026, 1, 1), []
+    state = GaussianState(MEAN[:, None], COVARIANCE, timestamp=at)
+    for each in read:
+        at += timedelta(seconds=STEP_S)
+        prediction = predictor.predict(state, timestamp=at)
+        detection = Detection(np.array([[each]]), timestamp=at, measurement_model=model)
+        state = updater.update(SingleHypothesis(prediction, detection))
+        found.append(np.asarray(state.state_vector, float)[:, 0])
+    return np.array(found)
+
+
+def compiled_c() -> Callable[[np.ndarray, Samples], np.ndarray]:
+    """A loop written for this one system, as fast as a C compiler makes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, library = Path(folder) / "filter.c", Path(folder) / "filter.so"
+        source.write_text(SOURCE)
+        command = ["cc", "-O3", "-march=native", "-shared", "-fPIC", str(source), "-o", str(library)]
+        subprocess.run([*command, "-lm"], check=True)
+        function = ctypes.CDLL(str(library)).filter
+    array = np.ctypeslib.ndpointer(np.float64, flags="C")
+    function.argtypes = [ctypes.c_int, array, ctypes.c_int, array, array, array]
+
+    def run(read: np.ndarray, samples: Samples) -> np.ndarray:
+        out = np.empty((len(read), 2))
+        function(
+            len(read), np.ascontiguousarray(read), len(samples.weights), *map(np.array, samples), out
+        )
+        return out
+
+    return run
+
+
+if __name__ == "__main__":
+    for each in main():
+        print("{:36} {:>10} {:>10} {:>8}".format(*each))

@@ -1,0 +1,155 @@
+"""The inertial filter on a simulated body: bias, motion, gaps, and the contract."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.models.orientation import axis_angle_between
+from replay.estimators.inertial import (
+    InertialModel,
+    InertialSamples,
+    OrientationEstimates,
+    run_inertial_filter,
+    start_inertial_filter,
+)
+
+RATE_HZ = 100.0
+REST_S = 5.0
+MODEL = InertialModel(rest_s=REST_S)
+GRAVITY = np.array([0.0, 0.0, 9.81])
+FIELD = np.array([0.0, 16.0, -41.0])
+
+
+def simulate(seconds: float, seed: int, bias: float = 0.02) -> tuple[np.ndarray, InertialSamples]:
+    """A body that rests, then tumbles: truth (rows, 4) and its samples, with noise and bias."""
+    generator = np.random.default_rng(seed)
+    time_s = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    phase = generator.uniform(0.0, 2.0 * np.pi, (3, 1))
+    rate = 1.5 * np.sin(np.array([[0.9], [1.3], [0.7]]) * time_s + phase).T
+    rate[time_s < REST_S] = 0.0
+    attitude = Rotation.random(rng=generator)
+    truth = []
+    for turn in Rotation.from_rotvec(rate / RATE_HZ):
+        attitude = attitude * turn
+        truth.append(attitude)
+    world = Rotation.concatenate(truth)
+    noise = generator.standard_normal((3, len(time_s), 3))
+    push = 2.0 * np.sin(np.array([3.0, 5.0, 4.0]) * time_s[:, None])
+    samples = InertialSamples(
+        np.array([0, len(time_s)]),
+        (1e9 * time_s).astype(np.int64) + 10**18,
+        rate + bias + 0.01 * noise[0],
+        world.inv().apply(GRAVITY + push) + 0.1 * noise[1],
+        world.inv().apply(FIELD) + 0.5 * noise[2],
+    )
+    return world.as_quat(scalar_first=True), samples
+
+
+def join(*runs: InertialSamples) -> InertialSamples:
+    offsets = np.cumsum([0, *(len(each.time_ns) for each in runs)])
+    return InertialSamples(
+        offsets, *(np.concatenate(parts) for parts in zip(*(r[1:] for r in runs), strict=True))
+    )
+
+
+def cut(samples: InertialSamples, rows: slice) -> InertialSamples:
+    parts = [part[rows] for part in samples[1:]]
+    return InertialSamples(np.array([0, len(parts[0])]), *parts)
+
+
+def error_deg(truth: np.ndarray, estimates: OrientationEstimates) -> np.ndarray:
+    return 2.0 * np.degrees(axis_angle_between(truth, estimates.orientation))
+
+
+def test_orientation_is_found_and_kept():
+    """Without the bias of the rest, 60 s of tumbling would drift by 69 degrees."""
+    truth, samples = simulate(60.0, 0)
+    _, estimates = run_inertial_filter(MODEL, start_inertial_filter(1), samples)
+    error = error_deg(truth, estimates)
+    assert np.isnan(error[: int(RATE_HZ)]).all(), "unknown until the first second is over"
+    known = error[int(REST_S * RATE_HZ) :]
+    assert np.sqrt((known**2).mean()) < 2.0
+    assert known.max() < 5.0
+
+
+def test_covariance_covers_the_error():
+    """Squared errors over what the filter expects: below 1, as ten degrees per block is cautious."""
+    truth, samples = simulate(60.0, 1)
+    _, estimates = run_inertial_filter(MODEL, start_inertial_filter(1), samples)
+    rows = slice(int(REST_S * RATE_HZ), None)
+    expected = np.trace(estimates.covariance[rows], axis1=1, axis2=2)
+    found = np.radians(error_deg(truth, estimates)[rows]) ** 2
+    assert 0.01 < found.mean() / expected.mean() < 1.0
+    assert np.linalg.eigvalsh(estimates.covariance[rows]).min() > 0.0
+
+
+def test_single_block_is_the_attitude_of_its_averages():
+    """At rest: up along the mean force, north along the mean field, to the noise of a second."""
+    _, samples = simulate(1.5, 2, bias=0.0)
+    _, estimates = run_inertial_filter(InertialModel(rest_s=1.5), start_inertial_filter(1), samples)
+    first = int(RATE_HZ)
+    assert np.isnan(estimates.orientation[first - 1, 0])
+    mean_force = samples.force[: first + 1].mean(axis=0)
+    seen = Rotation.from_quat(estimates.orientation[first], scalar_first=True)
+    np.testing.assert_allclose(
+        seen.apply(mean_force), [0.0, 0.0, np.linalg.norm(mean_force)], atol=1e-12
+    )
+    assert seen.apply(samples.field[: first + 1].mean(axis=0))[0] == pytest.approx(0.0, abs=1e-12)
+    # concentration -2 / sigma^2 of one block: the standard deviation of the attitude
+    sigma = np.sqrt(np.diagonal(estimates.covariance[first]))
+    np.testing.assert_allclose(sigma, MODEL.attitude_sigma_rad, rtol=0.01)
+
+
+def test_a_gap_makes_the_orientation_unknown_until_the_next_block():
+    truth, samples = simulate(30.0, 3)
+    rows = np.r_[0:2000, 2300:3000]
+    held = InertialSamples(np.array([0, len(rows)]), *(part[rows] for part in samples[1:]))
+    _, estimates = run_inertial_filter(MODEL, start_inertial_filter(1), held)
+    error = error_deg(truth[rows], estimates)
+    assert np.isfinite(error[1999])
+    assert np.isnan(error[2000:2099]).all()
+    # one second in motion gives the first attitude, the following ones mend it
+    assert error[2110:].max() < 30.0
+    assert error[2500:].max() < 5.0
+
+
+def test_samples_that_are_not_finite_are_passed_over():
+    truth, samples = simulate(20.0, 4)
+    force = samples.force.copy()
+    force[1000:1005] = np.nan
+    _, estimates = run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(force=force))
+    error = error_deg(truth, estimates)
+    assert np.isnan(error[1000:1005]).all()
+    assert error[1005:].max() < 5.0
+
+
+def test_a_field_along_gravity_gives_no_attitude():
+    """There is no north in it: the filter dead-reckons on."""
+    _, samples = simulate(10.0, 5)
+    field = samples.field.copy()
+    field[600:] = samples.force[600:]
+    _, estimates = run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(field=field))
+    assert np.isfinite(estimates.orientation[200:]).all()
+
+
+def test_ensemble_equals_single_runs_and_blocks_equal_the_whole():
+    """Bit for bit, cut anywhere: the replay's contract."""
+    runs = [simulate(12.0, seed)[1] for seed in (6, 7)]
+    ends, whole = run_inertial_filter(MODEL, start_inertial_filter(2), join(*runs))
+    for index, samples in enumerate(runs):
+        state, early = run_inertial_filter(MODEL, start_inertial_filter(1), cut(samples, slice(0, 777)))
+        state, late = run_inertial_filter(MODEL, state, cut(samples, slice(777, None)))
+        rows = slice(index * 1200, (index + 1) * 1200)
+        for part, before, after in zip(whole, early, late, strict=True):
+            assert np.array_equal(part[rows], np.concatenate([before, after]), equal_nan=True)
+        for end, at_end in zip(ends, state, strict=True):
+            assert np.array_equal(end[index], at_end[0])
+
+
+def test_bad_input_is_told():
+    _, samples = simulate(1.0, 8)
+    with pytest.raises(BadInput, match="must be positive"):
+        run_inertial_filter(InertialModel(block_s=0.0), start_inertial_filter(1), samples)
+    with pytest.raises(BadInput, match="give a time"):
+        run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(rate=samples.rate[:-1]))

@@ -1,0 +1,296 @@
+"""The wrapped normal on the torus: identities, figure 3 of the paper, products against a grid."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recorders.errors import BadInput
+from recorders.models.headings import turn_together
+from recorders.models.planar import wrap_angle
+from replay.distributions import wrapped_normal, wrapped_normal_kernels
+from replay.distributions.wrapped_normal import (
+    CircularMoments,
+    Samples,
+    WrappedNormal,
+    make_wrapped_normal,
+)
+from replay.estimators.grid import torus_grid
+
+SIGMA = np.array([0.8, 1.3])
+RHOS = np.linspace(-0.9, 0.9, 19)
+
+
+def covariance(rho: float, sigma: np.ndarray = SIGMA) -> np.ndarray:
+    return np.outer(sigma, sigma) * np.array([[1.0, rho], [rho, 1.0]])
+
+
+def spreads(lowest: float, highest: float):
+    """Wrapped normals anywhere, with variances between powers of ten and any correlation."""
+    power = st.floats(lowest, highest)
+
+    def build(powers, rho, mean):
+        return make_wrapped_normal(mean, covariance(rho, 10.0 ** (0.5 * np.array(powers))))
+
+    return st.builds(
+        build, st.tuples(power, power), st.floats(-0.99, 0.99), st.tuples(*[st.floats(-3, 3)] * 2)
+    )
+
+
+@settings(deadline=None)
+@given(spreads(-6.0, 1.5), st.floats(0.0, 0.45))
+def test_five_samples_have_the_moments_of_the_distribution(distribution, central_weight):
+    """m_1 and r_c to 1e-12 for every w5; variances of 1e-6 keep their digits too."""
+    moments = wrapped_normal.circular_moments(distribution)
+    samples = wrapped_normal.five_samples(moments, central_weight)
+    assert samples.weights.sum() == pytest.approx(1.0, abs=1e-15)
+    assert samples.weights.min() >= 0.0
+    first = (samples.weights[:, None] * np.exp(1j * samples.positions)).sum(axis=0)
+    expected = wrapped_normal.trigonometric_moments(distribution, 1)
+    np.testing.assert_allclose(first, expected, atol=1e-12)
+    found = wrapped_normal.sample_moments(samples)
+    assert found.correlation == pytest.approx(float(moments.correlation), abs=1e-12)
+    inside = moments.variance < 20.0  # beyond, |m| < 5e-5 and its logarithm loses digits
+    np.testing.assert_allclose(found.variance[inside], moments.variance[inside], rtol=1e-9)
+
+
+@settings(deadline=None)
+@given(spreads(-6.0, 1.0))
+def test_fit_by_moments_returns_the_distribution(distribution):
+    fitted = wrapped_normal.fit_moments(wrapped_normal.circular_moments(distribution))
+    scale = np.sqrt(np.prod(np.diagonal(distribution.covariance)))
+    np.testing.assert_allclose(
+        fitted.covariance, distribution.covariance, rtol=1e-12, atol=1e-12 * scale
+    )
+    np.testing.assert_allclose(fitted.mean, distribution.mean)
+
+
+@settings(deadline=None)
+@given(spreads(-6.0, 3.0), st.integers(1, 4))
+def test_moments_and_correlation_are_those_of_the_density(distribution, order):
+    """Closed forms against the closed form of every trigonometric moment, without overflow."""
+    c = distribution.covariance
+    exact = np.exp(-0.5 * order**2 * np.diagonal(c) + 1j * order * distribution.mean)
+    np.testing.assert_allclose(wrapped_normal.trigonometric_moments(distribution, order), exact)
+    found = wrapped_normal.circular_moments(distribution).correlation
+    assert abs(found) <= 1.0
+    if c.max() < 300.0:
+        expected = np.sinh(c[0, 1]) / np.sqrt(np.sinh(c[0, 0]) * np.sinh(c[1, 1]))
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-13)
+
+
+def test_known_samples():
+    distribution = make_wrapped_normal([0.0, 0.0], covariance(0.5))
+    moments = wrapped_normal.circular_moments(distribution)
+    samples = wrapped_normal.five_samples(moments)
+    np.testing.assert_allclose(samples.positions[1], [0.853053, 1.279758], atol=6e-7)
+    np.testing.assert_allclose(samples.weights, [0.281241] * 2 + [0.118759] * 2 + [0.2], atol=6e-7)
+    assert moments.correlation == pytest.approx(0.406204, abs=6e-7)
+
+
+def test_mixed_mle_is_no_inverse_of_the_samples():
+    """The sheet: rho .5 -> .461 and .9 -> .832 without any motion."""
+    for rho, expected in ((0.5, 0.461), (0.9, 0.832)):
+        distribution = make_wrapped_normal([1.0, -3.0], covariance(rho))
+        samples = wrapped_normal.five_samples(wrapped_normal.circular_moments(distribution))
+        fitted = wrapped_normal.fit_mixed_mle(samples).covariance
+        assert fitted[0, 1] / SIGMA.prod() == pytest.approx(expected, abs=6e-4)
+        np.testing.assert_allclose(np.diagonal(fitted), SIGMA**2, rtol=1e-12)
+
+
+def test_mixed_mle_approaches_the_truth_with_many_samples():
+    """Random samples, unlike the five, are of the density itself."""
+    distribution = make_wrapped_normal([0.5, 2.0], covariance(-0.6))
+    drawn = wrapped_normal.sample(distribution, 4000, np.random.default_rng(0))
+    fitted = wrapped_normal.fit_mixed_mle(Samples(drawn, np.full(4000, 1.0 / 4000)))
+    np.testing.assert_allclose(fitted.covariance, distribution.covariance, atol=0.15)
+    np.testing.assert_allclose(fitted.mean, distribution.mean, atol=0.1)
+
+
+def moved(samples: Samples, coupling: float) -> Samples:
+    x = samples.positions
+    positions = np.stack(turn_together(x[..., 0], x[..., 1], coupling, 0.0, 0.0), axis=-1)
+    return Samples(positions, samples.weights)
+
+
+def figure_3(coupling: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Errors of mu and C over RHOS: five samples and UKF samples, refitted by mixed maximum likelihood.
+
+    Truth is the population value, from 40 x 40 Gauss-Hermite nodes in place of 10,000 samples.
+    """
+    root = np.linalg.cholesky(np.stack([covariance(rho) for rho in RHOS]))
+    x, w = np.polynomial.hermite_e.hermegauss(40)
+    nodes = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    weights = np.outer(w, w).ravel() / w.sum() ** 2
+    kept = weights > 1e-14
+
+    def samples(points: np.ndarray, each: np.ndarray) -> Samples:
+        positions = points @ np.swapaxes(root, -1, -2)
+        return Samples(positions, np.broadcast_to(each, positions.shape[:-1]))
+
+    truth = wrapped_normal.fit_mixed_mle(moved(samples(nodes[kept], weights[kept]), coupling))
+    distributions = WrappedNormal(np.zeros((len(RHOS), 2)), root @ np.swapaxes(root, -1, -2))
+    moments = wrapped_normal.circular_moments(distributions)
+    five, heavy = (wrapped_normal.five_samples(moments, weight) for weight in (0.2, 0.45))
+    star = np.sqrt(2.5) * np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+    several = WrappedNormal(*(np.stack([part] * MC_RUNS) for part in distributions))
+    drawn = wrapped_normal.sample(several, 50, np.random.default_rng(0))
+    random = Samples(drawn, np.full(drawn.shape[:-1], 0.02))
+
+    def errors(found: WrappedNormal) -> tuple[np.ndarray, np.ndarray]:
+        mean = np.abs(wrap_angle(found.mean - truth.mean)).mean(axis=-1)
+        spread = np.abs(found.covariance - truth.covariance).mean(axis=(-1, -2))
+        return mean, spread
+
+    fits = {"five": five, "heavy": heavy, "ukf": samples(star, np.full(5, 0.2)), "random": random}
+    return {
+        name: errors(wrapped_normal.fit_mixed_mle(moved(each, coupling))) for name, each in fits.items()
+    }
+
+
+MC_RUNS = 12
+# the sheet's rows: rho, then by c the errors of mu and C of the five samples, and of the UKF's
+FIGURE_3 = {
+    -0.9: {
+        0.1: ".0074 .0588 .0027 .1736",
+        0.5: ".0383 .1111 .0133 .1115",
+        1.0: ".0836 .1449 .0260 .0562",
+    },
+    -0.6: {
+        0.1: ".0016 .0458 .0112 .2211",
+        0.5: ".0102 .1265 .0584 .0929",
+        1.0: ".0332 .1810 .1324 .0512",
+    },
+    0.0: {
+        0.1: ".0027 .0143 .0122 .0254",
+        0.5: ".0111 .0513 .0638 .0807",
+        1.0: ".0074 .1228 .1475 .2962",
+    },
+    0.3: {0.1: ".0016 .0065 .0124 .1197", 0.5: ".0059 .0533 .0646 .2968", 1.0: ".0027 .1508 .1470 1.09"},
+    0.9: {0.1: ".0074 .0400 .0027 .2135", 0.5: ".0383 .2531 .0133 .3102", 1.0: "1.654 1.92 .026 .304"},
+}
+
+
+@pytest.mark.parametrize(
+    ("coupling", "random", "wins"),
+    [
+        (0.1, (0.141, 0.175), 19),
+        (0.2, None, 17),
+        (0.5, (0.154, 0.206), 12),
+        (1.0, (0.200, 0.300), 11),
+    ],
+)
+def test_figure_3(coupling, random, wins):
+    """The sheet's cells, its Monte Carlo means, and how often the five samples win C against the UKF."""
+    found = figure_3(coupling)
+    for rho, rows in FIGURE_3.items():
+        column = int(np.argmin(np.abs(RHOS - rho)))
+        cells = [found[name][part][column] for name in ("five", "ukf") for part in (0, 1)]
+        if coupling in rows:
+            expected = np.array(rows[coupling].split(), float)
+            np.testing.assert_allclose(cells, expected, atol=3e-3 if coupling == 1.0 else 1e-3)
+    if random:
+        means = [found["random"][part].mean() for part in (0, 1)]
+        np.testing.assert_allclose(means, random, rtol=0.1)
+    assert (found["five"][1] < found["ukf"][1]).sum() == wins
+    at_the_ends = found["five"][0][[0, -1]] > found["ukf"][0][[0, -1]]
+    assert at_the_ends.all(), "the sheet: the mean loses against the UKF at |rho| = .9"
+    # w5 = .45 keeps C better at every c (.4 does not at c = .1), at a price in mu up to c = .5
+    assert found["heavy"][1].mean() < found["five"][1].mean()
+    assert (found["heavy"][0].mean() > found["five"][0].mean()) == (coupling <= 0.5)
+    for own, drawn in zip(found["five"], found["random"], strict=True):
+        mean, error = drawn.mean(axis=0), drawn.std(axis=0) / np.sqrt(MC_RUNS)
+        if coupling <= 0.5:
+            assert (own < mean + 2.0 * error).all(), "wins against 50 random samples everywhere"
+
+
+def test_density_is_normalised_and_has_its_moments():
+    """On both sides of the switch from wrapped to Fourier sums."""
+    grid = torus_grid(256)
+    cell = (2.0 * np.pi / 256) ** 2
+    for scale in (0.05, 0.5, 1.0, 3.0, 30.0, 1e6):
+        distribution = make_wrapped_normal([0.3, -2.0], scale * covariance(0.7))
+        density = wrapped_normal.density(distribution, grid)
+        assert density.sum() * cell == pytest.approx(1.0, abs=1e-12)
+        moments = (density[..., None] * np.exp(1j * grid)).sum(axis=(0, 1)) * cell
+        expected = wrapped_normal.trigonometric_moments(distribution, 1)
+        np.testing.assert_allclose(moments, expected, atol=1e-12)
+
+
+def test_density_is_finite_where_it_is_narrow():
+    narrow = make_wrapped_normal([3.1, 0.0], 1e-6 * np.eye(2))
+    x = np.array([[3.1, 0.0], [3.1 - 2.0 * np.pi, 2.0 * np.pi], [0.0, 0.0]])
+    expected = [1e6 / (2.0 * np.pi)] * 2 + [0.0]
+    np.testing.assert_allclose(wrapped_normal.density(narrow, x), expected, rtol=1e-9)
+
+
+@settings(deadline=None, max_examples=15)
+@given(spreads(-1.5, 1.0), spreads(-1.5, 1.0))
+def test_product_is_that_of_the_densities(first, second):
+    """Everywhere on a grid to 1e-12 of the peak; and the refit has the moments of this mixture."""
+    grid = torus_grid(64)
+    expected = wrapped_normal.density(first, grid) * wrapped_normal.density(second, grid)
+    expected /= expected.sum()
+    mixture = wrapped_normal.product_mixture(first, second)
+    density = sum(
+        weight * wrapped_normal.density(WrappedNormal(mean, mixture.covariance), grid)
+        for mean, weight in zip(mixture.mean, mixture.weights, strict=True)
+        if weight > 1e-17
+    )
+    np.testing.assert_allclose(density / density.sum(), expected, atol=1e-12 * expected.max())
+    refitted = wrapped_normal.product(first, second)
+    found = wrapped_normal.trigonometric_moments(refitted, 1)
+    moments = mixture.weights @ np.exp(1j * mixture.mean - 0.5 * np.diagonal(mixture.covariance))
+    np.testing.assert_allclose(found, moments, atol=1e-12)
+    assert np.linalg.eigvalsh(refitted.covariance)[0] > 0.0
+
+
+def test_product_with_a_uniform_density_changes_nothing():
+    known = make_wrapped_normal([1.0, 2.0], [[1e-6, 1e-5], [1e-5, 1e-2]])
+    uniform = make_wrapped_normal([0.0, 0.0], 1e6 * np.eye(2))
+    for pair in ((known, uniform), (uniform, known)):
+        found = wrapped_normal.product(*pair)
+        np.testing.assert_allclose(found.mean, known.mean, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance, known.covariance, rtol=1e-9)
+
+
+def test_a_mean_that_vanishes_is_uniform():
+    """Four samples around the circle have no direction: the variance that stands for uniform."""
+    around = np.stack([np.arange(4) * np.pi / 2.0, np.array([0.0, 0.1, 0.0, -0.1])], axis=-1)
+    moments = wrapped_normal.sample_moments(Samples(around, np.full(4, 0.25)))
+    assert 70.0 < moments.variance[0] <= wrapped_normal_kernels.UNIFORM
+
+
+def test_convolution_adds():
+    first = make_wrapped_normal([3.0, -3.0], covariance(0.5))
+    second = make_wrapped_normal([1.0, -1.0], covariance(-0.2))
+    both = wrapped_normal.convolve(first, second)
+    products = [
+        np.prod([wrapped_normal.trigonometric_moments(each, n) for each in (first, second)], axis=0)
+        for n in (1, 2)
+    ]
+    for n, expected in enumerate(products, 1):
+        np.testing.assert_allclose(wrapped_normal.trigonometric_moments(both, n), expected, atol=1e-14)
+
+
+def moments_of(variance: list[float], correlation: float) -> CircularMoments:
+    return CircularMoments(np.zeros(2), np.array(variance), np.array(correlation))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: make_wrapped_normal([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]), "positive definite"),
+        (lambda: make_wrapped_normal([0.0, 0.0], [[1.0, 0.5], [0.4, 1.0]]), "symmetric"),
+        (lambda: make_wrapped_normal([np.nan, 0.0], np.eye(2)), "finite"),
+        (lambda: make_wrapped_normal([0.0, 0.0, 0.0], np.eye(3)), "give"),
+        (lambda: wrapped_normal.five_samples(moments_of([1.0, 1.0], 0.1), 0.6), "central weight"),
+        (lambda: wrapped_normal.five_samples(moments_of([1.0, 1.0], 1.1)), "circular correlation"),
+        (lambda: wrapped_normal.fit_moments(moments_of([0.0, 1.0], 0.1)), "not in"),
+        (lambda: wrapped_normal.fit_moments(moments_of([np.inf, 1.0], 0.1)), "not in"),
+        (lambda: wrapped_normal.fit_moments(moments_of([0.5, 3.0], 0.9)), "fit_mixed_mle"),
+    ],
+)
+def test_bad_input_is_told(make, message):
+    with pytest.raises(BadInput, match=message):
+        make()
