@@ -156,7 +156,7 @@ def optimised(fill_slope: Function, power: float, tolerance: float, iterations: 
     ) -> float:
         gap = np.inf
         size = len(mean)
-        slope = np.empty((size, size))
+        slope, better = np.empty((size, size)), np.empty(count)
         for i in range(count):
             weights[i] = 1.0 / count
         for _ in range(iterations):
@@ -164,20 +164,18 @@ def optimised(fill_slope: Function, power: float, tolerance: float, iterations: 
                 return np.inf
             fill_slope(covariance, slope)
             total, gap = 0.0, -np.inf
-            before = weights[:count].copy()
             for i in range(count):
                 gain = 0.0
                 for row in range(size):
                     for k in range(size):
                         gain += information[i, row, k] * slope[row, k]
                 gap = max(gap, gain - 1.0)
-                weights[i] *= gain**power
-                total += weights[i]
+                better[i] = weights[i] * gain**power
+                total += better[i]
             if gap <= tolerance:
-                weights[:count] = before
                 break
             for i in range(count):
-                weights[i] /= total
+                weights[i] = better[i] / total
         return gap if combined(count, weights, information, means, mean, covariance) else np.inf
 
     return weigh

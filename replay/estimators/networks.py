@@ -105,7 +105,7 @@ def observe(
     `independent` is the part of the covariance that stems from measurements since it was zero.
     """
     size = len(mean)
-    gain = np.empty(size)
+    gain, crossed = np.empty(size), np.empty(size)
     for seen in range(size):
         if np.isnan(value[seen]):
             continue
@@ -113,8 +113,9 @@ def observe(
         error = value[seen] - mean[seen]
         for row in range(size):
             gain[row] = covariance[row, seen] / spread
-        crossed = independent[seen].copy()
         at = independent[seen, seen]
+        for row in range(size):
+            crossed[row] = independent[seen, row]
         for row in range(size):
             mean[row] += gain[row] * error
             for column in range(size):
@@ -129,7 +130,15 @@ def observe(
                 covariance[column, row] = covariance[row, column]
 
 
-def network(fuse: Function, own_first: bool) -> Function:
+def assign(mean: Floats, covariance: Floats, new_mean: Floats, new_covariance: Floats) -> None:
+    """Fill the first two from the others; loops, since slices are very slow to compile."""
+    for row in range(len(mean)):
+        mean[row] = new_mean[row]
+        for column in range(len(mean)):
+            covariance[row, column] = new_covariance[row, column]
+
+
+def network(fuse: Function) -> Function:
     """The loop over the activities of one run; `own_first` fuses the own x*, not the prediction."""
 
     def follow(
@@ -139,6 +148,7 @@ def network(fuse: Function, own_first: bool) -> Function:
         prior_mean: Floats,
         prior_covariance: Floats,
         prior_ns: Integers,
+        own_first: bool,
         results: Results,
         failed_ns: Integers,
     ) -> None:
@@ -146,8 +156,7 @@ def network(fuse: Function, own_first: bool) -> Function:
         mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
         time_ns = np.empty(nodes, np.int64)
         for node in range(nodes):
-            mean[node] = prior_mean[run]
-            covariance[node] = prior_covariance[run]
+            assign(mean[node], covariance[node], prior_mean[run], prior_covariance[run])
             time_ns[node] = prior_ns[run]
         begin, last = activities.offsets[run], activities.offsets[run + 1]
         most = 1
@@ -164,13 +173,12 @@ def network(fuse: Function, own_first: bool) -> Function:
                     span_s = (now - time_ns[node]) * 1e-9
                     move(mean[node], covariance[node], sensing.density[node], span_s)
                     time_ns[node] = now
-                results.sent_mean[end] = mean[node]
-                results.sent_covariance[end] = covariance[node]
-                results.sent_independent[end] = 0.0
+                sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
+                assign(sent_mean, sent_covariance, mean[node], covariance[node])
                 for k in range(activities.measured[end], activities.measured[end + 1]):
                     observe(
-                        results.sent_mean[end],
-                        results.sent_covariance[end],
+                        sent_mean,
+                        sent_covariance,
                         results.sent_independent[end],
                         sensing.value[k],
                         sensing.variance[sensing.sensor[k]],
@@ -181,23 +189,26 @@ def network(fuse: Function, own_first: bool) -> Function:
                 first = activities.received[activity]
                 count = 1 + activities.received[activity + 1] - first
                 if count > 1:
-                    if own_first:
-                        means[0] = results.sent_mean[activity]
-                        covariances[0] = results.sent_covariance[activity]
-                    else:
-                        means[0] = mean[node]
-                        covariances[0] = covariance[node]
-                    independents[0] = 0.0
-                    for i in range(1, count):
-                        source = activities.message[first + i - 1]
-                        means[i] = results.sent_mean[source]
-                        covariances[i] = results.sent_covariance[source]
-                        independents[i] = results.sent_independent[source]
+                    for i in range(count):
+                        source = activities.message[first + i - 1] if i > 0 else activity
+                        if i > 0 or own_first:
+                            its_mean, its_covariance = (
+                                results.sent_mean[source],
+                                results.sent_covariance[source],
+                            )
+                        else:
+                            its_mean, its_covariance = mean[node], covariance[node]
+                        assign(means[i], covariances[i], its_mean, its_covariance)
                         late_s = (now - activities.time_ns[source]) * 1e-9
+                        # what was new in a late one others may have passed on
+                        new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
+                        for row in range(size):
+                            for column in range(size):
+                                independents[i, row, column] = (
+                                    new * results.sent_independent[source, row, column]
+                                )
                         if late_s > 0.0:
-                            # others may have passed on what was new in it
                             move(means[i], covariances[i], sensing.density[node], late_s)
-                            independents[i] = 0.0
                     gap = fuse(
                         count, means, covariances, independents, weights, mean[node], covariance[node]
                     )
@@ -212,8 +223,9 @@ def network(fuse: Function, own_first: bool) -> Function:
                         sensing.value[k],
                         sensing.variance[sensing.sensor[k]],
                     )
-                results.mean[activity] = mean[node]
-                results.covariance[activity] = covariance[node]
+                assign(
+                    results.mean[activity], results.covariance[activity], mean[node], covariance[node]
+                )
             begin = end
 
     return follow
@@ -222,7 +234,7 @@ def network(fuse: Function, own_first: bool) -> Function:
 @lru_cache(maxsize=16)
 def _compiled(name: str, tolerance: float) -> Function:
     fused_by = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
-    return compile_over_runs(network(rule(fused_by, tolerance), name == TRAP))
+    return compile_over_runs(network(rule(fused_by, tolerance)))
 
 
 def message_bytes(name: str, states: int) -> int:
@@ -258,10 +270,18 @@ def solve(
     count = len(activities.node)
     blank = np.full((count, size), np.nan)
     square = np.full((count, size, size), np.nan)
-    results = Results(blank, square, blank.copy(), square.copy(), square.copy())
+    results = Results(blank, square, blank.copy(), square.copy(), np.zeros_like(square))
     failed_ns = np.full(prior.runs, -1)
     _compiled(parameters.rule, parameters.tolerance)(
-        prior.runs, activities, sensing, prior["mean"][rows], covariance, prior_ns, results, failed_ns
+        prior.runs,
+        activities,
+        sensing,
+        prior["mean"][rows],
+        covariance,
+        prior_ns,
+        parameters.rule == TRAP,
+        results,
+        failed_ns,
     )
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * size)}
     outputs = [_failures(f"/estimates/{name}/failure", failed_ns)]

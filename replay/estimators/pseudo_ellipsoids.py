@@ -23,8 +23,8 @@ Order = Literal[4, 8]
 Weighting = Literal["area", "batch", "determinant", "equal"]
 Size = Callable[[Floats], float]
 SEARCH_NODES = 120
-# of the literal filter's prior, in squared half arenas: wide, and yet not so wide that digits are lost
-PRIOR_VARIANCE = 1e2
+PRIOR_VARIANCE = 1e2  # of "determinant", in squared half arenas
+ROUNDING = 1e-11
 
 
 class PseudoEllipsoid(NamedTuple):
@@ -162,22 +162,6 @@ def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid
     )
 
 
-def bounding_ellipsoid_update(
-    centre: Floats, shape: Floats, rows: Floats, value: Floats, size: Floats, weight: float
-) -> tuple[Floats, Floats]:
-    """The bounding ellipsoid filter (6), (7), literally: centre (n,) and shape (n, n) after z = H x + v.
-
-    Raises BadInput where the factor s is negative: the sets have no common point.
-    """
-    spread = size + weight * rows @ shape @ rows.T
-    gain = weight * np.linalg.solve(spread, rows @ shape).T
-    error = value - rows @ centre
-    factor = 1.0 + weight - weight * float(error @ np.linalg.solve(spread, error))
-    if factor < 0:
-        raise BadInput("measurement and prior set have no common point; one of their bounds is wrong")
-    return centre + gain @ error, factor * (shape - gain @ rows @ shape)
-
-
 def order_of(ellipsoid: PseudoEllipsoid) -> Order:
     """How many monomials it is made of."""
     return 4 if len(ellipsoid.vector) == 4 else 8
@@ -190,6 +174,19 @@ def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
     return 2 * raised @ ellipsoid.vector - quadratic - ellipsoid.constant
 
 
+def most_room(ellipsoid: PseudoEllipsoid) -> float:
+    """The greatest fused slack of any monomials, s of (7), at least its rounding error.
+
+    Raises BadInput where it is negative by more than that: the sets have no common point.
+    """
+    centre = np.linalg.lstsq(ellipsoid.information, ellipsoid.vector)[0]
+    most = float(ellipsoid.vector @ centre) - ellipsoid.constant
+    error = ROUNDING * abs(ellipsoid.constant)
+    if most < -error:
+        raise BadInput("the pairs' sets have no common point; one of their bounds is wrong")
+    return max(most, error)
+
+
 def fit(
     pairs: Pairs, arena: Arena, order: Order, weighting: Weighting = "area", sweeps: int = 1
 ) -> PseudoEllipsoid:
@@ -200,7 +197,7 @@ def fit(
         arena: where the robot is known to be.
         order: the number L of monomials, 4 or 8.
         weighting: "area" minimises the set's area at every step, "batch" over all weights at once,
-            "determinant" that of C^e by the literal filter from a wide prior, "equal" chooses nothing.
+            "determinant" that of C^e, from a wide prior, "equal" chooses nothing.
             The paper says "area" and not how.
         sweeps: how often the rings are fused; fusing a set again is legitimate.
 
@@ -213,15 +210,17 @@ def fit(
     first, second = ((ends - origin) / scale_m for ends in pairs[:2])
     rings = ring_coefficients(pairs._replace(first=first, second=second), near)
     if weighting == "determinant":
-        return PseudoEllipsoid(*_literal(rings, order, sweeps), origin, scale_m)
-    nothing = PseudoEllipsoid(np.zeros((order, order)), np.zeros(order), 0.0, origin, scale_m)
-    fused = nothing
+        return _smallest_ellipsoid(rings, order, sweeps)._replace(origin=origin, scale_m=scale_m)
+    fused = _nothing(order)._replace(origin=origin, scale_m=scale_m)
     for ring, weight in zip(rings, _weights(rings, near, order, weighting, sweeps), strict=True):
         fused = fuse(fused, ring, weight)
-    least = fused.vector @ np.linalg.lstsq(fused.information, fused.vector)[0] - fused.constant
-    if least < 0:
-        raise BadInput("the pairs' sets have no common point; one of their bounds is wrong")
+    most_room(fused)
     return fused
+
+
+def _nothing(order: Order) -> PseudoEllipsoid:
+    """Zero information: the whole space."""
+    return PseudoEllipsoid(np.zeros((order, order)), np.zeros(order), 0.0, np.zeros(2), 1.0)
 
 
 def _weights(rings: Floats, arena: Arena, order: Order, weighting: Weighting, sweeps: int) -> Floats:
@@ -288,28 +287,31 @@ def _fused(rings: Floats, weights: Floats, points: Floats, order: Order) -> Floa
     )
 
 
-def _literal(rings: Floats, order: Order, sweeps: int) -> tuple[Floats, Floats, float]:
-    """The filter (18) as printed, from a wide prior, lambda by the least determinant of C^e."""
-    centre, shape = np.zeros(order), PRIOR_VARIANCE * np.eye(order)
+def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllipsoid:
+    """The filter (7), (18) with the lambda that makes the determinant of C^e least.
+
+    Its C^e is s A^-1, with the information A and the most room s, and a weight is lambda times s. Its
+    prior is wide and proper, or the first determinants were infinite; it stays a part of the set.
+    """
+    fused = _nothing(order)._replace(information=np.eye(order) / PRIOR_VARIANCE, constant=-1.0)
     for ring in np.tile(rings, (sweeps, 1)):
-        rows, value, size = measurement(ring, order)
+        most = most_room(fused)
 
-        def logarithm_of_volume(
+        def log_volume(
             logarithm: float,
-            centre: Floats = centre,
-            shape: Floats = shape,
-            parts: tuple[Floats, Floats, Floats] = (rows, value, size),
+            before: PseudoEllipsoid = fused,
+            ring: Floats = ring,
+            most: float = most,
         ) -> float:
-            fused = bounding_ellipsoid_update(centre, shape, *parts, float(np.exp(logarithm)))[1]
-            return float(np.linalg.slogdet(fused)[1])
+            after = fuse(before, ring, most * float(np.exp(logarithm)))
+            sizes = np.linalg.eigvalsh(after.information)
+            # a narrow ring beside the prior leaves some of them to rounding
+            sizes = np.maximum(sizes, np.finfo(float).eps * sizes[-1])
+            return float(order * np.log(most_room(after)) - np.log(sizes).sum())
 
-        best = minimize_scalar(logarithm_of_volume, bounds=(-9.0, 4.0), method="bounded")
-        centre, fused = bounding_ellipsoid_update(
-            centre, shape, rows, value, size, float(np.exp(best.x))
-        )
-        shape = 0.5 * (fused + fused.T)
-    information = np.asarray(np.linalg.inv(shape), np.float64)
-    return information, information @ centre, float(centre @ information @ centre) - 1.0
+        best = minimize_scalar(log_volume, bounds=(-9.0, 4.0), method="bounded")
+        fused = fuse(fused, ring, most * float(np.exp(best.x)))
+    return fused
 
 
 def outline(ellipsoid: PseudoEllipsoid, arena: Arena, nodes: int = 400) -> Outline:

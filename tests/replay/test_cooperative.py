@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.ensemble import replay_ensemble
 from recorders.recording import import_run
-from replay.evaluation import accuracy, consistency
+from replay.metrics import accuracy, consistency
 from replay.sources import memory_source
 
 

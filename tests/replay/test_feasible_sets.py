@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from recorders.errors import BadInput
@@ -22,10 +22,10 @@ from replay.estimators.feasible_sets import (
 )
 from replay.estimators.pseudo_ellipsoids import (
     PseudoEllipsoid,
-    bounding_ellipsoid_update,
     fit,
     fuse,
     measurement,
+    most_room,
     outline,
     parabola_ellipse,
     ring_coefficients,
@@ -42,6 +42,15 @@ def section_v(first=(2, 0, 1), second=(0, 1, 2), bound_deg=4.0):
     """The paper's example: robot (0, 0), noise-free pairs (3,1), (1,2), (2,3)."""
     one, two = LANDMARKS[list(first)], LANDMARKS[list(second)]
     return make_pairs(one, two, relative_bearing((0.0, 0.0), one.T, two.T), np.radians(bound_deg))
+
+
+def bounding_ellipsoid_update(centre, shape, rows, value, size, weight):
+    """The bounding ellipsoid filter (6), (7) as printed: its centre, C^+ and s."""
+    spread = size + weight * rows @ shape @ rows.T
+    gain = weight * np.linalg.solve(spread, rows @ shape).T
+    error = value - rows @ centre
+    factor = 1.0 + weight - weight * error @ np.linalg.solve(spread, error)
+    return centre + gain @ error, factor * (shape - gain @ rows @ shape), factor
 
 
 def box_area(border):
@@ -101,7 +110,7 @@ def test_the_first_pair_of_section_v(order, expected):
 
 
 @given(st.integers(0, 2**32), st.integers(2, 5), st.floats(0.005, 1.5))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25)
 def test_the_exact_set_is_where_no_bound_is_exceeded(seed, landmarks, bound_rad):
     """Area, box and rings of the arcs against a grid of point-wise tests; the robot is in the set."""
     robot, pairs = scene(seed, landmarks, bound_rad, 1.0)
@@ -130,7 +139,9 @@ def test_the_exact_set_is_where_no_bound_is_exceeded(seed, landmarks, bound_rad)
     st.sampled_from([4, 8]),
     st.sampled_from(["equal", "determinant"]),
 )
-@settings(max_examples=40, deadline=None)
+@example(0, 2, 0.005, 8, "determinant")
+@example(1, 4, 0.005, 8, "determinant")
+@settings(max_examples=40)
 def test_a_pseudo_ellipsoid_holds_the_exact_set(seed, landmarks, bound_rad, order, weighting):
     """Containment, which is what the method guarantees: bounded, unbounded and lens-shaped pairs."""
     _, pairs = scene(seed, landmarks, bound_rad, 1.0)
@@ -175,8 +186,9 @@ def test_the_recursion_is_the_literal_filter_and_the_sum_of_slacks():
         np.testing.assert_allclose(
             room(fused, points), room(prior, points) + 0.7 * slack(ring, points, order), rtol=1e-9
         )
-        moved, spread = bounding_ellipsoid_update(centre, shape, *measurement(ring, order), 0.7)
-        size = moved @ fused.information @ moved - fused.constant
+        moved, spread, size = bounding_ellipsoid_update(centre, shape, *measurement(ring, order), 0.7)
+        assert most_room(fused) == pytest.approx(size, rel=1e-6)
+        np.testing.assert_allclose(fused.information @ moved, fused.vector, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(np.linalg.inv(spread) * size, fused.information, rtol=1e-6, atol=1e-6)
 
 

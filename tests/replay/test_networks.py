@@ -45,9 +45,6 @@ def centralised_rmse_m(room):
     [
         ("alone", 4.83, 3.7, 4.3),
         ("ci-trace", 1.08, 3.6, 4.4),
-        ("ci-determinant", 1.08, 3.6, 4.4),
-        ("niehsen", 1.088, 2.9, 3.5),
-        ("franken", 1.094, 2.8, 3.5),
         ("own-again", 1.165, 5.3, 6.4),
     ],
 )
