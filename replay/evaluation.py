@@ -1,8 +1,9 @@
 """Estimates against truth: alignment, errors, and whether the filter's own covariance can be believed.
 
 An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
-truth is interpolated at the estimate's stamps, never over a gap; errors of angles are wrapped. NEES and
-NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
+truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space
+(see `replay.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
+Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,13 +17,12 @@ from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
-from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
 from replay.consistency import normalized_error_squared
 from replay.sources import Source
+from replay.tangent import WIDTHS, are_kinds, between, difference, tangent_components
 
 Floats = NDArray[np.float64]
-KINDS = ("linear", "angle")
 POSITION = ("x_m", "y_m", "z_m")
 
 
@@ -33,10 +33,11 @@ class Errors:
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
-        components: names of the d components; kinds: "linear" or "angle" each.
+        components: names of the d components of the tangent space; kinds: "linear", "angle" or
+            "rotation" (about an axis of the body) each.
         run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
-        error: (n, d) estimate - truth, angles wrapped.
+        error: (n, d) estimate - truth.
         covariance: (n, d, d) the estimator's own.
         nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
             definite.
@@ -60,6 +61,11 @@ class Errors:
     def position(self) -> list[int]:
         """The indices of the position's components."""
         return [index for index, name in enumerate(self.components) if name in POSITION]
+
+    @property
+    def rotation(self) -> list[int]:
+        """The indices of an orientation's components, which are a rotation vector in rad."""
+        return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
 
 
 class Innovations(NamedTuple):
@@ -90,9 +96,9 @@ def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> t
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """The truth's state (n, d) at any stamps, linear in time; NaN over gaps longer than the limit.
+    """The truth's state (n, d) at any stamps, the shortest way between; NaN over gaps above the limit.
 
-    Angles are interpolated the short way round. A stamp that the truth has exactly needs no neighbour.
+    A stamp that the truth has exactly needs no neighbour.
     """
     times = truth.publish_time_ns
     state = truth["state"]
@@ -102,10 +108,7 @@ def truth_at(
     left = np.where(times[right] > time_ns, right - 1, right).clip(0)
     span = times[right] - times[left]
     weight = (time_ns - times[left]) / np.maximum(span, 1)
-    change = state[right] - state[left]
-    angular = np.array([kind == "angle" for kind in kinds])
-    change[:, angular] = wrap_angle(change[:, angular])
-    value = state[left] + weight[:, None] * change
+    value = between(state[left], state[right], weight, kinds)
     inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
     value[~inside] = np.nan
     return value
@@ -120,10 +123,10 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     estimator, case = split_topic(stream.topic)
     components = tuple(stream.components)
     kinds = tuple(stream.metadata.get("kinds", "").split(","))
-    if len(components) != len(kinds) or not set(kinds) <= set(KINDS):
+    if len(components) != len(kinds) or not are_kinds(kinds):
         raise BadInput(
             f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
-            f"out of {', '.join(KINDS)}"
+            f"out of {', '.join(WIDTHS)}; an axis has two in a row, a quaternion four"
         )
     truth_topic = stream.metadata.get("truth", "")
     if not all(truth_topic in source.topics for source in sources):
@@ -132,10 +135,10 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         _reference(source, truth_topic, components, kinds, estimates.of_run(run), gap_limit_s)
         for run, source in enumerate(sources)
     ]
-    size = len(components)
-    error = stream["mean"].reshape(len(stream), size) - np.concatenate(references)
-    angular = np.array([kind == "angle" for kind in kinds])
-    error[:, angular] = wrap_angle(error[:, angular])
+    mean = stream["mean"].reshape(len(stream), len(components))
+    error = difference(mean, np.concatenate(references), kinds)
+    tangent = tangent_components(components, kinds)
+    size = len(tangent)
     known = np.isfinite(error).all(axis=1)
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
@@ -145,8 +148,8 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     return Errors(
         estimator,
         case,
-        components,
-        kinds,
+        tuple(name for name, _ in tangent),
+        tuple(kind for _, kind in tangent),
         run[known],
         step[known],
         stream.publish_time_ns[known],
@@ -228,6 +231,9 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     table["elapsed_s"] = mean(errors.elapsed_s)
     if errors.position:
         table["position_rmse_m"] = np.sqrt(mean(np.sum(errors.error[:, errors.position] ** 2, 1)))
+    if errors.rotation:
+        squared = mean(np.sum(errors.error[:, errors.rotation] ** 2, 1))
+        table["orientation_rmse_deg"] = np.degrees(np.sqrt(squared))
     for column, name in enumerate(errors.components):
         table[f"rmse_{name}"] = np.sqrt(mean(errors.error[:, column] ** 2))
     table["nees"] = mean(errors.nees)

@@ -67,10 +67,12 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any]]) -> dict[s
 
 
 def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of the position and of every other component over all runs and steps."""
+    """RMSE of position, orientation and every other component over all runs and steps."""
     values: dict[str, float] = {}
     if len(errors.error) and errors.position:
         values["position_rmse_m"] = _rms(errors.error[:, errors.position])
+    if len(errors.error) and errors.rotation:
+        values["orientation_rmse_deg"] = float(np.degrees(_rms(errors.error[:, errors.rotation])))
     for column, name in enumerate(errors.components):
         if len(errors.error) and column not in errors.position:
             quantity, _, unit = name.rpartition("_")

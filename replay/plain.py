@@ -8,7 +8,7 @@ that has them, name the outputs, and tell of a run that failed while the others 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Generic, Literal, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,11 @@ from recorders.parameters import ParametersType
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Batch, Bound, Estimator, Recursive
+from replay.tangent import Kind, tangent_components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Components = Mapping[str, Literal["linear", "angle"]]
+Components = Mapping[str, Kind]
 
 DIVERGED = "the estimate is not finite: no usable prior, or the filter diverged"
 
@@ -35,6 +36,7 @@ class Given(Generic[ParametersType]):
     parameters: ParametersType
     topics: Mapping[str, Topic]
     whole: Mapping[str, Ragged]
+    runs: int
 
     def stated(self, topic: str, name: str) -> float:
         """The parameter `name`, or where it is None the number that the topic's channel states.
@@ -95,7 +97,8 @@ class Results(NamedTuple):
     """What a recursion fills, one row for every message; a row of NaN says nothing.
 
     Attributes:
-        mean, covariance: (n, d), (n, d, d) the estimate after the message.
+        mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
+            space (see `replay.tangent`), d where all are linear or angles.
         innovation, innovation_covariance: (n, m), (n, m, m) of the message.
         squared: (n,) the normalised innovation squared.
         accepted: (n,) whether a gate let the message in; 1 unless set.
@@ -121,7 +124,7 @@ class Solution(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """What streams were solved to: stamps (n,), means (n, d), covariances (n, d, d), how it ended."""
+    """What streams were solved to: stamps (n,), means (n, d), covariances (n, t, t), how it ended."""
 
     time_ns: Integers
     mean: Floats
@@ -164,7 +167,7 @@ def recursive(
         parameters: their type.
         streams: the topics to follow, with their schemas; see `bindings` for their names.
         whole: the topics that `start` needs whole, such as a map or a prior.
-        components: the estimate's components by name, each "linear" or an "angle".
+        components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
         measured: the components of the innovations, where `follow` tells of them.
         start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
@@ -181,13 +184,16 @@ def recursive(
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         outputs = _Outputs(name, _resolved(truth, prefix), components, measured or {})
 
-        def begin(given: dict[str, Ragged]) -> _Carried:
-            maps = {each: given[found[each].name] for each in whole}
-            settings, state = start(Given(values, found, maps))
-            return _Carried(settings, state, np.zeros(len(state[0]), bool))
+        def started(maps: Mapping[str, Ragged], runs: int) -> _Carried:
+            return _Carried(*start(Given(values, found, maps, runs)), np.zeros(runs, bool))
 
-        def advance(carried: _Carried, block: Block) -> tuple[_Carried, list[Ragged]]:
-            settings, before, told = carried
+        def begin(given: dict[str, Ragged]) -> _Carried | None:
+            maps = {each: given[found[each].name] for each in whole}
+            return started(maps, next(iter(maps.values())).runs) if maps else None
+
+        def advance(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+            # without anything whole, the first block is what tells how many runs there are
+            settings, before, told = carried or started({}, len(block.events.offsets) - 1)
             state = type(before)(*(array.copy() for array in before))
             messages = _messages(block)
             results = outputs.blank(len(messages.time_ns))
@@ -358,12 +364,17 @@ class _Outputs:
     components: Components
     measured: Components
 
+    @property
+    def tangent(self) -> int:
+        """How many components the tangent space has."""
+        return len(tangent_components(list(self.components), list(self.components.values())))
+
     def blank(self, rows: int) -> Results:
         """Results that say nothing."""
-        d, m = len(self.components), len(self.measured)
+        d, t, m = len(self.components), self.tangent, len(self.measured)
         return Results(
             np.full((rows, d), np.nan),
-            np.full((rows, d, d), np.nan),
+            np.full((rows, t, t), np.nan),
             np.full((rows, m), np.nan),
             np.full((rows, m, m), np.nan),
             np.full(rows, np.nan),
@@ -418,7 +429,7 @@ class _Outputs:
             estimates.time_ns,
             _named(self.components),
             mean=mean,
-            covariance=np.reshape(estimates.covariance, (len(mean), len(self.components) ** 2)),
+            covariance=np.reshape(estimates.covariance, (len(mean), self.tangent**2)),
         )
 
     def _failure(self, failures: Sequence[Failure], reasons: Sequence[str]) -> Stream:

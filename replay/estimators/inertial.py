@@ -1,5 +1,7 @@
 """Orientation from inertial and magnetic samples: dead reckoning, corrected by the Bingham filter.
 
+Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
+
 Made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021). The body rests
 first, which gives the bias of the gyro. Then the accelerometer and the magnetometer are carried to the
 end of a block by the gyro and averaged, which tells gravity from motion; the TRIAD attitude of the
@@ -100,6 +102,30 @@ class OrientationEstimates(NamedTuple):
     covariance: NDArray[np.float64]
 
 
+class ReckoningState(NamedTuple):
+    """What dead reckoning carries from sample to sample, first axis runs.
+
+    Attributes:
+        orientation: (runs, 4), zero until the rest is over, NaN after a gap.
+        time_ns: of the first sample and the last one, (runs, 2); -1 for none yet.
+        sums: of gyro, accelerometer and magnetometer over the rest, (runs, 3, 3).
+        rest_samples: how many samples they have (runs,).
+    """
+
+    orientation: NDArray[np.float64]
+    time_ns: NDArray[np.int64]
+    sums: NDArray[np.float64]
+    rest_samples: NDArray[np.int64]
+
+
+def start_reckoning(runs: int) -> ReckoningState:
+    """The state before the first sample: nothing known."""
+    none_yet = np.full((runs, 2), -1)
+    return ReckoningState(
+        np.zeros((runs, 4)), none_yet, np.zeros((runs, 3, 3)), np.zeros(runs, np.int64)
+    )
+
+
 def start_inertial_filter(runs: int) -> InertialState:
     """The state before the first sample: nothing known."""
     return InertialState(
@@ -122,15 +148,101 @@ def run_inertial_filter(
 
     Raises BadInput where the columns have different lengths or the model's numbers are not positive.
     """
+    samples, estimates = _prepared(model, samples)
+    state = InertialState._make(part.copy() for part in state)
+    _inertial_filter(model, state, samples, estimates)
+    return state, estimates
+
+
+def run_dead_reckoning(
+    model: InertialModel, state: ReckoningState, samples: InertialSamples, *, unbiased: bool
+) -> tuple[ReckoningState, OrientationEstimates]:
+    """The gyro alone from the attitude of the rest on, less its mean over the rest where `unbiased`.
+
+    There are no estimates before the rest is over, nor after a gap. Args and errors as
+    `run_inertial_filter`.
+    """
+    samples, estimates = _prepared(model, samples)
+    state = ReckoningState._make(part.copy() for part in state)
+    _dead_reckoning(model, unbiased, state, samples, estimates)
+    return state, estimates
+
+
+def attitudes(model: InertialModel, samples: InertialSamples) -> OrientationEstimates:
+    """The TRIAD attitude of every sample alone: gravity is taken for all that is felt."""
+    samples, estimates = _prepared(model, samples)
+    _attitudes(samples, estimates.orientation)
+    estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
+    return estimates
+
+
+def _prepared(
+    model: InertialModel, samples: InertialSamples
+) -> tuple[InertialSamples, OrientationEstimates]:
+    """Checked samples, and estimates to fill."""
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
         raise BadInput("inertial samples: give a time, and rate, force and field (3) of each")
     if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
         raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
-    state = InertialState._make(part.copy() for part in state)
     estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
-    _inertial_filter(model, state, InertialSamples._make(map(np.ascontiguousarray, samples)), estimates)
-    return state, estimates
+    return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
+
+
+@njit(cache=True, error_model="numpy")
+def _attitudes(samples: InertialSamples, orientation: NDArray) -> None:
+    for row in range(len(orientation)):
+        orientation[row] = _triad(samples.force[row], samples.field[row])
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _dead_reckoning(
+    model: InertialModel,
+    unbiased: bool,
+    state: ReckoningState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+) -> None:
+    for run in prange(len(samples.offsets) - 1):
+        for row in range(samples.offsets[run], samples.offsets[run + 1]):
+            _reckon(model, unbiased, state, run, samples, estimates, row)
+
+
+@njit(cache=True, error_model="numpy")
+def _reckon(
+    model: InertialModel,
+    unbiased: bool,
+    state: ReckoningState,
+    run: int,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+    row: int,
+) -> None:
+    """Take in one sample; one that is not finite is passed over."""
+    time_ns, rate = samples.time_ns[row], samples.rate[row]
+    force, field = samples.force[row], samples.field[row]
+    if not math.isfinite(rate.sum() + force.sum() + field.sum()):
+        return
+    orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
+    if times[0] < 0:
+        times[:] = time_ns
+    duration_s, elapsed_s = (time_ns - times[1]) * _NS, (time_ns - times[0]) * _NS
+    times[1] = time_ns
+    if duration_s > model.gap_s:
+        orientation[:] = np.nan
+    if elapsed_s < model.rest_s:
+        sums[0] += rate
+        sums[1] += force
+        sums[2] += field
+        state.rest_samples[run] += 1
+        return
+    if (orientation == 0.0).all():
+        orientation[:] = _triad(sums[1], sums[2])
+    bias = sums[0] / max(state.rest_samples[run], 1) if unbiased else np.zeros(3)
+    compose(orientation.copy(), _increment((rate - bias) * duration_s), orientation)
+    estimates.orientation[row] = orientation
+    variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
+    estimates.covariance[row] = variance * np.eye(3)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""The wrapped normal on the torus: identities, figure 3 of the paper, products against a grid."""
+"""The wrapped normal on the torus: identities, products against a grid."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recorders.errors import BadInput
-from recorders.models.headings import turn_together
-from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal, wrapped_normal_kernels
 from replay.distributions.wrapped_normal import (
     CircularMoments,
@@ -18,7 +16,6 @@ from replay.distributions.wrapped_normal import (
 from replay.estimators.grid import torus_grid
 
 SIGMA = np.array([0.8, 1.3])
-RHOS = np.linspace(-0.9, 0.9, 19)
 
 
 def covariance(rho: float, sigma: np.ndarray = SIGMA) -> np.ndarray:
@@ -105,103 +102,6 @@ def test_mixed_mle_approaches_the_truth_with_many_samples():
     fitted = wrapped_normal.fit_mixed_mle(Samples(drawn, np.full(4000, 1.0 / 4000)))
     np.testing.assert_allclose(fitted.covariance, distribution.covariance, atol=0.15)
     np.testing.assert_allclose(fitted.mean, distribution.mean, atol=0.1)
-
-
-def moved(samples: Samples, coupling: float) -> Samples:
-    x = samples.positions
-    positions = np.stack(turn_together(x[..., 0], x[..., 1], coupling, 0.0, 0.0), axis=-1)
-    return Samples(positions, samples.weights)
-
-
-def figure_3(coupling: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Errors of mu and C over RHOS: five samples and UKF samples, refitted by mixed maximum likelihood.
-
-    Truth is the population value, from 40 x 40 Gauss-Hermite nodes in place of 10,000 samples.
-    """
-    root = np.linalg.cholesky(np.stack([covariance(rho) for rho in RHOS]))
-    x, w = np.polynomial.hermite_e.hermegauss(40)
-    nodes = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
-    weights = np.outer(w, w).ravel() / w.sum() ** 2
-    kept = weights > 1e-14
-
-    def samples(points: np.ndarray, each: np.ndarray) -> Samples:
-        positions = points @ np.swapaxes(root, -1, -2)
-        return Samples(positions, np.broadcast_to(each, positions.shape[:-1]))
-
-    truth = wrapped_normal.fit_mixed_mle(moved(samples(nodes[kept], weights[kept]), coupling))
-    distributions = WrappedNormal(np.zeros((len(RHOS), 2)), root @ np.swapaxes(root, -1, -2))
-    moments = wrapped_normal.circular_moments(distributions)
-    five, heavy = (wrapped_normal.five_samples(moments, weight) for weight in (0.2, 0.45))
-    star = np.sqrt(2.5) * np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
-    several = WrappedNormal(*(np.stack([part] * MC_RUNS) for part in distributions))
-    drawn = wrapped_normal.sample(several, 50, np.random.default_rng(0))
-    random = Samples(drawn, np.full(drawn.shape[:-1], 0.02))
-
-    def errors(found: WrappedNormal) -> tuple[np.ndarray, np.ndarray]:
-        mean = np.abs(wrap_angle(found.mean - truth.mean)).mean(axis=-1)
-        spread = np.abs(found.covariance - truth.covariance).mean(axis=(-1, -2))
-        return mean, spread
-
-    fits = {"five": five, "heavy": heavy, "ukf": samples(star, np.full(5, 0.2)), "random": random}
-    return {
-        name: errors(wrapped_normal.fit_mixed_mle(moved(each, coupling))) for name, each in fits.items()
-    }
-
-
-MC_RUNS = 12
-# the sheet's rows: rho, then by c the errors of mu and C of the five samples, and of the UKF's
-FIGURE_3 = {
-    -0.9: {
-        0.1: ".0074 .0588 .0027 .1736",
-        0.5: ".0383 .1111 .0133 .1115",
-        1.0: ".0836 .1449 .0260 .0562",
-    },
-    -0.6: {
-        0.1: ".0016 .0458 .0112 .2211",
-        0.5: ".0102 .1265 .0584 .0929",
-        1.0: ".0332 .1810 .1324 .0512",
-    },
-    0.0: {
-        0.1: ".0027 .0143 .0122 .0254",
-        0.5: ".0111 .0513 .0638 .0807",
-        1.0: ".0074 .1228 .1475 .2962",
-    },
-    0.3: {0.1: ".0016 .0065 .0124 .1197", 0.5: ".0059 .0533 .0646 .2968", 1.0: ".0027 .1508 .1470 1.09"},
-    0.9: {0.1: ".0074 .0400 .0027 .2135", 0.5: ".0383 .2531 .0133 .3102", 1.0: "1.654 1.92 .026 .304"},
-}
-
-
-@pytest.mark.parametrize(
-    ("coupling", "random", "wins"),
-    [
-        (0.1, (0.141, 0.175), 19),
-        (0.2, None, 17),
-        (0.5, (0.154, 0.206), 12),
-        (1.0, (0.200, 0.300), 11),
-    ],
-)
-def test_figure_3(coupling, random, wins):
-    """The sheet's cells, its Monte Carlo means, and how often the five samples win C against the UKF."""
-    found = figure_3(coupling)
-    for rho, rows in FIGURE_3.items():
-        column = int(np.argmin(np.abs(RHOS - rho)))
-        cells = [found[name][part][column] for name in ("five", "ukf") for part in (0, 1)]
-        if coupling in rows:
-            expected = np.array(rows[coupling].split(), float)
-            np.testing.assert_allclose(cells, expected, atol=3e-3 if coupling == 1.0 else 1e-3)
-    if random:
-        means = [found["random"][part].mean() for part in (0, 1)]
-        np.testing.assert_allclose(means, random, rtol=0.1)
-    assert (found["five"][1] < found["ukf"][1]).sum() == wins
-    at_the_ends = found["five"][0][[0, -1]] > found["ukf"][0][[0, -1]]
-    assert at_the_ends.all(), "the sheet: the mean loses against the UKF at |rho| = .9"
-    # w5 = .45 keeps C better at every c (.4 does not at c = .1), at a price in mu up to c = .5
-    assert found["heavy"][1].mean() < found["five"][1].mean()
-    assert (found["heavy"][0].mean() > found["five"][0].mean()) == (coupling <= 0.5)
-    for own, drawn in zip(found["five"], found["random"], strict=True):
-        mean, error = drawn.mean(axis=0), drawn.std(axis=0) / np.sqrt(MC_RUNS)
-        if coupling <= 0.5:
-            assert (own < mean + 2.0 * error).all(), "wins against 50 random samples everywhere"
 
 
 def test_density_is_normalised_and_has_its_moments():

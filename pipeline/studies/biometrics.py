@@ -1,0 +1,206 @@
+"""The study of biometric score fusion: modality, method and process, and verification of all pairs.
+
+Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
+seeds; those of all pairs get confidence intervals of drawing users again.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from pydantic import PositiveInt
+from scipy.stats import norm
+
+from pipeline.ensemble import Replayed, hash_streams, replay_ensemble
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Outcome
+from pipeline.studies.biometrics_claims import PAPER_FUSED, claims_of_bssr1, claims_of_simulation
+from pipeline.studies.localization import obtain, summary_table, write_logs
+from recorders.models.scores import TOPIC, comparisons_of, matchers_of
+from recorders.parameters import Parameters
+from replay.blocks import Ragged
+from replay.engine import configure
+from replay.estimators.biometrics import LearnerParameters, subsets_of
+from replay.evaluation import split_topic
+from replay.metrics import find_metrics, measure
+from replay.sources import MemorySource
+from replay.timeline.show import show
+from replay.verification import (
+    FALSE_ACCEPT_RATES,
+    Fused,
+    bootstrap_users,
+    fused_of,
+    relative_rate_increase,
+    roc,
+)
+
+RATE, SPREAD, COUNT = "verification_rate_percent", "verification_rate_sd_percent", "identified_percent"
+THINNED = 2000
+
+
+class BiometricsOptions(Parameters):
+    """How often the cross validations are repeated, and users are drawn again."""
+
+    seeds: PositiveInt = 5
+    replicates: PositiveInt = 100
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    sources = obtain(experiment, setting)
+    replayed = replay_ensemble(
+        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
+    )
+    write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    metrics = find_metrics(experiment.metrics)
+    values = measure(replayed.judged, metrics)
+    values |= _repeated(experiment, setting, sources, values)
+    outcome = Outcome(metrics=dict(values), input_sha256=hash_streams(sources))
+    outcome.tables["summary"] = summary_table(outcome.metrics)
+    outcome.tables["factors"] = factor_table(values, sources[0])
+    outcome.tables["confidence"] = confidence_table(replayed, setting.options.replicates)
+    outcome.figures["distributions"] = distribution_figure(sources[0])
+    outcome.figures["roc"] = curve_figure(replayed, deviates=False)
+    outcome.figures["det"] = curve_figure(replayed, deviates=True)
+    judge = claims_of_bssr1 if experiment.import_ else claims_of_simulation
+    outcome.claims += judge(values, _counts(replayed))
+    return outcome
+
+
+def _repeated(
+    experiment: Experiment, setting: Setting, sources: list[MemorySource], first: Mapping[str, float]
+) -> dict[str, float]:
+    """Means and standard deviations over the seeds of the fusions that draw a trimmed database."""
+    drawn = {}
+    for label, settings in experiment.estimators.items():
+        _, parameters = configure(label, settings)
+        if isinstance(parameters, LearnerParameters) and parameters.pairs == "trimmed":
+            drawn[label] = (dict(settings), parameters.seed)
+    rates = [{key: value for key, value in first.items() if f".{RATE}" in key}]
+    more = range(1, setting.options.seeds if drawn else 1)
+    for step in setting.progress(more, "repeating with other seeds", len(more)):
+        estimators = {label: {**values, "seed": seed + step} for label, (values, seed) in drawn.items()}
+        again = replay_ensemble(sources, estimators, gap_limit_s=experiment.gap_limit_s)
+        rates.append(measure(again.judged, find_metrics(["verification"])))
+    values: dict[str, float] = {}
+    for key in rates[0]:
+        over_seeds = [rate[key] for rate in rates]
+        values[key] = float(np.mean(over_seeds))
+        if len(over_seeds) > 1:
+            values[key.replace(RATE, SPREAD)] = float(np.std(over_seeds, ddof=1))
+    return values
+
+
+def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFrame:
+    """Tables 2 to 5: each subset's rate and relative increase by each fusion, paper beside ours.
+
+    Rates of single matchers and of arithmetic fusion are of identification, as in the paper; the paper's
+    relative increases follow from its printed rates.
+    """
+    matchers = matchers_of(source.streams[TOPIC].metadata)
+    rows = []
+    for case, chosen in subsets_of(matchers).items():
+        single = [values.get(f"single.{COUNT}.{matchers[index].name}", np.nan) for index in chosen]
+        for key in values if len(chosen) > 1 else ():
+            label, quantity, of = key.split(".", 2)
+            has_rate = f"{label}.{RATE}.{case}" in values
+            if of != case or quantity != (RATE if has_rate else COUNT):
+                continue
+            increase, relative = relative_rate_increase(values[key] / 100, np.array(single) / 100)
+            row = {"subset": case, "fusion": label, "paper_percent": np.nan, "ours_percent": values[key]}
+            row["paper_percent"] = PAPER_FUSED.get(label, {}).get(case, np.nan)
+            row["sd_percent"] = values.get(f"{label}.{SPREAD}.{case}", np.nan)
+            rows.append(
+                {**row, "mean_single_percent": np.mean(single), "ari": increase, "rri": relative}
+            )
+    return pd.DataFrame(rows)
+
+
+def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
+    """95 % intervals of GAR at FAR and EER of the first run, of drawing users again."""
+    names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
+    rows = []
+    for topic, fused in _complete(replayed).items():
+        label, case = split_topic(topic)
+        drawn = 100 * bootstrap_users(fused, replicates, np.random.default_rng(0))
+        bounds = np.quantile(drawn, [0.025, 0.975], axis=0).T
+        rows += [(label, case, name, low, high) for name, (low, high) in zip(names, bounds, strict=True)]
+    return pd.DataFrame(rows, columns=["fusion", "case", "quantity", "low", "high"])
+
+
+def _complete(replayed: Replayed) -> dict[str, Fused]:
+    """The first run's fusions of all pairs, of single matchers and of all together."""
+    found = {
+        topic: fused_of(rows.of_run(0))
+        for topic, rows in replayed.outputs.items()
+        if split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single"
+    }
+    return {topic: fused for topic, fused in found.items() if fused.is_complete}
+
+
+def _counts(replayed: Replayed) -> dict[str, list[float]]:
+    """Identified users in every run, by fusion and case."""
+    metrics = find_metrics(["verification"])
+    counts: dict[str, list[float]] = {}
+    for run in range(len(replayed.sources)):
+        of_run = {
+            topic: Ragged(rows.of_run(run), np.array([0, len(rows.of_run(run))]))
+            for topic, rows in replayed.outputs.items()
+        }
+        values = measure(Replayed(replayed.sources[run : run + 1], of_run, [], []).judged, metrics)
+        for key, value in values.items():
+            counts.setdefault(key, []).append(value)
+    return counts
+
+
+def distribution_figure(source: MemorySource) -> Figure:
+    """Histograms of genuine and impostor scores, a plot per matcher."""
+    compared = comparisons_of(source.streams[TOPIC])
+    same = np.eye(len(compared.scores), dtype=bool)
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    plots = figure.subplots(2, -(-len(compared.matchers) // 2)).ravel()
+    for index, (plot, matcher) in enumerate(zip(plots, compared.matchers, strict=False)):
+        score, valid = compared.scores[:, :, index], ~compared.failed[:, :, index]
+        edges = np.linspace(score[valid].min(), score[valid].max(), 80)
+        for name, rows in (("impostor", ~same & valid), ("genuine", same & valid)):
+            plot.hist(score[rows], edges, density=True, alpha=0.6, label=name)
+        plot.set(title=matcher.name, xlabel="score", yscale="log")
+    plots[0].legend()
+    return figure
+
+
+def curve_figure(replayed: Replayed, *, deviates: bool) -> Figure:
+    """ROC, or with normal deviates on both axes the detection error trade-off."""
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    plot = figure.subplots()
+    ticks = np.array([1e-4, 1e-3, 0.01, 0.05, 0.2])
+    for topic, fused in _complete(replayed).items():
+        curve = roc(fused.score, fused.genuine)
+        label = " ".join(split_topic(topic))
+        accept, reject = curve.false_accept, 1 - curve.genuine_accept
+        inside = np.flatnonzero((accept > 0) & (accept < 1))
+        rows = inside[:: max(1, len(inside) // THINNED)]
+        if deviates:
+            plot.plot(
+                norm.ppf(accept[rows]), norm.ppf(np.maximum(reject[rows], 1e-4)), label=label, lw=1
+            )
+        else:
+            plot.plot(accept[rows], curve.genuine_accept[rows], label=label, lw=1)
+    if deviates:
+        for axis in (plot.xaxis, plot.yaxis):
+            axis.set_ticks(norm.ppf(ticks), [f"{100 * tick:g}" for tick in ticks])
+        bounds = norm.ppf([5e-5, 0.4])
+        plot.set(xlim=bounds, ylim=bounds, xlabel="FAR (%)", ylabel="FRR (%)", title="DET")
+    else:
+        plot.set(xscale="log", xlabel="FAR", ylabel="GAR", title="ROC", ylim=(0.65, 1.005))
+    plot.legend()
+    return figure
+
+
+BIOMETRICS = Study(
+    "fusion of biometric scores: rates by modality, method and process; ROC, EER, Cllr",
+    study,
+    BiometricsOptions,
+)

@@ -1,0 +1,125 @@
+"""The study of orientation from inertial samples: total error over each trial's movement.
+
+BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. What counts are the samples that its authors
+marked as movement; an error is the whole angle from the true orientation to the estimated one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.ensemble import hash_streams, replay_ensemble
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Claim, Outcome
+from pipeline.studies.localization import obtain, write_logs
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.evaluation import Errors
+from replay.metrics import find_metrics, measure
+from replay.sources import Source
+from replay.timeline.show import show
+
+
+class InertialOptions(Parameters):
+    """What is claimed: the mean error over the trials of which estimator, in degrees."""
+
+    estimator: str = "bingham"
+    target_deg: float = 3.5
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    options: InertialOptions = setting.options
+    sources = obtain(experiment, setting)
+    replayed = replay_ensemble(
+        sources,
+        experiment.estimators,
+        gap_limit_s=experiment.gap_limit_s,
+        progress=setting.progress,
+    )
+    write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    trials = movement_table(replayed.errors, sources)
+    means = {
+        str(name): float(rows["movement_rmse_deg"].mean())
+        for name, rows in trials.groupby("estimator", sort=False)
+    }
+    if options.estimator not in means:
+        raise BadInput(f"no estimates of '{options.estimator}' over movement with truth to judge")
+    outcome = Outcome(input_sha256=hash_streams(sources))
+    outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
+    for trial, estimator, rmse_deg, _ in trials.to_numpy():
+        outcome.metrics[f"{estimator}.movement_rmse_deg.{trial}"] = rmse_deg
+    outcome.metrics.update(measure(replayed.judged, find_metrics(experiment.metrics)))
+    outcome.tables["trials"] = trials
+    outcome.figures["trials"] = trials_figure(trials)
+    outcome.claims = _claims(means, options, trials["trial"].nunique())
+    return outcome
+
+
+def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.DataFrame:
+    """One row per trial and estimator: total RMSE over movement (deg), how many samples that are."""
+    rows = []
+    for errors in found:
+        moving = np.concatenate(
+            [
+                _is_moving(source, errors.case, errors.time_ns[errors.run == run])
+                for run, source in enumerate(sources)
+            ]
+        )
+        total = np.linalg.norm(errors.error[moving][:, errors.rotation], axis=1)
+        if len(total):
+            rmse_deg = float(np.degrees(np.sqrt(np.mean(total**2))))
+            rows.append((errors.case, errors.estimator, rmse_deg, len(total)))
+    return pd.DataFrame(rows, columns=["trial", "estimator", "movement_rmse_deg", "samples"])
+
+
+def _is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """What the last message before each stamp says; the topic speaks at every change."""
+    stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
+    row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1
+    return (row >= 0) & (stream["value"][row.clip(0), 0] != 0.0)
+
+
+def trials_figure(trials: pd.DataFrame) -> Figure:
+    """Total RMSE over movement of every trial and estimator; on a logarithmic axis."""
+    figure = Figure(figsize=(8, 1.5 + 0.5 * trials["trial"].nunique()), layout="constrained")
+    axes = figure.subplots()
+    table = trials.pivot_table(index="trial", columns="estimator", values="movement_rmse_deg")
+    table = table[trials["estimator"].drop_duplicates().tolist()].iloc[::-1]
+    table.plot.barh(ax=axes, logx=True)
+    axes.set(xlabel="total orientation RMSE over movement (deg)", ylabel="")
+    axes.legend(loc="lower right")
+    return figure
+
+
+def _claims(means: dict[str, float], options: InertialOptions, trials: int) -> list[Claim]:
+    own = means[options.estimator]
+    rivals = {name: value for name, value in means.items() if name != options.estimator}
+    claims = [
+        Claim(
+            f"mean total orientation RMSE over movement at most {options.target_deg:g} deg",
+            f"{options.target_deg:g} deg (own target; no tuning per trial)",
+            f"{own:.3f} deg over {trials} trials",
+            "confirmed" if own <= options.target_deg else "refuted",
+        )
+    ]
+    if rivals:
+        best = min(rivals, key=rivals.__getitem__)
+        claims.append(
+            Claim(
+                "better than gyro alone, gyro minus bias and TRIAD alone",
+                "smaller mean error than each of them",
+                f"{own:.3f} deg against {rivals[best]:.3f} deg of {best}, the best of them",
+                "confirmed" if own < rivals[best] else "refuted",
+            )
+        )
+    return claims
+
+
+INERTIAL = Study(
+    "orientation from inertial samples: error over movement, trial by trial", study, InertialOptions
+)

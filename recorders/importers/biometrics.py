@@ -1,0 +1,128 @@
+"""Score matrices of biometric matchers, such as the NIST Biometric Scores Set: one CSV per matcher.
+
+The first row holds the gallery's user ids, the first column the probes'. Matchers are named in the
+parameters, or in a file `matchers.toml` of the folder:
+
+    [[matchers]]
+    name = "face-C"          # the file is face-C.csv
+    modality = "face"
+    score = "similarity"     # or "distance"
+    failure = -1             # the score of what could not be enrolled
+"""
+
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.models.scores import Matcher, score_stream
+from recorders.parameters import Parameters, build
+from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
+
+
+class Matchers(Parameters):
+    """What matchers.toml says."""
+
+    matchers: list[Matcher] = []
+
+
+class ScoreMatricesParameters(Matchers):
+    """The matchers, and when probes arrive: the data say no times."""
+
+    probe_interval_s: PositiveFloat = 1.0
+
+
+class Matrix(NamedTuple):
+    """One file: ids of probes and gallery, scores (probes, gallery)."""
+
+    probes: list[str]
+    gallery: list[str]
+    scores: NDArray[np.float64]
+
+
+def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
+    """Read one matrix per matcher; users are numbered in the order of the files.
+
+    Raises BadInput that names the file where it is missing, malformed, has other users than the first,
+    or contradicts the sense that is declared for its scores.
+    """
+    matchers = parameters.matchers or _described(folder)
+    matrices = [_matrix(folder / f"{each.name}.csv") for each in matchers]
+    first = matrices[0]
+    for matcher, matrix in zip(matchers, matrices, strict=True):
+        path = folder / f"{matcher.name}.csv"
+        if matrix.probes != matrix.gallery:
+            raise BadInput(f"{path}: rows and columns must be of the same users in the same order")
+        if matrix.gallery != first.gallery:
+            raise BadInput(
+                f"{path}: {len(matrix.gallery)} users, not the {len(first.gallery)} of "
+                f"{matchers[0].name}.csv in the same order; give matrices of the same users"
+            )
+        _check_sense(path, matcher, matrix.scores)
+    arrival_s = parameters.probe_interval_s * np.arange(len(first.probes))
+    arrival_ns = SIMULATION_EPOCH_NS + np.rint(arrival_s * 1e9).astype(np.int64)
+    scores = np.stack([matrix.scores for matrix in matrices], axis=-1)
+    notes = {"times": f"made up: a probe every {parameters.probe_interval_s:g} s"}
+    return Recording([score_stream(matchers, scores, arrival_ns)], notes=notes)
+
+
+def _described(folder: Path) -> list[Matcher]:
+    path = folder / "matchers.toml"
+    try:
+        matchers = build(Matchers, tomllib.loads(path.read_text(encoding="utf-8")), str(path)).matchers
+    except FileNotFoundError:
+        raise BadInput(f"{path}: missing; name the matchers there or as parameter 'matchers'") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInput(f"{path}: is not readable as TOML ({error})") from None
+    if not matchers:
+        raise BadInput(f"{path}: names no matchers; give [[matchers]] with name and modality")
+    return matchers
+
+
+def _matrix(path: Path) -> Matrix:
+    try:
+        table = pd.read_csv(path, index_col=0, dtype={0: str}, keep_default_na=False)
+    except FileNotFoundError:
+        raise BadInput(f"{path}: missing; a matcher needs its matrix") from None
+    except (OSError, ValueError, IndexError) as error:
+        raise BadInput(f"{path}: cannot be read as a matrix with ids ({error})") from None
+    if table.empty or table.shape[0] != table.shape[1]:
+        raise BadInput(
+            f"{path}: {table.shape[0]} rows and {table.shape[1]} columns; give a square matrix"
+        )
+    numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
+    bad = ~np.isfinite(numbers)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        found = table.iloc[row, column]
+        raise BadInput(f"{path}: probe {row + 1}, gallery entry {column + 1} is {found!r}, no number")
+    return Matrix(table.index.astype(str).tolist(), table.columns.astype(str).tolist(), numbers)
+
+
+def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> None:
+    """Raise BadInput where a matcher tells nothing, or its scores go the other way than declared."""
+    valid = scores != matcher.failure if matcher.failure is not None else np.ones(scores.shape, bool)
+    genuine = np.eye(len(scores), dtype=bool)
+    if not valid.any() or np.ptp(scores[valid]) == 0:
+        raise BadInput(f"{path}: all scores are equal; leave this matcher out")
+    if not (valid & genuine).any() or not (valid & ~genuine).any():
+        raise BadInput(f"{path}: needs scores of the same and of different users; give more users")
+    ahead = np.median(scores[valid & genuine]) - np.median(scores[valid & ~genuine])
+    if ahead * (1 if matcher.score == "similarity" else -1) < 0:
+        other = "distance" if matcher.score == "similarity" else "similarity"
+        raise BadInput(
+            f"{path}: declared as {matcher.score}, but scores of the same user are "
+            f'{"lower" if ahead < 0 else "higher"} than those of others; declare score = "{other}"'
+        )
+
+
+SCORE_MATRICES = Importer(
+    "biometric score matrices: a folder with a CSV per matcher, ids in the first row and column",
+    ScoreMatricesParameters,
+    read,
+)

@@ -1,0 +1,129 @@
+"""BROAD, the Berlin Robust Orientation Estimation Assessment Dataset: inertial samples with truth.
+
+Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021, CC BY 4.0. A trial is one HDF5 file; a file or a folder
+of them is one run, in which every trial has its own topics under the file's name.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.orientation import require_unit
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
+
+ORIENTATION = {
+    "components": "orientation_w,orientation_x,orientation_y,orientation_z",
+    "kinds": "quaternion,quaternion,quaternion,quaternion",
+}
+# Dataset and width; None for a plain column.
+DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement": None}
+
+
+class BroadParameters(Parameters):
+    """How far a quaternion may be from unit length, and what is a gap in the inertial stream."""
+
+    unit_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    gap_s: PositiveFloat = 0.1
+
+
+def read(path: Path, parameters: BroadParameters) -> Recording:
+    """Read a trial or a folder of trials; samples that are not finite are dropped and told in the notes.
+
+    The files have no clock of their own: all trials start at the same epoch.
+    Raises BadInput that names the file where it is no HDF5, or lacks or contradicts the truth.
+    """
+    files = sorted(path.glob("*.hdf5")) if path.is_dir() else [path]
+    if not files:
+        raise BadInput(f"{path}: no .hdf5 files; give a BROAD trial or the folder of some")
+    notes: dict[str, str] = {}
+    streams = [stream for file in files for stream in _trial(file, parameters, notes)]
+    return Recording(streams, SIMULATION_EPOCH_NS, notes)
+
+
+def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> list[Stream]:
+    data, rate_hz = _datasets(file)
+    count = len(data["movement"])
+    time_ns = SIMULATION_EPOCH_NS + np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    inertial = np.concatenate([data["imu_acc"], data["imu_gyr"], data["imu_mag"]], axis=1)
+    sampled = np.isfinite(inertial).all(axis=1)
+    seen = np.isfinite(data["opt_quat"]).all(axis=1)
+    if not sampled.any() or not seen.any():
+        missing = "truth" if sampled.any() else "inertial samples"
+        raise BadInput(f"{file}: no {missing}: every value is NaN; leave this trial out")
+    truth = require_unit(data["opt_quat"][seen], f"{file}: truth opt_quat", parameters.unit_tolerance)
+    moving = data["movement"] != 0
+    changes = np.flatnonzero(np.append(True, moving[1:] != moving[:-1]))
+    name = file.stem
+    _tell_gaps(notes, f"{name}, inertial samples", time_ns, sampled, parameters.gap_s)
+    _tell_gaps(notes, f"{name}, truth", time_ns, seen, parameters.gap_s)
+    samples = inertial[sampled]
+    return [
+        make_stream(
+            f"/{name}/truth", schemas.TRUTH_STATE, time_ns[seen], metadata=ORIENTATION, state=truth
+        ),
+        make_stream(
+            f"/{name}/inertial",
+            schemas.INERTIAL_SAMPLE,
+            time_ns[sampled],
+            metadata={"rate_hz": repr(rate_hz)},
+            specific_force_mps2=samples[:, :3],
+            turn_rate_radps=samples[:, 3:6],
+            magnetic_field_ut=samples[:, 6:],
+        ),
+        make_stream(
+            f"/{name}/movement",
+            schemas.VECTOR_MEASUREMENT,
+            time_ns[changes],
+            metadata={"components": "moving", "kinds": "linear"},
+            value=moving[changes, None].astype(float),
+        ),
+    ]
+
+
+def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
+    """The datasets of one file, all of one length, and the sampling rate."""
+    try:
+        with h5py.File(file) as content:
+            missing = [name for name in DATASETS if name not in content]
+            if missing:
+                what = "truth, " if missing[0] == "opt_quat" else ""
+                raise BadInput(f"{file}: has no {what}dataset {missing[0]}; give a BROAD trial with it")
+            data = {name: np.asarray(content[name][()]) for name in DATASETS}
+            rate_hz = float(content.attrs.get("sampling_rate", np.nan))
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise BadInput(f"{file}: cannot be read as HDF5 ({error}); give a BROAD trial") from None
+    if not rate_hz > 0.0 or not np.isfinite(rate_hz):
+        raise BadInput(f"{file}: attribute sampling_rate must be a positive number of Hz, as published")
+    count = len(data["movement"]) if data["movement"].ndim else 0
+    for name, width in DATASETS.items():
+        expected = (count,) if width is None else (count, width)
+        if data[name].shape != expected or count == 0:
+            raise BadInput(f"{file}: dataset {name} has shape {data[name].shape}; expected {expected}")
+    return data, rate_hz
+
+
+def _tell_gaps(
+    notes: dict[str, str], what: str, time_ns: NDArray, kept: NDArray[np.bool_], gap_s: float
+) -> None:
+    """Note how much was dropped, and the gaps that are longer than `gap_s`."""
+    if kept.all():
+        return
+    ends = [time_ns[:1], time_ns[kept], time_ns[-1:]]
+    silent_s = np.diff(np.concatenate(ends)) * 1e-9
+    gaps = silent_s[silent_s > gap_s]
+    longest = f", {len(gaps)} gaps over {gap_s:g} s, the longest {gaps.max():.2f} s" if len(gaps) else ""
+    notes[what] = f"{int((~kept).sum())} of {len(kept)} not finite, dropped{longest}"
+
+
+BROAD = Importer(
+    "BROAD trials: inertial samples, magnetometer and optical truth; an .hdf5 file or a folder of them",
+    BroadParameters,
+    read,
+)

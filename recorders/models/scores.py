@@ -1,0 +1,100 @@
+"""Biometric matchers and their scores: every probe compared with every gallery entry, as columns.
+
+Probe i and gallery entry i are of the same user. A score stands as the matcher gave it; the stream's
+metadata say which matchers are distances, and what a matcher gives where it could not enrol an image.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.parameters import Parameters
+
+TOPIC = "/scores"
+
+
+class Matcher(Parameters):
+    """A matcher: its name, what it looks at, the sense of its scores, and its score of a failure."""
+
+    name: str
+    modality: str
+    score: Literal["similarity", "distance"] = "similarity"
+    failure: float | None = None
+
+
+class Comparisons(NamedTuple):
+    """All comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
+
+    Distances are negated: greater is more alike. `failed` marks the failures to enrol; `arrival_ns`
+    (users,) says when each probe came.
+    """
+
+    matchers: tuple[Matcher, ...]
+    scores: NDArray[np.float64]
+    failed: NDArray[np.bool_]
+    arrival_ns: NDArray[np.int64]
+
+
+def score_stream(
+    matchers: Sequence[Matcher], scores: NDArray[np.float64], arrival_ns: ArrayLike
+) -> Stream:
+    """The stream of scores (users, users, matchers), probe by probe as they arrive (users,)."""
+    users = len(scores)
+    metadata = {
+        "matchers": ",".join(each.name for each in matchers),
+        "modalities": ",".join(each.modality for each in matchers),
+        "senses": ",".join(each.score for each in matchers),
+        "failure_scores": ",".join(
+            "" if each.failure is None else repr(each.failure) for each in matchers
+        ),
+    }
+    return make_stream(
+        TOPIC,
+        schemas.SCORE_VECTOR,
+        np.repeat(arrival_ns, users),
+        metadata=metadata,
+        probe_id=np.repeat(np.arange(users), users),
+        gallery_id=np.tile(np.arange(users), users),
+        scores=scores.reshape(users * users, len(matchers)),
+    )
+
+
+def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
+    """The matchers that a score stream's metadata name; raises BadInput where they do not fit."""
+    keys = ("matchers", "modalities", "senses", "failure_scores")
+    try:
+        rows = zip(*(metadata[key].split(",") for key in keys), strict=True)
+        return tuple(
+            Matcher(name=name, modality=modality, score=sense, failure=float(failed) if failed else None)
+            for name, modality, sense, failed in rows
+        )
+    except (KeyError, ValueError):
+        raise BadInput(
+            f"topic {TOPIC}: the metadata {', '.join(keys)} must have one entry per matcher; "
+            "record the scores again"
+        ) from None
+
+
+def comparisons_of(stream: Stream) -> Comparisons:
+    """A score stream as matrices; raises BadInput where a pair of users is missing or there twice."""
+    matchers = matchers_of(stream.metadata)
+    probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
+    users = int(max(probe.max(initial=-1), gallery.max(initial=-1))) + 1
+    pairs = np.unique(probe * users + gallery)
+    if len(pairs) != len(stream) or len(stream) != users**2:
+        raise BadInput(
+            f"topic {stream.topic}: {len(stream)} score vectors, {len(pairs)} of them of different "
+            f"pairs, for {users} users; every probe must be compared once with every gallery entry"
+        )
+    scores = np.empty((users, users, len(matchers)))
+    scores[probe, gallery] = stream["scores"]
+    failures = np.array([np.nan if each.failure is None else each.failure for each in matchers])
+    failed = (scores == failures) | np.isnan(scores)
+    senses = np.array([1.0 if each.score == "similarity" else -1.0 for each in matchers])
+    arrival_ns = np.zeros(users, np.int64)
+    arrival_ns[probe] = stream.publish_time_ns
+    return Comparisons(matchers, scores * senses, failed, arrival_ns)

@@ -1,0 +1,94 @@
+"""Two headings that turn with each other, and correlated measurements of both, modulo 2 pi.
+
+x+ = x + c (cos x2, sin x1) + drift + w and z = x + v: the system of Kurz and Hanebeck, "Deterministic
+Sampling on the Torus for Bivariate Circular Estimation", 2016, section IV, with noise. The measurements'
+channel states the model.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from recorders.log import make_stream, schemas
+from recorders.models.headings import turn_together
+from recorders.models.planar import wrap_angle
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+Correlation = Annotated[float, Field(gt=-1, lt=1)]
+HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
+
+
+def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
+    """The covariance (2, 2) of two numbers with one standard deviation."""
+    return sigma**2 * np.array([[1.0, correlation], [correlation, 1.0]])
+
+
+class HeadingsParameters(Parameters):
+    """The scenario; standard deviations are those of both angles."""
+
+    steps: PositiveInt = 50
+    step_s: PositiveFloat = 0.1
+    coupling_rad: float = 0.1
+    drift1_rad: float = 0.3
+    drift2_rad: float = -0.2
+    system_sigma_rad: PositiveFloat = 0.2
+    system_correlation: Correlation = 0.8
+    measurement_sigma_rad: PositiveFloat = 0.8
+    measurement_correlation: Correlation = 0.5
+    prior_sigma_rad: PositiveFloat = 1.0
+
+    def covariances(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Those of system and measurement noise, (2, 2), rad^2."""
+        return (
+            equal_sigmas(self.system_sigma_rad, self.system_correlation),
+            equal_sigmas(self.measurement_sigma_rad, self.measurement_correlation),
+        )
+
+
+def simulate(parameters: HeadingsParameters, rng: np.random.Generator) -> Recording:
+    """Record one run: prior, truth after every step, and its measurement in [0, 2 pi)."""
+    system, measurement = parameters.covariances()
+    system_noise = rng.multivariate_normal((0.0, 0.0), system, parameters.steps)
+    noise = rng.multivariate_normal((0.0, 0.0), measurement, parameters.steps)
+    x = parameters.prior_sigma_rad * rng.standard_normal(2)
+    truth = np.empty((parameters.steps, 2))
+    for step, each in enumerate(system_noise):
+        moved = turn_together(
+            x[0], x[1], parameters.coupling_rad, parameters.drift1_rad, parameters.drift2_rad
+        )
+        truth[step] = x = np.array(moved) + each
+    elapsed_s = parameters.step_s * np.arange(parameters.steps + 1)
+    time_ns = SIMULATION_EPOCH_NS + np.rint(1e9 * elapsed_s).astype(np.int64)
+    stated = parameters.model_dump(exclude={"steps", "step_s", "prior_sigma_rad"})
+    return Recording(
+        [
+            make_stream(
+                "/prior",
+                schemas.GAUSSIAN_ESTIMATE,
+                time_ns[:1],
+                metadata=HEADINGS,
+                mean=np.zeros((1, 2)),
+                covariance=parameters.prior_sigma_rad**2 * np.eye(2).reshape(1, 4),
+            ),
+            make_stream(
+                "/truth", schemas.TRUTH_STATE, time_ns[1:], metadata=HEADINGS, state=wrap_angle(truth)
+            ),
+            make_stream(
+                "/headings",
+                schemas.VECTOR_MEASUREMENT,
+                time_ns[1:],
+                metadata={**HEADINGS, **{name: repr(value) for name, value in stated.items()}},
+                value=(truth + noise) % (2.0 * np.pi),
+            ),
+        ]
+    )
+
+
+TORUS_HEADINGS = Simulator(
+    "two headings that turn with each other; correlated noisy measurements of both",
+    HeadingsParameters,
+    simulate,
+)

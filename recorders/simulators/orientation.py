@@ -1,0 +1,130 @@
+"""Axes in the plane and orientations in space that turn at random, and are measured with noise.
+
+x+ = x (+) w and z = x (+) v, with Bingham noise or Gaussian noise scaled to unit length; the evaluation
+of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, section 7. The
+measurements' channel states the noise and the prior as JSON.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PositiveFloat, PositiveInt, model_validator
+
+from recorders.log import Schema, make_stream, schemas
+from recorders.models.directional_noise import sample_bingham, sample_projected_gaussian
+from recorders.models.orientation import compose
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+
+class Noise(Parameters):
+    """A distribution on the unit vectors, along the components of a complex number or quaternion.
+
+    `diagonal` are the concentrations of a Bingham distribution, 0 for its mode and at most 0 else; or
+    the variances of a Gaussian about the identity (1, 0, ...), whose samples are scaled to unit length.
+    """
+
+    distribution: Literal["bingham", "gaussian"] = "bingham"
+    diagonal: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _has_its_sign(self) -> Self:
+        if len(self.diagonal) not in (2, 4):
+            raise ValueError("give 2 numbers for an axis, 4 for an orientation")
+        if self.distribution == "bingham" and max(self.diagonal) != 0.0:
+            raise ValueError("Bingham concentrations are 0 for the mode and at most 0 else")
+        if self.distribution == "gaussian" and min(self.diagonal) < 0.0:
+            raise ValueError("variances are not negative")
+        return self
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Unit vectors (count, d)."""
+        d = len(self.diagonal)
+        if self.distribution == "bingham":
+            return sample_bingham(np.eye(d), np.broadcast_to(self.diagonal, (count, d)), rng)
+        return sample_projected_gaussian(np.eye(d)[0], np.diag(self.diagonal), (count,), rng)
+
+
+class AxisParameters(Parameters):
+    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode."""
+
+    steps: PositiveInt = 100
+    step_s: PositiveFloat = 0.1
+    start: tuple[float, ...] = (1.0, 0.0)
+    prior: Noise = Noise(diagonal=(-1.0, 0.0))
+    system: Noise = Noise(diagonal=(0.0, -200.0))
+    measurement: Noise = Noise(diagonal=(0.0, -2.0))
+
+    @model_validator(mode="after")
+    def _has_one_dimension(self) -> Self:
+        sizes = [len(self.start), *(len(each.diagonal) for each in (self.prior, self.system))]
+        if sizes != [len(self.measurement.diagonal)] * 3 or sizes[0] != self.dimension():
+            raise ValueError(
+                f"start, prior, system and measurement have {self.dimension()} numbers each"
+            )
+        if not np.isclose(np.linalg.norm(self.start), 1.0, rtol=0.0, atol=1e-9):
+            raise ValueError("start has unit length")
+        return self
+
+    @classmethod
+    def dimension(cls) -> int:
+        """The number of components."""
+        return 2
+
+
+class OrientationParameters(AxisParameters):
+    """The paper's four-dimensional evaluation: (61)-(65)."""
+
+    start: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
+    prior: Noise = Noise(diagonal=(-1.0, -1.0, -1.0, 0.0))
+    system: Noise = Noise(diagonal=(0.0, -2.0, -200.0, -200.0))
+    measurement: Noise = Noise(diagonal=(0.0, -500.0, -500.0, -500.0))
+
+    @classmethod
+    def dimension(cls) -> int:
+        """The number of components."""
+        return 4
+
+
+def simulate(
+    schema: Schema, kinds: Mapping[str, str], parameters: AxisParameters, rng: np.random.Generator
+) -> Recording:
+    """Record one run: the truth after every step, and its measurement."""
+    system_rng, measurement_rng = rng.spawn(2)
+    turns = parameters.system.sample(parameters.steps, system_rng)
+    truth = np.empty(turns.shape)
+    x = np.array(parameters.start)
+    for step, turn in enumerate(turns):
+        x = compose(x, turn)
+        truth[step] = x = x / np.linalg.norm(x)
+    measured = compose(truth, parameters.measurement.sample(parameters.steps, measurement_rng))
+    elapsed_s = parameters.step_s * np.arange(1, parameters.steps + 1)
+    time_ns = SIMULATION_EPOCH_NS + np.rint(1e9 * elapsed_s).astype(np.int64)
+    named = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
+    stated = {
+        each: getattr(parameters, each).model_dump_json() for each in ("prior", "system", "measurement")
+    }
+    (field,) = (entry.name for entry in schema if entry.kind == "vector")
+    return Recording(
+        [
+            make_stream("/truth", schemas.TRUTH_STATE, time_ns, metadata=named, state=truth),
+            make_stream(f"/{field}", schema, time_ns, metadata=stated, **{field: measured}),
+        ]
+    )
+
+
+AXIS_KINDS = {"axis_x": "axis", "axis_y": "axis"}
+ORIENTATION_KINDS = {f"orientation_{part}": "quaternion" for part in "wxyz"}
+AXIS = Simulator(
+    "an axis in the plane, equal to its negative, turns at random; noisy measurements of it",
+    AxisParameters,
+    partial(simulate, schemas.AXIS, AXIS_KINDS),
+)
+ORIENTATION = Simulator(
+    "an orientation in space turns at random; noisy quaternions of it",
+    OrientationParameters,
+    partial(simulate, schemas.ORIENTATION, ORIENTATION_KINDS),
+)

@@ -1,0 +1,127 @@
+"""The estimators of orientation from inertial samples, as a replay has them; see `inertial`."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.log import schemas
+from recorders.parameters import Parameters
+from replay.engine import Estimator
+from replay.estimators.inertial import (
+    InertialModel,
+    InertialSamples,
+    OrientationEstimates,
+    attitudes,
+    run_dead_reckoning,
+    run_inertial_filter,
+    start_inertial_filter,
+    start_reckoning,
+)
+from replay.plain import Components, Given, Messages, Results, recursive
+
+ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
+Advance = Callable[[InertialModel, Any, InertialSamples], tuple[Any, OrientationEstimates]]
+
+
+class InertialParameters(Parameters):
+    """See `inertial.InertialModel`: the same numbers for all logs."""
+
+    rest_s: NonNegativeFloat = 20.0
+    block_s: PositiveFloat = 1.0
+    attitude_sigma_deg: Annotated[float, Field(gt=0, le=90)] = 10.0
+    drift_sigma_deg: Annotated[float, Field(gt=0, le=90)] = 0.4
+    gap_s: PositiveFloat = 0.1
+
+    @property
+    def model(self) -> InertialModel:
+        """The same in radians."""
+        return InertialModel(
+            rest_s=self.rest_s,
+            block_s=self.block_s,
+            attitude_sigma_rad=math.radians(self.attitude_sigma_deg),
+            drift_sigma_rad=math.radians(self.drift_sigma_deg),
+            gap_s=self.gap_s,
+        )
+
+
+class GyroParameters(InertialParameters):
+    """Whether the gyro's mean over the rest is taken off."""
+
+    unbiased: bool = True
+
+
+def _follow(
+    run: int,
+    settings: tuple[InertialModel, Advance],
+    messages: Messages,
+    state: Any,
+    results: Results,
+) -> None:
+    """Take one run through its samples; `value` is specific force, turn rate, magnetic field."""
+    model, advance = settings
+    rows = slice(int(messages.offsets[run]), int(messages.offsets[run + 1]))
+    value = messages.value[rows]
+    offsets = np.array([0, len(value)])
+    samples = InertialSamples(
+        offsets, messages.time_ns[rows], value[:, 3:6], value[:, :3], value[:, 6:9]
+    )
+    before = type(state)(*(part[run : run + 1] for part in state))
+    after, estimates = advance(model, before, samples)
+    for part, changed in zip(state, after, strict=True):
+        part[run] = changed[0]
+    results.mean[rows], results.covariance[rows] = estimates
+
+
+def _inertial(
+    summary: str,
+    parameters: type[Any],
+    start: Callable[[Given[Any]], tuple[tuple[InertialModel, Advance], Any]],
+) -> Estimator[Any]:
+    return recursive(
+        summary,
+        parameters=parameters,
+        streams={"inertial": schemas.INERTIAL_SAMPLE},
+        whole={},
+        components=ORIENTATION,
+        truth="truth",
+        start=start,
+        follow=_follow,
+        compiled=False,
+    )
+
+
+def _start_bingham(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
+    return (given.parameters.model, run_inertial_filter), start_inertial_filter(given.runs)
+
+
+def _start_gyro(given: Given[GyroParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
+    advance = partial(run_dead_reckoning, unbiased=given.parameters.unbiased)
+    return (given.parameters.model, advance), start_reckoning(given.runs)
+
+
+def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
+    def advance(
+        model: InertialModel, state: Any, samples: InertialSamples
+    ) -> tuple[Any, OrientationEstimates]:
+        return state, attitudes(model, samples)
+
+    return (given.parameters.model, advance), start_reckoning(given.runs)
+
+
+BINGHAM_INERTIAL = _inertial(
+    "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
+    InertialParameters,
+    _start_bingham,
+)
+GYRO = _inertial(
+    "the gyro alone, from the attitude of the rest at the start on", GyroParameters, _start_gyro
+)
+TRIAD = _inertial(
+    "the TRIAD attitude of every sample's accelerometer and magnetometer",
+    InertialParameters,
+    _start_triad,
+)

@@ -1,0 +1,116 @@
+"""Components that are no vector space: angles, axes and orientations, and their errors in tangent space.
+
+Every component of a state has a kind. The two of an axis, and the four of a quaternion, stand side by
+side and are equal to their negatives; their error is the rotation from truth to estimate in the body's
+frame, an angle or a rotation vector, as are the covariances of estimates. Kurz, Gilitschenski, Julier,
+Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3 and 7.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.models.orientation import compose, conjugate
+from recorders.models.planar import wrap_angle
+
+Floats = NDArray[np.float64]
+Kind = Literal["linear", "angle", "axis", "quaternion"]
+# How many components a thing of a kind has.
+WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 2, "quaternion": 4}
+
+
+def are_kinds(kinds: Sequence[str]) -> bool:
+    """Whether these are kinds, with all components of every axis and quaternion side by side."""
+    index = 0
+    while index < len(kinds):
+        width = WIDTHS.get(kinds[index])
+        if width is None or tuple(kinds[index : index + width]) != (kinds[index],) * width:
+            return False
+        index += width
+    return True
+
+
+def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
+    """Names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
+
+    A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
+    of kind "rotation".
+    """
+    found: list[tuple[str, str]] = []
+    for kind, columns in _things(kinds):
+        name = components[columns.start]
+        stem = name.rpartition("_")[0] or name
+        if kind == "quaternion":
+            found += [(f"{stem}_{axis}_rad", "rotation") for axis in "xyz"]
+        else:
+            found.append((f"{stem}_rad", "angle") if kind == "axis" else (name, kind))
+    return found
+
+
+def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
+    """Estimate - truth, both (n, components), in the tangent space (n, tangent components)."""
+    parts = []
+    for kind, columns in _things(kinds):
+        if kind in ("axis", "quaternion"):
+            relative = compose(conjugate(truth[:, columns]), estimate[:, columns])
+            parts.append(rotation_vector(relative))
+        else:
+            change = estimate[:, columns] - truth[:, columns]
+            parts.append(wrap_angle(change) if kind == "angle" else change)
+    return np.concatenate(parts, axis=1) if parts else np.empty((len(estimate), 0))
+
+
+def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
+    """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
+    value = np.empty(left.shape)
+    for kind, columns in _things(kinds):
+        here, there = left[:, columns], right[:, columns]
+        value[:, columns] = (
+            _slerp(here, there, weight)
+            if kind in ("axis", "quaternion")
+            else here + weight[:, None] * difference(there, here, [kind])
+        )
+    return value
+
+
+def rotation_vector(x: Floats) -> Floats:
+    """The shortest rotations of unit complex numbers (n, 2), as angles (n, 1), or of quaternions (n, 4).
+
+    In rad; x and -x are the same, so that the angle of an axis lies in [-pi/2, pi/2].
+    """
+    folded = x * np.where(x[:, :1] < 0.0, -1.0, 1.0)
+    length = np.linalg.norm(folded[:, 1:], axis=1, keepdims=True)
+    angle = np.arctan2(length, folded[:, :1])
+    small = length < 1e-12
+    scale = np.where(small, 1.0, angle / np.where(small, 1.0, length))
+    return (1.0 if x.shape[1] == 2 else 2.0) * scale * folded[:, 1:]
+
+
+def vector_part_covariance(x: Floats, second_moment: Floats) -> Floats:
+    """Covariances (n, t, t) of small rotations about unit vectors x (n, d) with E(y y^T) (n, d, d).
+
+    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
+    """
+    turn = np.stack([compose(conjugate(x), basis) for basis in np.eye(x.shape[1])], axis=-1)
+    local = turn @ second_moment @ np.swapaxes(turn, -1, -2)
+    return (1.0 if x.shape[1] == 2 else 4.0) * local[:, 1:, 1:]
+
+
+def _slerp(left: Floats, right: Floats, weight: Floats) -> Floats:
+    """Along the great circle, from left to the nearer one of right and -right."""
+    turn = rotation_vector(compose(conjugate(left), right))
+    angle = (1.0 if left.shape[1] == 2 else 0.5) * weight[:, None] * turn
+    length = np.linalg.norm(angle, axis=1, keepdims=True)
+    step = np.concatenate([np.cos(length), angle * np.sinc(length / np.pi)], axis=1)
+    return compose(left, step)
+
+
+def _things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
+    """Kind and columns of every number, angle, axis and quaternion."""
+    index = 0
+    while index < len(kinds):
+        width = WIDTHS[kinds[index]]
+        yield kinds[index], slice(index, index + width)
+        index += width
