@@ -63,7 +63,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
 
 
 def format_value(value: object) -> str:
-    """Four significant digits for floats, nothing for None, a long list as its range, text for the rest."""
+    """Four significant digits for floats, nothing for None, the range of a long list, or text."""
     if isinstance(value, list):
         known = [each for each in value if each is not None]
         if len(known) > 4:
