@@ -72,6 +72,23 @@ def kept(table: pd.DataFrame, column: str = "share", reports: int = MANY_REPORTS
     return Kept(len(shares), float((shares >= KEPT_SHARE).mean()), float(shares.mean()))
 
 
+def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:
+    """How many numbers spoke within the last `live_s`: times (m,) at which that changes, counts (m,).
+
+    Times (n,) are sorted.
+    """
+    order = np.lexsort((time_ns, numbers))
+    sorted_ns, sorted_numbers = time_ns[order], numbers[order]
+    live_ns = round(live_s * 1e9)
+    begins = np.append(True, (np.diff(sorted_numbers) != 0) | (np.diff(sorted_ns) > live_ns))
+    begin_ns = sorted_ns[begins]
+    end_ns = sorted_ns[np.append(begins[1:], True)] + live_ns
+    at_ns = np.unique(np.concatenate([begin_ns, end_ns]))
+    at_ns = at_ns[at_ns <= time_ns[-1]]
+    began = np.searchsorted(np.sort(begin_ns), at_ns, side="right")
+    return at_ns, began - np.searchsorted(np.sort(end_ns), at_ns, side="right")
+
+
 def track_tables(output: Output) -> list[pd.DataFrame]:
     """A table per run of a stream of tracks; none where the log does not say whose the reports are.
 
