@@ -205,8 +205,9 @@ def score_of(
         c += settings.velocity_variance[level] + reports.velocity_variance[event]
         weight = mixed(tracks.weight[run, place, level], settings)
         density += weight * density_at(difference, a, b, c)
-    # the rate of a track that is silent for long falls: Lomax' distribution of the intervals
-    density /= tracks.interval_s[run, place] + duration_s
+    # the rate of reports rises until half the usual interval is over, and falls with a long silence
+    usual_s = tracks.interval_s[run, place]
+    density *= min(1.0, 2.0 * duration_s / usual_s) / (usual_s + duration_s)
     if are_slow(tracks, run, place, reports.speed_mps[event], settings):
         course_rad, before_rad = reports.course_rad[event], tracks.course_rad[run, place]
         held, turned = tracks.held[run, place, 0], tracks.held[run, place, 1]

@@ -22,6 +22,7 @@ from replay.tracks import live_counts, track_tables
 REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
 TRAIL_S = 300.0
 LIVE_S = 600.0
+LISTED_VESSELS = 200
 # What is drawn of each estimator at most.
 DRAWN_REPORTS = 50_000
 # Hues this far apart, in turns, never meet again soon.
@@ -128,9 +129,11 @@ def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(output):
-        columns = ("thing", "reports", "share", "tracks", "switches")
-        for thing, reports, share, count, switches in table[list(columns)].itertuples(index=False):
+        shown = table[["thing", "reports", "share", "tracks", "switches"]][:LISTED_VESSELS]
+        for thing, reports, share, count, switches in shown.itertuples(index=False):
             lines.append(f"|{thing}|{reports}|{share:.3f}|{count}|{switches}|")
+        if len(table) > LISTED_VESSELS:
+            lines.append(f"\n{len(table) - LISTED_VESSELS} more are in the study's tables")
     canvas.fix("vessels", rr.TextDocument("\n".join(lines), media_type="text/markdown"))
     return rrb.TextDocumentView(origin="vessels", name=f"Vessels in tracks of {name}")
 

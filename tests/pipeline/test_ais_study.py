@@ -1,7 +1,9 @@
 """The AIS experiment from file to result: metrics, tables, claims, timeline."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -74,3 +76,38 @@ def test_the_solent_meets_its_targets(real_data: Path, tmp_path: Path):
     assert [claim.verdict for claim in result.claims] == ["confirmed", "confirmed"]
     assert result.metrics["report-tracker.kept_track_percent"] >= 70
     assert np.all([value is not None for value in result.metrics.values()])
+
+
+def test_on_the_command_line_block_by_block(
+    tmp_path: Path, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+):
+    """Import tells what was found; a replay from the log and its evaluation agree."""
+    monkeypatch.chdir(tmp_path)
+    table(tmp_path, far=True)
+    said = fuselog("import", "ais", "ais.csv", "-o", "log.mcap")
+    assert said.code == 0
+    assert "wrong positions: 1 over 50 m/s" in said.out + said.err
+    replayed = fuselog("replay", "log.mcap", "-e", "report-tracker", "--json").json
+    evaluated = fuselog("evaluate", "log.estimates.mcap", "--json").json
+    assert replayed["metrics"] == evaluated["metrics"]
+    assert replayed["metrics"]["report-tracker.kept_track_percent"] == 100
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (HEADER, ("ais.csv", "no reports")),
+        (f"{HEADER}\n2020-01-01,1,95,0,0,0", ("data row 1", "Latitude_degrees", "'95'", "-90 to 91")),
+        ("a,b\n1,2", ("no column Time",)),
+    ],
+)
+def test_bad_tables_end_with_two_and_one_sentence(
+    tmp_path: Path, fuselog: Callable[..., Any], content: str, words: tuple[str, ...]
+):
+    data = tmp_path / "ais.csv"
+    data.write_text(content)
+    said = fuselog("run", "ais", "--data", str(data), "--out", str(tmp_path / "out"))
+    assert said.code == 2
+    assert said.err.count("\n") == 1
+    assert all(word in said.err for word in words)
+    assert not (tmp_path / "out").exists()
