@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.ensemble import replay_in_memory
+from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
 from replay.blocks import Block, gather, merge_events
@@ -150,6 +152,13 @@ def test_silent_tracks_are_dropped_and_numbers_stay():
     settings = {"report-tracker": {"forget_s": 200.0}}
     found = replay_in_memory([source(vessel)], settings)[TOPIC]["track_id"]
     assert found.tolist() == [0] * 10 + [1] * 19
+
+
+def test_levels_in_another_order_are_refused():
+    with pytest.raises(BadInput, match="quiet levels first"):
+        bind(
+            "report-tracker", [source(straight((0, 0), (1, 0), 9.0))], {"sigma_position_m": (9, 3, 2, 1)}
+        )
 
 
 def test_table_of_tracks_by_hand():
