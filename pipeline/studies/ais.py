@@ -102,7 +102,7 @@ def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:
     who = f"{own.things} vessels with more than {options.more_reports_than} reports"
     return [
         judged(
-            f"{options.kept_share:.0%} of {who} keep one track for {KEPT_SHARE:.0%} of them",
+            f"{options.kept_share:.0%} of {who} keep one track for {KEPT_SHARE:.0%} of their reports",
             "own target; plain nearest neighbour on position and velocity: 62 %",
             f"{100 * own.kept_share:.1f} %",
             own.kept_share >= options.kept_share,

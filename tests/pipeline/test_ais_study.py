@@ -91,6 +91,10 @@ def test_on_the_command_line_block_by_block(
     evaluated = fuselog("evaluate", "log.estimates.mcap", "--json").json
     assert replayed["metrics"] == evaluated["metrics"]
     assert replayed["metrics"]["report-tracker.kept_track_percent"] == 100
+    part = fuselog(
+        "replay", "log.mcap", "-e", "report-tracker", "--start", "5", "--end", "580", "--json"
+    )
+    assert part.json["metrics"]["report-tracker.judged_things"] == 2
 
 
 @pytest.mark.parametrize(

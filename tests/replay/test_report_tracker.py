@@ -126,6 +126,32 @@ def test_estimates_are_near_the_truth_and_as_sure_as_they_say():
     assert np.abs(error[:, ::2]).max() < 5.0
 
 
+def test_with_equal_levels_it_is_a_kalman_filter():
+    """Means and covariances of one vessel are those of the textbook's matrices."""
+    equal = {
+        "acceleration_density": [0.05] * 4,
+        "sigma_position_m": [5.0] * 4,
+        "sigma_velocity_mps": [0.3] * 4,
+    }
+    log = source(straight((0, 0), (6, 2), 7.0))
+    stream = replay_in_memory([log], {"report-tracker": equal})[TOPIC].stream
+    reports = log.streams["/reports"]
+    course, speed = reports["course_rad"], reports["speed_mps"]
+    x, y = reports["position_m"].T
+    seen = np.stack([x, speed * np.sin(course), y, speed * np.cos(course)], axis=1)
+    noise = np.diag([25.0, 0.09, 25.0, 0.09])
+    motion = np.kron(np.eye(2), [[1.0, 7.0], [0.0, 1.0]])
+    disturbance = 0.05 * np.kron(np.eye(2), [[7.0**3 / 3, 7.0**2 / 2], [7.0**2 / 2, 7.0]])
+    mean, covariance = seen[0], noise
+    for row in range(1, len(seen)):
+        mean, covariance = motion @ mean, motion @ covariance @ motion.T + disturbance
+        gain = covariance @ np.linalg.inv(covariance + noise)
+        mean = mean + gain @ (seen[row] - mean)
+        covariance = covariance - gain @ covariance
+        assert_allclose(stream["mean"][row], mean, rtol=1e-11, atol=1e-9)
+        assert_allclose(stream["covariance"][row].reshape(4, 4), covariance, rtol=1e-9, atol=1e-11)
+
+
 def test_blocks_and_ensembles_change_nothing():
     """Three runs at once, and one run in three blocks, give the same bits."""
     runs = [source(straight((0, 0), (5, k), 7.0), straight((0, 50), (5, 0), 9.0)) for k in range(3)]
