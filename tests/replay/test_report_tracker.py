@@ -174,10 +174,11 @@ def test_blocks_and_ensembles_change_nothing():
 def test_silent_tracks_are_dropped_and_numbers_stay():
     """After `forget_s` a vessel that comes back is a new one; numbers are never given twice."""
     vessel = straight((0, 0), (0, 0), 10.0)
-    vessel = vessel[(vessel[:, 0] < 100) | (vessel[:, 0] > 400)]
+    vessel[20:, 0] += 300.0
+    vessel[40:, 0] += 300.0
     settings = {"report-tracker": {"forget_s": 200.0}}
     found = replay_in_memory([source(vessel)], settings)[TOPIC]["track_id"]
-    assert found.tolist() == [0] * 10 + [1] * 19
+    assert found.tolist() == [0] * 20 + [1] * 20 + [2] * 20
 
 
 def test_levels_in_another_order_are_refused():
