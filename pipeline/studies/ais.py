@@ -89,7 +89,8 @@ def tracks_figure(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions
             curves[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
     for label, (time_ns, numbers) in curves.items():
         at_ns, live = live_counts(time_ns, numbers, options.live_s)
-        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1)
+        colour = {"color": "0.4"} if label == "vessels" else {}
+        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1, **colour)
     below.set(xlabel="time (s)", ylabel=f"heard within {options.live_s:g} s", ylim=(0, None))
     below.legend(loc="lower right")
     return figure
