@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.blocks import Ragged
+from replay.estimators.feasible_sets import signed_area
 from replay.evaluation import split_topic, truth_at
 from replay.sources import Source
 
@@ -32,11 +33,20 @@ class JudgedSets:
     faults: int
 
 
-def polygons_of(sets: Stream, first: int, count: int) -> list[Floats]:
-    """The rings (n, 2) of the frame whose vertices are rows first ... first + count - 1."""
-    rows = slice(first, first + count)
-    ring, vertex = sets["ring_id"][rows], sets["vertex"][rows]
-    return np.split(vertex, np.flatnonzero(np.diff(ring.astype(np.int64))) + 1) if count else []
+def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
+    """The rings (n, 2) of every frame; none where its set is empty."""
+    ends = np.cumsum(sizes["elements"].astype(np.int64))
+    ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
+    frames = []
+    for first, end in zip(np.append(0, ends[:-1]), ends, strict=True):
+        cuts = np.flatnonzero(np.diff(ring[first:end])) + 1
+        frames.append(np.split(vertex[first:end], cuts) if end > first else [])
+    return frames
+
+
+def areas_of(frames: Sequence[Sequence[Floats]]) -> Floats:
+    """The area (n,) inside the rings of every frame; holes run the other way round."""
+    return np.array([abs(sum(map(signed_area, rings))) for rings in frames])
 
 
 def judge_sets(
@@ -56,8 +66,6 @@ def judge_sets(
 def _judge(
     sizes: Ragged, sets: Ragged, faults: int, sources: Sequence[Source], gap_limit_s: float
 ) -> JudgedSets:
-    count = sizes["elements"].astype(np.int64)
-    first = np.cumsum(count) - count
     run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
     topic = sizes.stream.metadata["truth"]
     truth = [
@@ -70,14 +78,12 @@ def _judge(
         for number, source in enumerate(sources)
     ]
     places = np.concatenate(truth)
-    area = np.zeros(len(count))
-    inside = np.zeros(len(count), bool)
-    for frame in range(len(count)):
-        for ring in polygons_of(sets.stream, int(first[frame]), int(count[frame])):
-            following = np.roll(ring, -1, axis=0)
-            area[frame] += 0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0])
+    frames = frames_of(sizes.stream, sets.stream)
+    inside = np.zeros(len(frames), bool)
+    for frame, rings in enumerate(frames):
+        for ring in rings:
             inside[frame] ^= Path(ring, closed=False).contains_point(places[frame])
     estimator, case = split_topic(sizes.stream.topic)
     known = np.asarray(np.isfinite(places).all(axis=1))
     time_ns = sizes.stream.publish_time_ns
-    return JudgedSets(estimator, case, run, time_ns, np.abs(area), known, inside, faults)
+    return JudgedSets(estimator, case, run, time_ns, areas_of(frames), known, inside, faults)

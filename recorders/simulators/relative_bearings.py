@@ -21,8 +21,9 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """The scene: that of section V (noise-free, its first pairs), or one drawn from a square.
+    """The scene: that of section V (noise-free, its first pairs), or one drawn from squares.
 
+    Landmarks are within `spread_m` of the middle in x and in y, the robot within `robot_spread_m`.
     A misidentified pair takes another landmark for its first one.
     """
 
@@ -33,6 +34,7 @@ class RelativeBearingsParameters(Parameters):
     landmarks: Annotated[int, Field(ge=2)] = 3
     arena_m: PositiveFloat = 10.0
     spread_m: PositiveFloat = 3.0
+    robot_spread_m: PositiveFloat = 2.0
     looks: PositiveInt = 1
     rate_hz: PositiveFloat = 1.0
     misidentified_probability: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -46,9 +48,12 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
         places, robot, error_rad = PAPER_LANDMARKS_M, np.zeros(2), 0.0
         first, second = np.array(PAPER_PAIRS[: parameters.paper_pairs]).T - 1
     else:
-        half = min(parameters.spread_m, 0.5 * parameters.arena_m)
+        widest = 0.5 * parameters.arena_m
+        half, robot_half = (
+            min(spread, widest) for spread in (parameters.spread_m, parameters.robot_spread_m)
+        )
         places = rng.uniform(-half, half, (parameters.landmarks, 2))
-        robot = rng.uniform(-half, half, 2)
+        robot = rng.uniform(-robot_half, robot_half, 2)
         first, second = np.triu_indices(parameters.landmarks, 1)
         error_rad = parameters.error_share * bound_rad
     if np.any(np.all(places == robot, axis=1)):

@@ -265,6 +265,12 @@ def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
     return found
 
 
+def signed_area(ring: Floats) -> float:
+    """The area inside a polygon (n, 2), positive where it runs anticlockwise."""
+    following = np.roll(ring, -1, axis=0)
+    return float(0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]))
+
+
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
     """A polygon's vertices along one arc, its end left out; tangents meet outside of convex arcs."""
     length, curvature = border.length[index], border.curvature[index]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
 from recorders.errors import BadInput
-from replay.estimators.feasible_sets import Arena, Pairs, discs, evaluate
+from replay.estimators.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
 
 Floats = NDArray[np.float64]
 Order = Literal[4, 8]
@@ -353,9 +353,3 @@ def _outline(values: Floats, grid: Grid) -> Outline:
     lines = contourpy.contour_generator(x, y, closed, line_type="Separate").lines(0.0)
     rings = [np.asarray(line)[:-1] for line in lines]
     return Outline(rings, abs(sum(map(signed_area, rings))))
-
-
-def signed_area(ring: Floats) -> float:
-    """The area inside a polygon (n, 2), positive where it runs anticlockwise."""
-    following = np.roll(ring, -1, axis=0)
-    return float(0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]))

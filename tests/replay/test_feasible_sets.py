@@ -18,6 +18,7 @@ from replay.estimators.feasible_sets import (
     half_planes,
     make_pairs,
     rings,
+    signed_area,
     to_blame,
 )
 from replay.estimators.pseudo_ellipsoids import (
@@ -30,7 +31,6 @@ from replay.estimators.pseudo_ellipsoids import (
     parabola_ellipse,
     ring_coefficients,
     room,
-    signed_area,
     slack,
 )
 
