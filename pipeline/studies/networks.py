@@ -18,6 +18,7 @@ from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_en
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
 from pipeline.studies.localization import obtain, summarise, write_logs
+from recorders.errors import BadInput
 from recorders.parameters import Parameters, merge
 from replay.blocks import gather
 from replay.estimators.covariance_intersection import fuse
@@ -75,8 +76,13 @@ def _replay(
 
 
 def _after(errors: Errors, settle_s: float) -> Errors:
-    """The errors from more than `settle_s` after the epoch on."""
+    """The errors from more than `settle_s` after the epoch on; raises BadInput where there are none."""
     kept = errors.elapsed_s > settle_s + 1e-9
+    if not kept.any():
+        raise BadInput(
+            f"{errors.estimator} {errors.case} estimates nothing after settle_s = {settle_s:g} s; "
+            "record more steps"
+        )
     columns = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
     return replace(errors, **{name: getattr(errors, name)[kept] for name in columns})
 

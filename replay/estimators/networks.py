@@ -407,8 +407,12 @@ def _sensing(
                 f"topic {topic.name}: the channel's metadata must name components of the state, sigmas "
                 "and acceleration_density"
             ) from None
+        if part["value"].size != len(part) * len(seen):
+            raise BadInput(
+                f"topic {topic.name}: its values do not have the {len(seen)} components named"
+            )
         value = np.full((len(part), len(components)), np.nan)
-        value[:, seen] = part["value"].reshape(len(part), -1)
+        value[:, seen] = part["value"].reshape(len(part), len(seen))
         values.append(value)
         index.append(np.full(len(part), number))
     if not np.all(np.nan_to_num(variance, nan=1.0) > 0):

@@ -172,7 +172,7 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> rrb.TextLogView
     for case in scene.cases[: PLOTTED_NODES + 1]:
         draw_events(canvas, scene, case)
     times, first = np.unique(links.publish_time_ns, return_index=True)
-    texts = [_told(links.take(rows)) for rows in np.split(np.arange(len(links)), first[1:])]
+    texts = [_told(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
     levels = ["WARN" if "lost" in text else "INFO" for text in texts]
     canvas.send("events/links", times, rr.TextLog.columns(text=texts, level=levels))
     return events_view("events")

@@ -1,5 +1,7 @@
 """Networks of nodes: the room of the covariance-intersection sheet, and what can go wrong on links."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -139,3 +141,27 @@ def test_bad_networks_are_refused(parameters, said):
 def test_an_unknown_rule_is_refused(room):
     with pytest.raises(BadInput, match="split-ci"):
         bind("network:best", room, {})
+
+
+def with_prior(source, **columns):
+    prior = source.streams["/prior"]
+    changed = replace(prior, columns={**prior.columns, **columns})
+    return replace(source, streams={**source.streams, "/prior": changed})
+
+
+def test_a_singular_prior_is_refused(room):
+    singular = np.diag([1.0, 1.0, 0.0, 1.0]).reshape(1, 16)
+    with pytest.raises(BadInput, match="not positive definite"):
+        judged([with_prior(room[0], covariance=singular)], "ci-trace")
+
+
+def test_a_covariance_that_is_singular_to_working_precision_fails_its_run_only(room):
+    """A run whose prior is nearly flat; the others are as without it."""
+    flat = np.diag([1e20, 1e-20, 1e20, 1e-20]).reshape(1, 16)
+    sources = [room[0], with_prior(room[1], covariance=flat), room[2]]
+    outputs = collect(replay(sources, bind("network:ci-trace", sources, {})))
+    failed = outputs["/estimates/network:ci-trace/failure"]
+    assert [len(failed.of_run(run)) for run in range(3)] == [0, 1, 0]
+    alone = collect(replay(room[:1], bind("network:ci-trace", room[:1], {})))
+    topic = "/estimates/network:ci-trace/node1/state"
+    assert np.array_equal(outputs[topic].of_run(0)["mean"], alone[topic].of_run(0)["mean"])

@@ -1,12 +1,19 @@
 """Set estimates in the log: section V, random scenes, faults, and real frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from matplotlib.path import Path
 
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import import_run
 from replay.engine import bind
+from replay.estimators.feasible_sets import box, exact_set, excess_rad, rings
+from replay.estimators.pseudo_ellipsoids import fit, room
+from replay.estimators.set_membership import SetParameters, frames, map_and_arena
+from replay.evaluation import truth_at
 from replay.set_evaluation import judge_sets
 from replay.sources import memory_source
 
@@ -95,3 +102,39 @@ def test_mrclam_fixes(mrclam6):
         assert inside.mean() == pytest.approx(share, abs=0.005)
         sizes = np.concatenate([each.area_m2 for each in found])[known]
         assert np.median(sizes) == pytest.approx(area, rel=0.10)
+
+
+def test_every_real_frame_whose_bound_holds_is_in_its_sets(mrclam6):
+    """Containment with no exception: where all relative bearings of a frame keep the bound of 2 deg."""
+    source = memory_source(*import_run("mrclam", mrclam6, {}))
+    known, arena = map_and_arena(source.streams["/landmarks"], SetParameters().arena_margin_m)
+    judged_frames = 0
+    for robot in range(1, 6):
+        seen, truth = (source.streams[f"/robot{robot}/{leaf}"] for leaf in ("range_bearing", "truth"))
+        found = list(frames(seen, known, np.radians(2.0), 3))
+        times = np.array([frame.time_ns for frame in found])
+        places = truth_at(truth, times, ["linear", "linear", "angle"], 0.2)[:, :2]
+        for frame, place in zip(found, places, strict=True):
+            if not np.nanmax(excess_rad(frame.pairs, place)) <= 0:
+                continue  # a bound that does not hold, or no truth
+            judged_frames += 1
+            border = exact_set(frame.pairs, arena)
+            low, high = box(border)
+            assert np.all((low <= place) & (place <= high))
+            assert sum(Path(ring, closed=False).contains_point(place) for ring in rings(border)) % 2
+            for order in (4, 8):
+                assert room(fit(frame.pairs, arena, order, "equal"), place) >= -1e-9
+    assert judged_frames > 1100
+
+
+def test_two_landmarks_at_one_place_are_refused():
+    (source,) = record_ensemble("relative-bearings", {}, 1, 1)
+    landmarks = source.streams["/landmarks"]
+    places = landmarks["position_m"].copy()
+    places[1] = places[0]
+    streams = {
+        **source.streams,
+        "/landmarks": replace(landmarks, columns={**landmarks.columns, "position_m": places}),
+    }
+    with pytest.raises(BadInput, match="coincide"):
+        judged([replace(source, streams=streams)], ("exact",))
