@@ -42,6 +42,14 @@ class Fused(NamedTuple):
     gap: Floats
 
 
+class Estimate(NamedTuple):
+    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others."""
+
+    mean: Floats
+    covariance: Floats
+    independent: Floats
+
+
 def inverted(matrix: Floats, inverse: Floats) -> bool:
     """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular."""
     size = len(matrix)
@@ -79,6 +87,14 @@ def multiply(left: Floats, right: Floats, product: Floats) -> None:
             product[row, column] = entry
 
 
+def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
+    """Fill matrix @ vector."""
+    for row in range(len(vector)):
+        image[row] = 0.0
+        for k in range(len(vector)):
+            image[row] += matrix[row, k] * vector[k]
+
+
 def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats) -> None:
     """Fill share * left + rest * right."""
     for row in range(len(total)):
@@ -109,10 +125,7 @@ def combined(
         for row in range(size):
             for k in range(size):
                 vector[row] += weights[i] * information[i, row, k] * means[i, k]
-    for row in range(size):
-        mean[row] = 0.0
-        for k in range(size):
-            mean[row] += covariance[row, k] * vector[k]
+    transform(covariance, vector, mean)
     return True
 
 
@@ -278,80 +291,65 @@ def weighted(weigh: Function) -> Function:
     return fuse
 
 
-def mix_inverse(
-    weight: float,
-    mean_a: Floats,
-    covariance_a: Floats,
-    independent_a: Floats,  # noqa: ARG001
-    mean_b: Floats,
-    covariance_b: Floats,
-    independent_b: Floats,  # noqa: ARG001
-    mean: Floats,
-    covariance: Floats,
-    independent: Floats,
-) -> bool:
+def put(mean: Floats, covariance: Floats, independent: Floats, place: Estimate) -> None:
+    """Fill an estimate; loops, since slices are very slow to compile."""
+    for row in range(len(mean)):
+        place.mean[row] = mean[row]
+        for column in range(len(mean)):
+            place.covariance[row, column] = covariance[row, column]
+            place.independent[row, column] = independent[row, column]
+
+
+def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
     """Inverse CI of two estimates at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
-    size = len(mean)
-    information_a, information_b = np.empty((size, size)), np.empty((size, size))
-    common, total = np.empty((size, size)), np.empty((size, size))
-    if not inverted(covariance_a, information_a) or not inverted(covariance_b, information_b):
-        return False
-    blend(weight, covariance_a, 1.0 - weight, covariance_b, total)
-    if not inverted(total, common):
-        return False
-    blend(1.0, information_a, 1.0, information_b, total)
+    size, shares = len(fused.mean), (weight, 1.0 - weight)
+    covariance, information = np.zeros((3, size, size)), np.empty((3, size, size))
+    for i in range(2):
+        for row in range(size):
+            for k in range(size):
+                covariance[i, row, k] = pair.covariance[i, row, k]
+                covariance[2, row, k] += shares[i] * pair.covariance[i, row, k]
+                fused.independent[row, k] = 0.0
+    for i in range(3):
+        if not inverted(covariance[i], information[i]):
+            return False
+    total, vector, common = np.empty((size, size)), np.zeros(size), information[2]
+    blend(1.0, information[0], 1.0, information[1], total)
     blend(1.0, total, -1.0, common, total)
-    if not inverted(total, covariance):
+    if not inverted(total, fused.covariance):
         return False
-    vector = np.zeros(size)
-    for row in range(size):
-        for k in range(size):
-            vector[row] += (information_a[row, k] - weight * common[row, k]) * mean_a[k]
-            vector[row] += (information_b[row, k] - (1.0 - weight) * common[row, k]) * mean_b[k]
-    for row in range(size):
-        mean[row] = 0.0
-        for k in range(size):
-            mean[row] += covariance[row, k] * vector[k]
-    independent[:] = 0.0
+    for i in range(2):
+        for row in range(size):
+            for k in range(size):
+                entry = information[i, row, k] - shares[i] * common[row, k]
+                vector[row] += entry * pair.mean[i, k]
+    transform(fused.covariance, vector, fused.mean)
     return True
 
 
-def mix_split(
-    weight: float,
-    mean_a: Floats,
-    covariance_a: Floats,
-    independent_a: Floats,
-    mean_b: Floats,
-    covariance_b: Floats,
-    independent_b: Floats,
-    mean: Floats,
-    covariance: Floats,
-    independent: Floats,
-) -> bool:
+def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
     """Split CI of two estimates at a weight: only the correlated parts are divided by it."""
-    size = len(mean)
-    information_a, information_b = np.empty((size, size)), np.empty((size, size))
-    part, other = np.empty((size, size)), np.empty((size, size))
-    blend(1.0 / weight, covariance_a, 1.0 - 1.0 / weight, independent_a, part)
-    rest = 1.0 - weight
-    blend(1.0 / rest, covariance_b, 1.0 - 1.0 / rest, independent_b, other)
-    if not inverted(part, information_a) or not inverted(other, information_b):
+    size, shares = len(fused.mean), (weight, 1.0 - weight)
+    part, information = np.empty((size, size)), np.empty((2, size, size))
+    for i in range(2):
+        inverse = 1.0 / shares[i]
+        blend(inverse, pair.covariance[i], 1.0 - inverse, pair.independent[i], part)
+        if not inverted(part, information[i]):
+            return False
+    blend(1.0, information[0], 1.0, information[1], part)
+    if not inverted(part, fused.covariance):
         return False
-    blend(1.0, information_a, 1.0, information_b, part)
-    if not inverted(part, covariance):
-        return False
-    gain_a, gain_b = np.empty((size, size)), np.empty((size, size))
-    multiply(covariance, information_a, gain_a)
-    multiply(covariance, information_b, gain_b)
-    multiply(gain_a, independent_a, part)
-    multiply(part, gain_a.T, independent)
-    multiply(gain_b, independent_b, part)
-    multiply(part, gain_b.T, other)
-    for row in range(size):
-        mean[row] = 0.0
-        for k in range(size):
-            independent[row, k] += other[row, k]
-            mean[row] += gain_a[row, k] * mean_a[k] + gain_b[row, k] * mean_b[k]
+    gain, spread, moved = np.empty((size, size)), np.empty((size, size)), np.empty(size)
+    for i in range(2):
+        multiply(fused.covariance, information[i], gain)
+        multiply(gain, pair.independent[i], part)
+        multiply(part, gain.T, spread)
+        transform(gain, pair.mean[i], moved)
+        for row in range(size):
+            fused.mean[row] = moved[row] + (fused.mean[row] if i > 0 else 0.0)
+            for k in range(size):
+                before = fused.independent[row, k] if i > 0 else 0.0
+                fused.independent[row, k] = before + spread[row, k]
     return True
 
 
@@ -392,34 +390,12 @@ def golden(step: int, steps: int, value: float, section: Floats) -> float:
 def pairwise(mix: Function, steps: int) -> Function:
     """The rule that fuses one estimate after another, each at the weight of the least trace."""
 
-    def trace_at(
-        weight: float,
-        mean_a: Floats,
-        covariance_a: Floats,
-        independent_a: Floats,
-        mean_b: Floats,
-        covariance_b: Floats,
-        independent_b: Floats,
-        mean: Floats,
-        covariance: Floats,
-        independent: Floats,
-    ) -> float:
-        if not mix(
-            weight,
-            mean_a,
-            covariance_a,
-            independent_a,
-            mean_b,
-            covariance_b,
-            independent_b,
-            mean,
-            covariance,
-            independent,
-        ):
+    def trace_at(weight: float, pair: Estimate, fused: Estimate) -> float:
+        if not mix(weight, pair, fused):
             return np.inf
         trace = 0.0
-        for row in range(len(mean)):
-            trace += covariance[row, row]
+        for row in range(len(fused.mean)):
+            trace += fused.covariance[row, row]
         return trace
 
     def fuse(
@@ -431,18 +407,21 @@ def pairwise(mix: Function, steps: int) -> Function:
         mean: Floats,
         covariance: Floats,
     ) -> float:
+        size = len(mean)
+        pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
+        first = Estimate(pair.mean[0], pair.covariance[0], pair.independent[0])
+        second = Estimate(pair.mean[1], pair.covariance[1], pair.independent[1])
+        fused = Estimate(mean, covariance, np.empty((size, size)))
         weights[0] = 1.0
-        mean[:] = means[0]
-        covariance[:] = covariances[0]
-        independent = independents[0].copy()
+        put(means[0], covariances[0], independents[0], fused)
         for i in range(1, count):
-            a, pa, sa = mean.copy(), covariance.copy(), independent.copy()
-            b, pb, sb = means[i], covariances[i], independents[i]
+            put(mean, covariance, fused.independent, first)
+            put(means[i], covariances[i], independents[i], second)
             section = np.empty(7)
             trace = np.inf
             for step in range(steps):
                 weights[i] = golden(step, steps, trace, section)
-                trace = trace_at(weights[i], a, pa, sa, b, pb, sb, mean, covariance, independent)
+                trace = trace_at(weights[i], pair, fused)
             if trace == np.inf:
                 return np.inf
         return 0.0

@@ -8,7 +8,7 @@ replay's output, so that one run is replayed with any rule. The state is (positi
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,23 @@ from recorders.parameters import Parameters
 from replay.blocks import Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Batch, Bound, Estimator
-from replay.estimators.covariance_intersection import RULES, rule
+from replay.estimators.covariance_intersection import rule
 from replay.estimators.gaussian import Floats, Function
 
 Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
+Rule = Literal[
+    "alone",
+    "centralised",
+    "naive",
+    "ci-trace",
+    "ci-determinant",
+    "niehsen",
+    "franken",
+    "split-ci",
+    "inverse-ci",
+    "own-again",
+]
 FAILURES = ("a covariance is singular or no longer finite",)
 
 
@@ -36,7 +48,7 @@ class NetworkParameters(Parameters):
     trap: it fuses the own x* and then uses its measurement a second time.
     """
 
-    rule: str = "ci-trace"
+    rule: Rule = "ci-trace"
     tolerance: PositiveFloat = 1e-3
 
 
@@ -453,9 +465,6 @@ def _failures(topic: str, failed_ns: Integers) -> Ragged:
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:
-    known = (ALONE, CENTRALISED, TRAP, *RULES)
-    if parameters.rule not in known:
-        raise BadInput(f"estimator network: no rule '{parameters.rule}'; there are: {', '.join(known)}")
     sensors: dict[int, Topic] = {}
     for topic in topics.values():
         node = topic.name.removeprefix("/node").removesuffix("/sensor")

@@ -63,15 +63,15 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     cases = [case for case in scene.cases if scene.errors_of(case)][:PLOTTED_NODES]
     if not cases:
         return board
-    nees = [view for case in cases for view in _draw_nees(canvas, scene, case)]
+    nees = [view for case in cases for view in _draw_nees(canvas, scene, case, legend=case == cases[-1])]
     errors = [rrb.Vertical(*draw_errors(canvas, scene, case), name=case) for case in cases]
     plots = rrb.Tabs(rrb.Vertical(*nees, name="NEES"), *errors)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 
 
-def _draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """The plots of one node; the maps' tabs name the colours."""
-    views = draw_nees(canvas, scene, case, legend=False)
+def _draw_nees(canvas: Canvas, scene: Scene, case: str, *, legend: bool) -> list[rrb.TimeSeriesView]:
+    """The plots of one node."""
+    views = draw_nees(canvas, scene, case, legend=legend)
     for view in views:
         view.name = f"{case}: {view.name}"
     return views

@@ -1,6 +1,7 @@
 """Networks of nodes: the room of the covariance-intersection sheet, and what can go wrong on links."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
 from replay.engine import bind, collect, replay
+from replay.estimators.covariance_intersection import RULES
+from replay.estimators.networks import ALONE, CENTRALISED, TRAP, Rule
 from replay.sources import memory_source
 
 RUNS = 120
@@ -138,7 +141,8 @@ def test_bad_networks_are_refused(parameters, said):
         record_run("ispace", parameters, 1)
 
 
-def test_an_unknown_rule_is_refused(room):
+def test_every_fusion_rule_has_its_name_and_no_other_is_known(room):
+    assert set(get_args(Rule)) == {*RULES, ALONE, CENTRALISED, TRAP}
     with pytest.raises(BadInput, match="split-ci"):
         bind("network:best", room, {})
 
