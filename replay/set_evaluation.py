@@ -1,6 +1,6 @@
 """Sets against truth: area, whether the true position is inside, and how often there is no set."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.blocks import Ragged
-from replay.estimators.feasible_sets import signed_area
+from replay.estimators.feasible_sets import excess_rad, signed_area
+from replay.estimators.set_membership import frames, map_and_arena
 from replay.evaluation import split_topic, truth_at
 from replay.sources import Source
 
@@ -20,7 +21,8 @@ Floats = NDArray[np.float64]
 class JudgedSets:
     """The sets of one estimator and case, a row per frame.
 
-    `inside` says whether the truth is in the set, where it is `known`; an empty set has area 0.
+    `inside` says whether the truth is in the set, where it is `known`, and `bound_holds` whether all
+    relative bearings of the frame keep their bound there; an empty set has area 0.
     """
 
     estimator: str
@@ -30,7 +32,13 @@ class JudgedSets:
     area_m2: Floats
     known: NDArray[np.bool_]
     inside: NDArray[np.bool_]
+    bound_holds: NDArray[np.bool_]
     faults: int
+
+    @property
+    def violations(self) -> int:
+        """How many sets miss the truth although their bounds hold: with guaranteed sets, none."""
+        return int((self.known & self.bound_holds & ~self.inside).sum())
 
 
 def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
@@ -78,12 +86,33 @@ def _judge(
         for number, source in enumerate(sources)
     ]
     places = np.concatenate(truth)
-    frames = frames_of(sizes.stream, sets.stream)
-    inside = np.zeros(len(frames), bool)
-    for frame, rings in enumerate(frames):
+    holds = [
+        _bounds_hold(sizes.stream.metadata, source, there)
+        for source, there in zip(sources, truth, strict=True)
+    ]
+    sets_of_frames = frames_of(sizes.stream, sets.stream)
+    inside = np.zeros(len(places), bool)
+    for frame, rings in enumerate(sets_of_frames):
         for ring in rings:
             inside[frame] ^= Path(ring, closed=False).contains_point(places[frame])
     estimator, case = split_topic(sizes.stream.topic)
-    known = np.asarray(np.isfinite(places).all(axis=1))
-    time_ns = sizes.stream.publish_time_ns
-    return JudgedSets(estimator, case, run, time_ns, areas_of(frames), known, inside, faults)
+    return JudgedSets(
+        estimator,
+        case,
+        run,
+        sizes.stream.publish_time_ns,
+        areas_of(sets_of_frames),
+        np.asarray(np.isfinite(places).all(axis=1)),
+        inside,
+        np.concatenate(holds),
+        faults,
+    )
+
+
+def _bounds_hold(stated: Mapping[str, str], source: Source, places: Floats) -> NDArray[np.bool_]:
+    """Whether each frame's relative bearings keep the bound at the places (frames, 2)."""
+    known, _ = map_and_arena(source.read(["/landmarks"])["/landmarks"], 0.0)
+    seen = source.read([stated["measured"]])[stated["measured"]]
+    found = frames(seen, known, float(stated["bound_rad"]), int(stated["least_landmarks"]))
+    excess = [excess_rad(frame.pairs, at) for frame, at in zip(found, places, strict=True)]
+    return np.array([bool(np.all(each <= 0)) for each in excess], bool)

@@ -6,7 +6,7 @@ Claims: Jin, Lee, Hashimoto, DIND networks, section 4.2, on real robots; the pap
 import numpy as np
 
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome
+from pipeline.results import Claim, MetricValue, Outcome, judged
 from pipeline.studies import localization
 
 ALONE, NAIVE, CI, JOINT = "alone", "naive", "ci", "joint"
@@ -53,10 +53,7 @@ def claims(metrics: dict[str, MetricValue]) -> list[Claim]:
         ),
     ]
     why = "explored on this one data set: the limits are ours, and the gate on sightings was added on it"
-    return [
-        Claim(claim, "section 4.2, no numbers", ours, "confirmed" if holds else "refuted", why)
-        for claim, ours, holds in rows
-    ]
+    return [judged(claim, "section 4.2, no numbers", ours, holds, why) for claim, ours, holds in rows]
 
 
 COOPERATIVE = Study("robots that share their estimates: what each way of fusing costs", study)

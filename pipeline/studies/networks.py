@@ -16,7 +16,7 @@ from pydantic import NonNegativeFloat
 
 from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome
+from pipeline.results import Claim, Outcome, judged
 from pipeline.studies.localization import obtain, summarise, write_logs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, merge
@@ -87,10 +87,10 @@ def _after(errors: Errors, settle_s: float) -> Errors:
     return replace(errors, **{name: getattr(errors, name)[kept] for name in columns})
 
 
-def network_table(judged: Sequence[Errors]) -> pd.DataFrame:
+def network_table(found: Sequence[Errors]) -> pd.DataFrame:
     """Per estimator: RMSE of the first node, ratio of the nodes' mean to the centralised one's, NEES."""
     rows: dict[str, list[tuple[float, float]]] = {}
-    for errors in judged:
+    for errors in found:
         squared = np.sum(errors.error[:, errors.position] ** 2, axis=1)
         rows.setdefault(errors.estimator, []).append(
             (float(np.sqrt(squared.mean())), float(np.nanmean(errors.nees)))
@@ -99,11 +99,11 @@ def network_table(judged: Sequence[Errors]) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "estimator": list(rows),
-            "rmse_first_node_m": [found[0][0] for found in rows.values()],
+            "rmse_first_node_m": [nodes[0][0] for nodes in rows.values()],
             "rmse_ratio": [
-                float(np.mean([rmse for rmse, _ in found])) / best for found in rows.values()
+                float(np.mean([rmse for rmse, _ in nodes])) / best for nodes in rows.values()
             ],
-            "nees": [float(np.mean([nees for _, nees in found])) for found in rows.values()],
+            "nees": [float(np.mean([nees for _, nees in nodes])) for nodes in rows.values()],
         }
     )
 
@@ -172,7 +172,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
     claims: list[Claim] = [_claim_of_equation_17()]
     if CI in nees:
         claims.append(
-            _claim(
+            judged(
                 "CI keeps the nodes' estimates consistent in a network with cycles and lost messages",
                 "provably guaranteed (section 4.2)",
                 f"mean NEES {nees[CI]:.2f} of 4 states",
@@ -180,7 +180,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
             )
         )
         claims.append(
-            _claim(
+            judged(
                 "CI is non-conservative",
                 "'yields a non-conservative estimate' (section 5.2)",
                 f"mean NEES {nees[CI]:.2f}: not above 4 by more than 10 %",
@@ -190,7 +190,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
         )
     if CI in nees and ALONE in nees and CENTRALISED in nees:
         claims.append(
-            _claim(
+            judged(
                 "nodes get the union of the accurate information of their neighbours",
                 "section 4.2, no numbers",
                 f"RMSE {ratio[CI]:.3f} times the centralised filter's, {ratio[ALONE]:.2f} alone",
@@ -201,7 +201,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
         )
     if "naive" in nees:
         claims.append(
-            _claim(
+            judged(
                 "fusing as if estimates were independent is inconsistent",
                 "section 5, no numbers",
                 f"mean NEES {nees['naive']:.3g} of 4 states",
@@ -210,7 +210,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
         )
     if CI in nees and "own-again" in nees:
         claims.append(
-            _claim(
+            judged(
                 "the node's measurement enters once, after CI of the prediction",
                 "steps 1-4 of section 4.2",
                 f"NEES {nees[CI]:.2f}; {nees['own-again']:.2f} where x* itself is fused, then z again",
@@ -220,7 +220,7 @@ def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list
     most = by_loss[(by_loss["estimator"] == CI) & (by_loss["loss"] >= 0.9)]
     for row in most.to_dict("records"):
         claims.append(
-            _claim(
+            judged(
                 "communication need not be guaranteed",
                 "section 4.2, no numbers",
                 f"mean NEES {row['nees']:.2f} with {row['loss']:.0%} of the messages lost",
@@ -239,17 +239,13 @@ def _claim_of_equation_17() -> Claim:
     )  # with P_ab = 0
     printed = float(np.trace(np.linalg.inv(inner)))
     actual = float(np.trace(fused.covariance @ inner @ fused.covariance))
-    return _claim(
+    return judged(
         "(17) is the covariance of the fused error",
         "P_c^-1 = w^2 P_a^-1 + ...; Fig. 8 is drawn from it",
         f"for independent errors its trace is {printed:.3f}, the fused error's {actual:.3f}",
         bool(np.isclose(printed, actual, rtol=1e-3)),
         "the right side belongs between two factors P of (14); with P_ab unknown there is no Fig. 8",
     )
-
-
-def _claim(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
-    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
 
 
 NETWORKS = Study(

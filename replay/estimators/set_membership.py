@@ -141,7 +141,14 @@ def solve(
                 blamed = to_blame(frame.pairs, arena)[:1]
                 faults.add(run, frame.time_ns, frame.numbers[blamed], frame.pairs.angle_rad[blamed])
     prefix = f"/estimates/{name}"
-    metadata = {"components": "x_m,y_m", "kinds": "linear,linear", "truth": truth}
+    metadata = {
+        "components": "x_m,y_m",
+        "kinds": "linear,linear",
+        "truth": truth,
+        "measured": topic,
+        "bound_rad": repr(bound_rad),
+        "least_landmarks": str(parameters.least_landmarks),
+    }
     ring_id, vertex = sets.columns([(0,), (0, 2)])
     (elements,) = sizes.columns([(0,)])
     pair, angle = faults.columns([(0, 2), (0,)])

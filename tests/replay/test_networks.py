@@ -125,7 +125,7 @@ def test_a_large_random_network_with_cycles_stays_consistent():
     source = memory_source(*record_run("ispace", parameters, 1))
     _, nees = judged([source], "ci-trace")
     assert len(nees) == 200
-    assert nees.mean() < 6  # one run: all nodes share one truth
+    assert nees.mean() < 4.6  # one run: all nodes share one truth; 3.4 +- 0.4 over runs
 
 
 @pytest.mark.parametrize(
