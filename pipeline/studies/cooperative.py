@@ -52,7 +52,7 @@ def claims(metrics: dict[str, MetricValue]) -> list[Claim]:
             bool(np.mean(rmse[CI]) < 0.5 * np.mean(rmse[ALONE])),
         ),
     ]
-    why = "explored on this one data set: the limits are ours, and the gate on sightings was added on it"
+    why = "the limits are ours; the gate on sightings of robots was added on MRCLAM set 6"
     return [judged(claim, "section 4.2, no numbers", ours, holds, why) for claim, ours, holds in rows]
 
 

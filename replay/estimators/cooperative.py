@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
+from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.planar import drive, range_bearing, wrap_angle
 from recorders.parameters import Parameters
@@ -325,37 +326,42 @@ def run(
     count = int(events.emit.max(initial=-1)) + 1
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
     _compiled(mode)(len(carried.mean), events, landmarks.positions, settings, carried, results)
-    emitting = np.flatnonzero(events.emit >= 0)
-    good = np.isfinite(results.mean[:, 0])
-    outputs = []
-    for robot, prefix in enumerate(prefixes):
-        chosen = (events.robots[emitting, 0] == robot) & good
-        rows = emitting[chosen]
-        poses = results.mean[chosen]
-        poses[:, 2] = wrap_angle(poses[:, 2])
-        stream = make_stream(
-            f"/estimates/{name}{prefix}/pose",
-            schemas.GAUSSIAN_ESTIMATE,
-            events.time_ns[rows],
-            metadata={
-                "components": "x_m,y_m,heading_rad",
-                "kinds": "linear,linear,angle",
-                "truth": f"{prefix}/truth",
-            },
-            mean=poses,
-            covariance=results.covariance[chosen].reshape(-1, 9),
-        )
-        outputs.append(Ragged(stream, np.searchsorted(rows, events.offsets)))
-    failed = np.flatnonzero((carried.failure != ALL_WELL) & (before.failure == ALL_WELL))
-    failure = make_stream(
+    poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
+    return (carried, landmarks), [*poses, _failures(name, before, carried)]
+
+
+def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, results: Results) -> Ragged:
+    """The estimates of one robot, up to a failure of its run."""
+    rows = np.flatnonzero((events.emit >= 0) & (events.robots[:, 0] == robot))
+    rows = rows[np.isfinite(results.mean[events.emit[rows], 0])]
+    mean, covariance = (part[events.emit[rows]] for part in results)
+    mean[:, 2] = wrap_angle(mean[:, 2])
+    stream = make_stream(
+        f"/estimates/{name}{prefixes[robot]}/pose",
+        schemas.GAUSSIAN_ESTIMATE,
+        events.time_ns[rows],
+        metadata={
+            "components": "x_m,y_m,heading_rad",
+            "kinds": "linear,linear,angle",
+            "truth": f"{prefixes[robot]}/truth",
+        },
+        mean=mean,
+        covariance=covariance.reshape(-1, 9),
+    )
+    return Ragged(stream, np.searchsorted(rows, events.offsets))
+
+
+def _failures(name: str, before: Carried, after: Carried) -> Ragged:
+    """The runs that failed in this block."""
+    failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
+    stream = make_stream(
         f"/estimates/{name}/failure",
         schemas.FAILURE,
-        carried.time_ns[failed].max(axis=1),
+        after.time_ns[failed].max(axis=1),
         metadata={"reasons": "; ".join(FAILURES)},
-        reason=carried.failure[failed],
+        reason=after.failure[failed],
     )
-    offsets = np.searchsorted(failed, np.arange(len(carried.failure) + 1))
-    return (carried, landmarks), [*outputs, Ragged(failure, offsets)]
+    return Ragged(stream, np.searchsorted(failed, np.arange(len(after.failure) + 1)))
 
 
 def _events(
@@ -396,23 +402,30 @@ def _number(prefix: str) -> int:
     return int(prefix.removeprefix("/robot"))
 
 
+def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
+    """The prefixes of the robots that have what is needed, by number."""
+    found = (topic.removesuffix("/odometry") for topic in topics if topic.endswith("/odometry"))
+    able = [
+        prefix
+        for prefix in found
+        if prefix.removeprefix("/robot").isdigit()
+        and {f"{prefix}/range_bearing", f"{prefix}/prior"} <= topics.keys()
+    ]
+    return tuple(sorted(able, key=_number))
+
+
 def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters) -> list[Bound]:
-    """One filter for all robots that have odometry, range-bearings and a prior."""
-    prefixes = tuple(
-        sorted(
-            (
-                prefix
-                for prefix in (
-                    topic.rpartition("/")[0] for topic in topics if topic.endswith("/odometry")
-                )
-                if prefix.removeprefix("/robot").isdigit()
-                and {f"{prefix}/range_bearing", f"{prefix}/prior"} <= topics.keys()
-            ),
-            key=_number,
-        )
-    )
+    """One filter for all robots; raises BadInput where an anchor is not among them."""
+    prefixes = _robots(topics)
     if len(prefixes) < 2 or "/landmarks" not in topics:
         return []
+    numbers = [_number(prefix) for prefix in prefixes]
+    for anchor in parameters.anchors:
+        if anchor not in numbers:
+            raise BadInput(
+                f"estimator {name}: anchor {anchor} is none of the robots "
+                f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
+            )
     given = parameters.model_dump(exclude={"mode", "anchors"})
     density, variance = np.empty((len(prefixes), 2)), np.empty((len(prefixes), 2))
     for row, prefix in enumerate(prefixes):
@@ -423,7 +436,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
     settings = Settings(
         density,
         variance,
-        np.array([_number(prefix) in parameters.anchors for prefix in prefixes]),
+        np.isin(numbers, parameters.anchors),
         np.array([np.inf, *chi2.ppf(parameters.gate_probability, [1, 2])]),
     )
     return [
