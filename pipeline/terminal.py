@@ -63,8 +63,11 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
 
 
 def format_value(value: object) -> str:
-    """Four significant digits for floats, nothing for None, text for the rest."""
+    """Four significant digits for floats, nothing for None, the range of a long list, or text."""
     if isinstance(value, list):
+        known = [each for each in value if each is not None]
+        if len(known) > 4:
+            return f"{format_value(min(known))} to {format_value(max(known))}"
         return " ".join(map(format_value, value))
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 

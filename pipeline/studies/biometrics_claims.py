@@ -13,7 +13,8 @@ from replay.verification import relative_rate_increase
 Values = Mapping[str, float]
 Counts = Mapping[str, Sequence[float]]
 
-CASES = ("face", "finger", "matcher-1", "matcher-2", "all")
+METHODS, MODALITIES = ("face", "finger"), ("matcher-1", "matcher-2")
+CASES = (*METHODS, *MODALITIES, "all")
 SINGLE = {"face-C": 89.17, "face-G": 84.33, "finger-left": 86.46, "finger-right": 92.65}
 PAPER_FUSED = {
     label: dict(zip(CASES, rates, strict=True))
@@ -41,7 +42,7 @@ ROUNDING = 0.005
 NAMES = {"qda": "LDA with quadratic kernel (QDA)", "knn": "KNN", "hmm": "HMM"}
 
 
-def claims_of_bssr1(values: Values, counts: Counts) -> list[Claim]:  # noqa: ARG001
+def claims_of_bssr1(values: Values) -> list[Claim]:
     """The claims on the real data; none where other fusions were run."""
     singles = {name: values.get(f"single.identified_percent.{name}", np.nan) for name in SINGLE}
     mean = _rates(values, "mean", "identified_percent")
@@ -154,8 +155,8 @@ def _increases(values: Values, singles: Mapping[str, float]) -> dict[str, dict[s
 
 def _modality_dominates(increases: Mapping[str, Mapping[str, float]]) -> Claim:
     known = [of for of in increases.values() if np.isfinite(list(of.values())).all()]
-    modalities = float(np.mean([of[case] for of in known for case in ("matcher-1", "matcher-2")]))
-    methods = float(np.mean([of[case] for of in known for case in ("face", "finger")]))
+    modalities = float(np.mean([of[case] for of in known for case in MODALITIES]))
+    methods = float(np.mean([of[case] for of in known for case in METHODS]))
     return Claim(
         "Table 5: fusing modalities gains more than fusing matchers of one (mean RRI)",
         "0.8449 against 0.6563",
@@ -166,8 +167,8 @@ def _modality_dominates(increases: Mapping[str, Mapping[str, float]]) -> Claim:
 
 
 def _process_before_method(increases: Mapping[str, Mapping[str, float]]) -> Claim:
-    one = [increases["hmm"][case] - increases["qda"][case] for case in ("face", "finger")]
-    two = [increases["hmm"][case] - increases["qda"][case] for case in ("matcher-1", "matcher-2")]
+    one = [increases["hmm"][case] - increases["qda"][case] for case in METHODS]
+    two = [increases["hmm"][case] - increases["qda"][case] for case in MODALITIES]
     gain, rest = float(np.mean(one)), float(np.mean(two))
     return Claim(
         "4.2: the process matters more within one modality (RRI of HMM less LDA)",

@@ -90,9 +90,9 @@ def trials_figure(trials: pd.DataFrame) -> Figure:
     axes = figure.subplots()
     table = trials.pivot_table(index="trial", columns="estimator", values="movement_rmse_deg")
     table = table[trials["estimator"].drop_duplicates().tolist()].iloc[::-1]
-    table.plot.barh(ax=axes, logx=True)
+    table.plot.barh(ax=axes, logx=True, legend=False)
     axes.set(xlabel="total orientation RMSE over movement (deg)", ylabel="")
-    axes.legend(loc="lower right")
+    figure.legend(loc="outside upper center", ncols=table.shape[1])
     return figure
 
 

@@ -151,7 +151,7 @@ def claims(
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:
     """Fig. 1: the sets with the circle that holds 95 %; the area of a point is its weight."""
-    figure = Figure(figsize=(2.6 * len(drawn), 2.9), layout="constrained")
+    figure = Figure(figsize=(2.6 * len(drawn), 3.2), layout="compressed")
     angle = np.linspace(0, 2 * np.pi, 100)
     radius = np.sqrt(chi2.ppf(0.95, 2))
     axes = np.atleast_1d(figure.subplots(1, len(drawn), sharex=True, sharey=True))

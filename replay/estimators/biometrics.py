@@ -35,7 +35,7 @@ Learner = Callable[[Floats, NDArray[np.bool_], np.random.Generator], Scorer]
 
 NEEDS = f"a stream {TOPIC} of at least two matchers' score vectors"
 TANH_SCALE = 0.01
-LEAST_LOGARITHM = -700.0
+LEAST_PROBABILITY = 1e-300
 LOG_LIKELIHOOD_RATIO = "log_likelihood_ratio"
 LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
 IMPOSTORS_PER_USER = 2
@@ -212,16 +212,16 @@ def learn_classifier(
     model.fit(vectors, genuine)
     if parameters.calibrated or parameters.classifier == "logistic":
         prior = np.log(genuine.sum() / (~genuine).sum())
-        return lambda scores: _log_odds(model.predict_log_proba(np.nan_to_num(scores))) - prior
+        return lambda scores: _log_odds(model.predict_proba(np.nan_to_num(scores))) - prior
     if parameters.classifier == "knn":
         return lambda scores: model.predict_proba(np.nan_to_num(scores))[:, 1] - 0.5
     return lambda scores: model.decision_function(np.nan_to_num(scores))
 
 
-def _log_odds(logarithms: Floats) -> Floats:
-    """Of the second class, from the logarithms of the probabilities (n, 2); finite."""
-    finite = np.maximum(logarithms, LEAST_LOGARITHM)
-    return finite[:, 1] - finite[:, 0]
+def _log_odds(probabilities: Floats) -> Floats:
+    """Of the second class, from the probabilities (n, 2) of both; finite."""
+    logarithms = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
+    return logarithms[:, 1] - logarithms[:, 0]
 
 
 def _classifier(parameters: ClassifierParameters, seed: int) -> Any:

@@ -8,15 +8,16 @@ an update with its measurement (2,) unless that is NaN.
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
+from replay.compile import compile_over_runs
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import (
     WrappedNormal,
@@ -24,10 +25,6 @@ from replay.distributions.wrapped_normal import (
     require_central_weight,
 )
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
-
-# Functions with a parallel loop hold calls only: numba would turn array statements in them into loops of
-# their own, which is slow to compile and was seen to go wrong.
-_turn_together, _wrap_angle = (njit(cache=True)(model) for model in (turn_together, wrap_angle))
 
 
 class HeadingModel(NamedTuple):
@@ -83,7 +80,7 @@ def run_toroidal_filter(
         fails is NaN from there on.
     """
     require_central_weight(central_weight)
-    return _run(_toroidal_filter, model, state, offsets, measurement, central_weight)
+    return _run(_toroidal_step, model, state, offsets, measurement, central_weight)
 
 
 def run_unscented_filter(
@@ -99,11 +96,11 @@ def run_unscented_filter(
     Args as `run_toroidal_filter`, and
         wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.
     """
-    return _run(_unscented_filter, model, state, offsets, measurement, wrapped)
+    return _run(_unscented_step, model, state, offsets, measurement, wrapped)
 
 
 def _run(
-    filter_all: Callable[..., None],
+    step: Callable[..., None],
     model: HeadingModel,
     state: WrappedNormal,
     offsets: NDArray[np.int64],
@@ -114,26 +111,32 @@ def _run(
         raise BadInput(f"heading measurements of shape {measurement.shape}; give ({offsets[-1]}, 2)")
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
-    filter_all(model, option, offsets, np.ascontiguousarray(measurement), state, estimates)
+    rows = np.ascontiguousarray(measurement)
+    _over_runs(step)(len(offsets) - 1, model, option, offsets, rows, state, estimates)
     return state, estimates
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _toroidal_filter(
-    model: HeadingModel,
-    central_weight: float,
-    offsets: NDArray,
-    measurement: NDArray,
-    state: WrappedNormal,
-    estimates: WrappedNormal,
-) -> None:
-    for run in prange(len(offsets) - 1):
+@cache
+def _over_runs(step: Callable[..., None]) -> Callable[..., None]:
+    """The compiled loop of a filter: `step` at every row, its state written down."""
+
+    def run_once(
+        run: int,
+        model: HeadingModel,
+        option: float | bool,
+        offsets: NDArray[np.int64],
+        measurement: NDArray[np.float64],
+        state: WrappedNormal,
+        estimates: WrappedNormal,
+    ) -> None:
         for row in range(offsets[run], offsets[run + 1]):
-            _toroidal_step(model, central_weight, measurement[row], state, run)
-            _record(state, run, estimates, row)
+            step(model, option, measurement[row], state, run)
+            estimates.mean[row] = state.mean[run]
+            estimates.covariance[row] = state.covariance[run]
+
+    return compile_over_runs(run_once)
 
 
-@njit(cache=True, error_model="numpy")
 def _toroidal_step(
     model: HeadingModel, central_weight: float, z: NDArray, state: WrappedNormal, run: int
 ) -> None:
@@ -149,21 +152,13 @@ def _toroidal_step(
         _store(fit_product(mean, covariance, z, model.measurement), mean, covariance)
 
 
-@njit(cache=True, error_model="numpy")
-def _record(state: WrappedNormal, run: int, estimates: WrappedNormal, row: int) -> None:
-    estimates.mean[row] = state.mean[run]
-    estimates.covariance[row] = state.covariance[run]
-
-
-@njit(cache=True, error_model="numpy")
 def _move(model: HeadingModel, x: NDArray) -> None:
     for n in range(len(x)):
-        x[n, 0], x[n, 1] = _turn_together(
+        x[n, 0], x[n, 1] = turn_together(
             x[n, 0], x[n, 1], model.coupling_rad, model.drift_rad[0], model.drift_rad[1]
         )
 
 
-@njit(cache=True, error_model="numpy")
 def _store(
     parameters: tuple[float, float, float, float, float], mean: NDArray, covariance: NDArray
 ) -> None:
@@ -171,22 +166,6 @@ def _store(
     covariance[1, 0] = covariance[0, 1]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _unscented_filter(
-    model: HeadingModel,
-    wrapped: bool,
-    offsets: NDArray,
-    measurement: NDArray,
-    state: WrappedNormal,
-    estimates: WrappedNormal,
-) -> None:
-    for run in prange(len(offsets) - 1):
-        for row in range(offsets[run], offsets[run + 1]):
-            _unscented_step(model, wrapped, measurement[row], state, run)
-            _record(state, run, estimates, row)
-
-
-@njit(cache=True, error_model="numpy")
 def _unscented_step(
     model: HeadingModel, wrapped: bool, z: NDArray, state: WrappedNormal, run: int
 ) -> None:
@@ -203,14 +182,11 @@ def _unscented_step(
             covariance[i, j] = spread + model.system[i, j]
     if not math.isnan(z[0]):
         innovation = z - mean
-        condition(
-            mean, covariance, _wrap_angle(innovation) if wrapped else innovation, model.measurement
-        )
+        condition(mean, covariance, wrap_angle(innovation) if wrapped else innovation, model.measurement)
     for k in range(2):
-        mean[k] = _wrap_angle(mean[k]) if wrapped else mean[k] % TURN
+        mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
 
 
-@njit(cache=True, error_model="numpy")
 def _sigma_points(mean: NDArray, covariance: NDArray) -> NDArray:
     """The mean, and the mean plus and minus sqrt(5 / 2) times the columns of the Cholesky factor."""
     first = math.sqrt(2.5 * covariance[0, 0])

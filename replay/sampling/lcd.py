@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
 from replay.sampling.distance import Array, lcd_distance_and_gradient
@@ -68,7 +69,8 @@ def lcd_samples(
     for start in range(starts):
         report(f"{count} samples in {dimension} dimensions: start {start + 1} of {starts}")
         begin = generator.standard_normal(free * dimension)
-        optima.append(minimize(objective, begin, jac=True, method="L-BFGS-B", options=OPTIMISER))
+        with threadpool_limits(1):  # products this small only keep a second core spinning
+            optima.append(minimize(objective, begin, jac=True, method="L-BFGS-B", options=OPTIMISER))
     return whole(min(optima, key=lambda optimum: optimum.fun).x)
 
 

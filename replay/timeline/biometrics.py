@@ -49,9 +49,10 @@ def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> r
     """Genuine score and greatest impostor score of each probe, and how the scores so far are spread."""
     fused, time_ns = fused_of(stream), stream.publish_time_ns
     root = entity_path("fusion", case, estimator)
+    of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
     _draw_probes(canvas, f"{root}/scores", fused, time_ns)
     return rrb.Horizontal(
-        plot_view(f"{root}/scores", "Fused score of each probe"),
+        plot_view(f"{root}/scores", f"{of_probe} of each probe"),
         _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
         name=estimator,
     )

@@ -104,7 +104,13 @@ def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
             show_labels=False,
         )
         canvas.fix(f"{entity}/axes", arrows)
-    return rrb.Spatial3DView(origin=escaped(root), name="Orientation: truth in red, green, blue")
+    return rrb.Spatial3DView(
+        origin=escaped(root),
+        name="Orientation: truth in red, green, blue",
+        eye_controls=rrb.EyeControls3D(
+            position=(2.4, 1.4, 1.2), look_target=(0, 0, 0), eye_up=(0, 0, 1)
+        ),
+    )
 
 
 def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:

@@ -146,8 +146,8 @@ def _draw_squares(
         canvas.fix(f"{plot}/bounds", look)
         for _, estimator, time_ns, values in alike:
             draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
-        extent = (-0.3 * high, 2.5 * high)
-        views.append(plot_view(plot, f"{name} of {degrees} components", extent, legend=legend))
+        title = f"{name} of {degrees} component{'s' * (degrees != 1)}"
+        views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
     return views
 
 
