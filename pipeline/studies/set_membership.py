@@ -146,19 +146,19 @@ def _set_figure(replayed: Replayed, title: str) -> Figure:
     robot = source.read(["/robot1/truth"])["/robot1/truth"]["state"][0]
     axes.plot(*robot[:2], "k+", label="truth")
     axes.set(xlabel="x (m)", ylabel="y (m)", title=title, aspect="equal")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=5)
     return figure
 
 
 def _bounds_figure(metrics: Mapping[str, MetricValue]) -> Figure:
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    share = figure.subplots()
-    area = share.twinx()
+    """Containment and area, estimator by estimator."""
+    figure = Figure(figsize=(6, 5), layout="constrained")
+    share, area = figure.subplots(2, 1, sharex=True)
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
     share.plot(names, [_value(metrics, f"{name}.containment_share") for name in names], "o-")
-    area.plot(names, [_value(metrics, f"{name}.area_median_m2") for name in names], "s--", color="C1")
-    share.set(ylabel="share of sets that hold the truth (circles)", ylim=(0, 1.02))
-    area.set(ylabel="median area, m² (squares)")
+    area.plot(names, [_value(metrics, f"{name}.area_median_m2") for name in names], "o-")
+    share.set(ylabel="share of sets that hold the truth")
+    area.set(ylabel="median area, m²", ylim=(0, None))
     return figure
 
 
