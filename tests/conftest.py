@@ -1,6 +1,7 @@
 """What tests of all rooms share."""
 
 import os
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -19,3 +20,12 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data at {folder}; set FUSELOG_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of MRCLAM data set 6, unpacked once."""
+    place = tmp_path_factory.mktemp("data")
+    with tarfile.open(real_data / "mrclam6.tar.xz") as archive:
+        archive.extractall(place, filter="data")
+    return place / "mrclam6"

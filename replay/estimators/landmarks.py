@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from recorders.errors import BadInput
 from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.planar import (
+    Components,
     drive,
     drive_jacobians,
     range_bearing,
@@ -152,7 +153,7 @@ class Looks(NamedTuple):
 
 
 def fill_motion_jacobians(
-    pose: Floats, velocity: Floats, duration_s: float, transition: Floats, gain: Floats
+    pose: Components, velocity: Components, duration_s: float, transition: Floats, gain: Floats
 ) -> None:
     """The Jacobians of `drive` by the pose (3, 3) and by the velocity (3, 2)."""
     by_heading, by_forward, by_turn = drive_jacobians(pose, velocity, duration_s)
@@ -167,7 +168,7 @@ def fill_motion_jacobians(
     gain[2, 1] = duration_s
 
 
-def fill_sensor_jacobian(pose: Floats, target: Floats, rows: Floats) -> None:
+def fill_sensor_jacobian(pose: Components, target: Components, rows: Floats) -> None:
     """The Jacobian of `range_bearing` by the pose (2, 3)."""
     by_range, by_bearing = range_bearing_jacobian(pose, target)
     for column in range(3):
@@ -300,10 +301,11 @@ def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
         prior.stream.publish_time_ns[rows],
         np.full(prior.runs, -1),
     )
-    return carried, _landmarks(whole.get("/landmarks")), (None,) * prior.runs
+    return carried, map_of_runs(whole.get("/landmarks")), (None,) * prior.runs
 
 
-def _landmarks(landmarks: Ragged | None) -> Landmarks:
+def map_of_runs(landmarks: Ragged | None) -> Landmarks:
+    """The maps of all runs from their topic, empty without one; raises BadInput unless planar."""
     if landmarks is None:
         return Landmarks(np.empty(0, np.int64), np.empty((0, 2)))
     positions = landmarks["position_m"]
@@ -366,12 +368,13 @@ def _sightings(block: Block, landmarks: Landmarks, bias: Floats) -> Sightings:
     value -= np.where(sensor[:, None] >= 0, bias, 0.0)
     target_id = block.column("target_id", missing=0).astype(np.int64)
     run_of = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    target = _rows_on_map(landmarks, (run_of << 32) + target_id)
+    target = rows_on_map(landmarks, (run_of << 32) + target_id)
     target[sensor < 0] = -1
     return Sightings(offsets, time_ns, sensor, value, target_id, target, is_last)
 
 
-def _rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+def rows_on_map(landmarks: Landmarks, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The rows of the map that keys (run * 2^32 + landmark) have, -1 where it lacks them."""
     if len(landmarks.keys) == 0:
         return np.full(len(keys), -1)
     rows = np.minimum(np.searchsorted(landmarks.keys, keys), len(landmarks.keys) - 1)
@@ -466,6 +469,20 @@ class Outputs(NamedTuple):
         return Ragged(make_stream(topic, schema, time_ns, metadata=metadata, **columns), offsets)
 
 
+def stated(topic: Topic, given: Mapping[str, float | None], name: str) -> float:
+    """A parameter as given, else as the channel's metadata states it; raises BadInput without either."""
+    own = given.get(name)
+    try:
+        value = float(topic.metadata[name]) if own is None else own
+    except (KeyError, ValueError):
+        raise BadInput(
+            f"topic {topic.name} does not state {name}; give it with --set {name}=..."
+        ) from None
+    if not 0 <= value < np.inf:
+        raise BadInput(f"topic {topic.name} states {name} = {value}; it is zero or positive")
+    return value
+
+
 def _bind(
     name: str,
     topics: Mapping[str, Topic],
@@ -518,26 +535,14 @@ def _bind(
 
 def _settings(odometry: Topic, sensors: list[Topic], parameters: DeadReckoningParameters) -> Settings:
     """What the parameters say and, where they do not, the channels' metadata."""
-
-    def stated(topic: Topic, name: str) -> float:
-        value = getattr(parameters, name)
-        try:
-            value = float(topic.metadata[name]) if value is None else value
-        except (KeyError, ValueError):
-            raise BadInput(
-                f"topic {topic.name} does not state {name}; give it with --set {name}=..."
-            ) from None
-        if not 0 <= value < np.inf:
-            raise BadInput(f"topic {topic.name} states {name} = {value}; it is zero or positive")
-        return value
-
-    density = [stated(odometry, "forward_noise_density"), stated(odometry, "turn_noise_density")]
+    given = parameters.model_dump()
+    density = [stated(odometry, given, f"{way}_noise_density") for way in ("forward", "turn")]
     variance = np.full((len(sensors), 2), np.nan)
     for row, topic in enumerate(sensors):
         measured = [field.name for field in schemas.SCHEMAS[topic.schema_name]]
         for column, name in enumerate(("range_m", "bearing_rad")):
             if name in measured:
-                variance[row, column] = stated(topic, f"sigma_{name}") ** 2
+                variance[row, column] = stated(topic, given, f"sigma_{name}") ** 2
     bias, gate = np.zeros(2), np.full(3, np.inf)
     if isinstance(parameters, LocalizationParameters):
         bias[:] = parameters.bias_range_m, parameters.bias_bearing_rad

@@ -38,6 +38,11 @@ def draw_events(canvas: Canvas, scene: Scene, case: str) -> rrb.TextLogView:
         lines = [f"{who}: {text}" for text in texts]
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
+    return events_view(root)
+
+
+def events_view(root: str) -> rrb.TextLogView:
+    """All events below an entity."""
     shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
 
@@ -63,6 +68,10 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
             f"failed: {reasons[reason] if reason < len(reasons) else reason}"
             for reason in stream["reason"].tolist()
         ]
+        yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.RELATIVE_BEARING):
+        pairs = zip(stream["first_id"].tolist(), stream["second_id"].tolist(), strict=True)
+        texts = [f"empty set: the pair {first}, {second} is to blame" for first, second in pairs]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
 
 

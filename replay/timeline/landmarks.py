@@ -36,6 +36,7 @@ from replay.timeline.plane import (
     turn_up,
 )
 from replay.timeline.plots import draw_quality
+from replay.timeline.sets import draw_sets
 
 POSE = ("x_m", "y_m", "heading_rad")
 SIGHTINGS = tuple(each.full_name for each in (schemas.RANGE_BEARING, schemas.RANGE, schemas.BEARING))
@@ -88,13 +89,14 @@ def _draw_robot(
             outline = (track.time_ns, track.poses[:, :2], track.covariances, track.stroke)
             draw_ellipses(canvas, f"{entity}/ellipse", *outline)
     _draw_sights(canvas, scene, robot, tracks, landmarks)
+    _, areas = draw_sets(canvas, scene, robot, root)
     paths = [f"{root}/{track.name}/path" for track in tracks]
     board = rrb.Vertical(
         plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown),
         draw_events(canvas, scene, robot),
         row_shares=[3, 1],
     )
-    return beside(board, draw_quality(canvas, scene, robot), robot)
+    return beside(board, [*draw_quality(canvas, scene, robot), *areas], robot)
 
 
 def _tracks(scene: Scene, robot: str) -> Iterator[Track]:

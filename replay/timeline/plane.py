@@ -5,6 +5,7 @@ hangs on one transform that turns it up. What moves sits at its time and vanishe
 current; a path is a segment per row, of which the view shows the last minute.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +81,25 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     """A point (n, 2) at each time, such as a measurement."""
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
+def draw_polygons(
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    sizes: NDArray[np.int64],
+    polygons: Sequence[Floats],
+    stroke: Stroke,
+) -> None:
+    """Closed polygons (vertices, 2), so many (n,) at each time; none is an empty set, not a gap."""
+    rows = thin(time_ns)
+    first = np.cumsum(sizes) - sizes
+    shown = [polygons[k] for row in rows for k in range(first[row], first[row] + sizes[row])]
+    strips = [np.concatenate([ring, ring[:1]]).astype(np.float32) for ring in shown]
+    times, counts = _until_stale(canvas, time_ns[rows], sizes[rows], gap_limit_ns(time_ns))
+    if strips:
+        canvas.send(entity, times, rr.LineStrips2D.columns(strips=strips).partition(counts))
+    canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
 
 
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
@@ -167,6 +187,7 @@ def plane_view(
     paths: list[str],
     places: Floats,
     trail_s: float = TRAIL_S,
+    name: str = "Map",
 ) -> rrb.Spatial2DView:
     """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
 
@@ -181,7 +202,7 @@ def plane_view(
     return rrb.Spatial2DView(
         origin="/",
         contents=[f"{escaped(each)}/**" for each in (root, *others)],
-        name=f"Map, grid {step_m:g} m",
+        name=f"{name}, grid {step_m:g} m",
         overrides={escaped(path): [trail] for path in paths},
         # the bounds are outside the transform that turns y up
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),

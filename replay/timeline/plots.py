@@ -98,13 +98,15 @@ def _draw_error(
     return plot_view(plot, name, (-1.1 * extent, 1.1 * extent), legend=False)
 
 
-def draw_nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+def draw_nees(
+    canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
+) -> list[rrb.TimeSeriesView]:
     """NEES of each estimator with the bounds of a single run; one plot per number of components."""
     found = [
         Squares(len(errors.components), errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
     ]
-    return _draw_squares(canvas, scene, case, "NEES", found, LINE)
+    return _draw_squares(canvas, scene, case, "NEES", found, LINE, legend=legend)
 
 
 def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
@@ -120,7 +122,14 @@ def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView
 
 
 def _draw_squares(
-    canvas: Canvas, scene: Scene, case: str, name: str, found: Sequence[Squares], style: Style
+    canvas: Canvas,
+    scene: Scene,
+    case: str,
+    name: str,
+    found: Sequence[Squares],
+    style: Style,
+    *,
+    legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
     """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
     views = []
@@ -136,9 +145,9 @@ def _draw_squares(
         canvas.send(f"{plot}/bounds", np.array(ends), band)
         canvas.fix(f"{plot}/bounds", look)
         for _, estimator, time_ns, values in alike:
-            _draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
+            draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
         title = f"{name} of {degrees} component{'s' * (degrees != 1)}"
-        views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high)))
+        views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
     return views
 
 
@@ -153,14 +162,15 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSer
             quantity, unit, scale = shown_unit(component)
             plot = entity_path("plots", case, component)
             shown = scale * values[:, column]
-            _draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
+            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
             views[component] = plot_view(plot, f"{quantity.capitalize()} ({unit})")
     return list(views.values())
 
 
-def _draw_curve(
+def draw_curve(
     canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, values: Floats, style: Style
 ) -> None:
+    """One curve of a plot: values (n,) over time."""
     rows = thin(time_ns)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
     canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))

@@ -1,0 +1,17 @@
+"""A point that keeps its velocity but for white acceleration noise; state = (positions, velocities).
+
+Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2.
+"""
+
+from recorders.models.planar import Component
+
+
+def noise_moments(
+    acceleration_density: Component, duration_s: Component
+) -> tuple[Component, Component, Component]:
+    """Variance of the position, covariance with the velocity, variance of the velocity, per axis.
+
+    `acceleration_density` is the power spectral density of the acceleration, m^2/s^3.
+    """
+    velocity = acceleration_density * duration_s
+    return velocity * duration_s**2 / 3.0, velocity * duration_s / 2.0, velocity

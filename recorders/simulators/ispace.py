@@ -1,0 +1,217 @@
+"""A room of networked sensor nodes that follow one moving thing: an intelligent space of DIND nodes.
+
+Jin, Lee, Hashimoto, DIND networks, sections 3 to 5; the room's numbers are ours, the paper prints none.
+Every node hears the thing with a sensor and at a rate of its own, sends what it knows over directed
+links, and loses messages. What it sends depends on the estimator, so the log holds the link events only.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.constant_velocity import noise_moments
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+COMPONENTS = ("x_m", "y_m", "vx_mps", "vy_mps")
+STATE = {"components": ",".join(COMPONENTS), "kinds": ",".join(["linear"] * 4)}
+Probability = Annotated[float, Field(ge=0, le=1)]
+Index = Annotated[int, Field(ge=1)]
+
+
+class Node(Parameters):
+    """A node's sensor: which components of the state it measures, how well, and at every how many steps.
+
+    `acceleration_density` is what the node's own motion model believes; None is the truth.
+    """
+
+    components: tuple[str, ...] = ("x_m", "y_m")
+    sigmas: tuple[PositiveFloat, ...] = (0.1, 0.1)
+    every_steps: PositiveInt = 1
+    acceleration_density: PositiveFloat | None = None
+
+
+ROOM = (
+    Node(sigmas=(0.05, 0.05)),
+    Node(sigmas=(0.15, 0.15), every_steps=2),
+    Node(sigmas=(0.05, 0.40), every_steps=3),
+    Node(sigmas=(0.40, 0.05), every_steps=5),
+)
+
+
+class NodeOutage(Parameters):
+    """A span in which a node neither senses nor sends nor hears; then it is back."""
+
+    node: Index
+    start_s: NonNegativeFloat
+    end_s: PositiveFloat
+
+
+class IspaceParameters(Parameters):
+    """The room; links work both ways. With `random_nodes` above 0 the graph is drawn anew for every run.
+
+    A drawn graph is a ring with `random_chords` chords, its nodes have the sensors of `nodes` in turn.
+    """
+
+    steps: PositiveInt = 100
+    step_s: PositiveFloat = 0.1
+    acceleration_density: PositiveFloat = 0.005
+    start: tuple[float, float, float, float] = (1.0, 1.0, 0.25, 0.2)
+    start_sigma: tuple[PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat] = (0.5, 0.5, 0.3, 0.3)
+    nodes: Annotated[tuple[Node, ...], Field(min_length=1)] = ROOM
+    links: tuple[tuple[Index, Index], ...] = ((1, 2), (2, 3), (3, 4), (4, 1), (1, 3))
+    random_nodes: Annotated[int, Field(ge=0)] = 0
+    random_chords: Annotated[int, Field(ge=0)] = 0
+    loss_probability: Probability = 0.2
+    duplicate_probability: Probability = 0.0
+    delay_s: NonNegativeFloat = 0.0
+    delay_jitter_s: NonNegativeFloat = 0.0
+    outages: tuple[NodeOutage, ...] = ()
+
+
+def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recording:
+    """Record one run. Raises BadInput where a link or an outage names a node that is not there."""
+    truth_rng, sensor_rng, link_rng, graph_rng = rng.spawn(4)
+    nodes, links = _network(parameters, graph_rng)
+    _check(parameters, len(nodes), links)
+    times_s: NDArray[np.float64] = np.arange(parameters.steps + 1, dtype=float) * parameters.step_s
+    truth = _truth(parameters, truth_rng)
+    streams = [
+        make_stream(
+            "/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            _stamps(times_s[:1]),
+            metadata=STATE,
+            mean=[parameters.start],
+            covariance=np.diag(np.square(parameters.start_sigma)).reshape(1, 16),
+        ),
+        make_stream("/truth", schemas.TRUTH_STATE, _stamps(times_s), metadata=STATE, state=truth),
+        _link_events(parameters, links, times_s[1:], link_rng),
+    ]
+    for number, node in enumerate(nodes, start=1):
+        steps = np.arange(1, parameters.steps + 1, node.every_steps)
+        steps = steps[~_is_out(parameters, number, times_s[steps])]
+        seen = [COMPONENTS.index(name) for name in node.components]
+        noise = sensor_rng.normal(size=(len(steps), len(seen))) * node.sigmas
+        density = node.acceleration_density or parameters.acceleration_density
+        streams.append(
+            make_stream(
+                f"/node{number}/sensor",
+                schemas.VECTOR_MEASUREMENT,
+                _stamps(times_s[steps]),
+                metadata={
+                    "components": ",".join(node.components),
+                    "sigmas": ",".join(map(repr, node.sigmas)),
+                    "acceleration_density": repr(density),
+                },
+                value=truth[steps][:, seen] + noise,
+            )
+        )
+    return Recording(streams + _outage_streams(parameters))
+
+
+def _network(
+    parameters: IspaceParameters, rng: np.random.Generator
+) -> tuple[list[Node], NDArray[np.int64]]:
+    """The nodes, and the directed links (m, 2) by number."""
+    count = parameters.random_nodes
+    if count == 0:
+        nodes = list(parameters.nodes)
+        pairs = np.array(parameters.links, np.int64).reshape(-1, 2)
+    else:
+        nodes = [parameters.nodes[index % len(parameters.nodes)] for index in range(count)]
+        ring = rng.permutation(count) + 1
+        chords = rng.integers(1, count + 1, (parameters.random_chords, 2))
+        pairs = np.concatenate([np.stack([ring, np.roll(ring, 1)], axis=1), chords])
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    return nodes, np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+
+
+def _check(parameters: IspaceParameters, count: int, links: NDArray[np.int64]) -> None:
+    named = [*links.ravel(), *(outage.node for outage in parameters.outages)]
+    if named and max(named) > count:
+        raise BadInput(f"scenario ispace: a link or outage names node {max(named)}; there are {count}")
+    if np.any(links[:, 0] == links[:, 1]):
+        raise BadInput("scenario ispace: a link joins a node with itself; leave it out")
+    for number, node in enumerate(parameters.nodes, start=1):
+        if not set(node.components) <= set(COMPONENTS) or len(node.components) != len(node.sigmas):
+            raise BadInput(
+                f"scenario ispace: node {number} needs components out of {', '.join(COMPONENTS)} "
+                "and one sigma for each"
+            )
+
+
+def _truth(parameters: IspaceParameters, rng: np.random.Generator) -> NDArray[np.float64]:
+    """States (steps + 1, 4), the first drawn from the prior."""
+    position, both, velocity = noise_moments(parameters.acceleration_density, parameters.step_s)
+    factor = np.linalg.cholesky(np.array([[position, both], [both, velocity]]))
+    kicks = rng.normal(size=(parameters.steps, 2, 2)) @ factor.T  # step, axis, (position, velocity)
+    start = np.array(parameters.start) + rng.normal(size=4) * parameters.start_sigma
+    speed = start[2:] + np.concatenate([np.zeros((1, 2)), np.cumsum(kicks[:, :, 1], axis=0)])
+    moves = speed[:-1] * parameters.step_s + kicks[:, :, 0]
+    place = start[:2] + np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
+    return np.concatenate([place, speed], axis=1)
+
+
+def _link_events(
+    parameters: IspaceParameters,
+    links: NDArray[np.int64],
+    times_s: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> Stream:
+    """Every node sends on every link at every step; lost messages have the time of their loss."""
+    sender, receiver = np.tile(links, (len(times_s), 1)).T
+    sent_s = np.repeat(times_s, len(links))
+    delay_s = parameters.delay_s + parameters.delay_jitter_s * rng.exponential(size=len(sent_s))
+    lost = rng.uniform(size=len(sent_s)) < parameters.loss_probability
+    lost |= _is_out(parameters, receiver, sent_s + delay_s)
+    copies = 1 + (rng.uniform(size=len(sent_s)) < parameters.duplicate_probability)
+    kept = np.repeat(np.arange(len(sent_s)), np.where(_is_out(parameters, sender, sent_s), 0, copies))
+    return make_stream(
+        "/links",
+        schemas.LINK_EVENT,
+        _stamps(sent_s[kept]),
+        sender_id=sender[kept],
+        receiver_id=receiver[kept],
+        arrival_time_ns=_stamps((sent_s + delay_s)[kept]),
+        lost=lost[kept],
+    )
+
+
+def _is_out(
+    parameters: IspaceParameters, node: int | NDArray[np.int64], times_s: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    out = np.zeros(len(times_s), bool)
+    for span in parameters.outages:
+        out |= (node == span.node) & (times_s >= span.start_s) & (times_s < span.end_s)
+    return out
+
+
+def _outage_streams(parameters: IspaceParameters) -> list[Stream]:
+    spans: dict[int, list[NodeOutage]] = {}
+    for span in parameters.outages:
+        spans.setdefault(span.node, []).append(span)
+    return [
+        make_stream(
+            f"/node{node}/outages",
+            schemas.OUTAGE,
+            _stamps(np.array([span.start_s for span in found])),
+            end_time_ns=_stamps(np.array([span.end_s for span in found])),
+        )
+        for node, found in spans.items()
+    ]
+
+
+def _stamps(seconds: NDArray[np.float64]) -> NDArray[np.int64]:
+    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
+
+
+ISPACE = Simulator(
+    "a room of networked sensor nodes that follow one moving thing; any graph, losses, delays, outages",
+    IspaceParameters,
+    simulate,
+)

@@ -1,0 +1,111 @@
+"""A robot at rest that measures relative bearings to landmarks, with errors that keep a known bound.
+
+Briechle, Hanebeck (2004), section V, and random scenes. Every look measures all pairs of landmarks, or
+the pairs given.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from recorders.models.planar import wrap_angle
+from recorders.models.relative_bearing import relative_bearing
+from recorders.parameters import Parameters
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+
+PAPER_LANDMARKS_M = np.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.0]])
+PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
+
+
+class RelativeBearingsParameters(Parameters):
+    """The scene: that of section V (noise-free, its first pairs), or one drawn from squares.
+
+    Landmarks are within `spread_m` of the middle in x and in y, the robot within `robot_spread_m`.
+    A misidentified pair takes another landmark for its first one.
+    """
+
+    scene: Literal["section-v", "random"] = "section-v"
+    paper_pairs: Annotated[int, Field(ge=1, le=3)] = 3
+    bound_deg: Annotated[float, Field(gt=0, lt=90)] = 4.0
+    error_share: Annotated[float, Field(ge=0, le=1)] = 1.0
+    landmarks: Annotated[int, Field(ge=2)] = 3
+    arena_m: PositiveFloat = 10.0
+    spread_m: PositiveFloat = 3.0
+    robot_spread_m: PositiveFloat = 2.0
+    looks: PositiveInt = 1
+    rate_hz: PositiveFloat = 1.0
+    misidentified_probability: Annotated[float, Field(ge=0, le=1)] = 0.0
+    start_s: NonNegativeFloat = 0.0
+
+
+def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -> Recording:
+    """Record one run: /landmarks, /robot1/truth, /robot1/relative_bearing."""
+    bound_rad = np.radians(parameters.bound_deg)
+    if parameters.scene == "section-v":
+        places, robot, error_rad = PAPER_LANDMARKS_M, np.zeros(2), 0.0
+        first, second = np.array(PAPER_PAIRS[: parameters.paper_pairs]).T - 1
+    else:
+        widest = 0.5 * parameters.arena_m
+        half, robot_half = (
+            min(spread, widest) for spread in (parameters.spread_m, parameters.robot_spread_m)
+        )
+        places = rng.uniform(-half, half, (parameters.landmarks, 2))
+        robot = rng.uniform(-robot_half, robot_half, 2)
+        first, second = np.triu_indices(parameters.landmarks, 1)
+        error_rad = parameters.error_share * bound_rad
+    if np.any(np.all(places == robot, axis=1)):
+        raise BadInput("scenario relative-bearings: the robot stands on a landmark")
+    count = len(first)
+    looks = np.repeat(np.arange(parameters.looks), count)
+    wrong = rng.uniform(size=len(looks)) < parameters.misidentified_probability
+    seen = np.where(wrong, rng.integers(0, len(places), len(looks)), np.tile(first, parameters.looks))
+    other = np.tile(second, parameters.looks)
+    error = rng.uniform(-1, 1, len(looks)) * error_rad
+    angle = wrap_angle(relative_bearing(robot, places[seen].T, places[other].T) + error)
+    stamps = SIMULATION_EPOCH_NS + np.rint(
+        1e9 * (parameters.start_s + np.arange(parameters.looks) / parameters.rate_hz)
+    ).astype(np.int64)
+    return Recording(
+        [
+            make_stream(
+                "/landmarks",
+                schemas.LANDMARK,
+                np.full(len(places), SIMULATION_EPOCH_NS),
+                metadata={"arena_m": ",".join(map(repr, _arena(parameters)))},
+                landmark_id=np.arange(1, len(places) + 1),
+                position_m=places,
+            ),
+            make_stream(
+                "/robot1/truth",
+                schemas.TRUTH_STATE,
+                stamps,
+                metadata={"components": "x_m,y_m", "kinds": "linear,linear"},
+                state=np.tile(robot, (parameters.looks, 1)),
+            ),
+            make_stream(
+                "/robot1/relative_bearing",
+                schemas.RELATIVE_BEARING,
+                stamps[looks],
+                metadata={"bound_rad": repr(float(bound_rad))},
+                first_id=np.tile(first, parameters.looks) + 1,
+                second_id=other + 1,
+                angle_rad=angle,
+            ),
+        ]
+    )
+
+
+def _arena(parameters: RelativeBearingsParameters) -> tuple[float, float, float, float]:
+    """The rectangle's low x, low y, high x, high y."""
+    half = 0.5 * parameters.arena_m
+    return (-half, -half, half, half)
+
+
+RELATIVE_BEARINGS = Simulator(
+    "a robot that measures bounded relative bearings to landmarks: the paper's scene, or random ones",
+    RelativeBearingsParameters,
+    simulate,
+)

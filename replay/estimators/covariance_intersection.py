@@ -1,0 +1,578 @@
+"""Fusion of estimates whose errors are correlated in an unknown way: covariance intersection and kin.
+
+Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
+Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
+Reinhardt, Hanebeck, Inverse Covariance Intersection (2017); Li, Nashashibi, Split CI (2013). A rule
+fuses K estimates of one state: scalar loops, so that networks compile it, called `fuse(count, means,
+covariances, independents, weights, mean, covariance) -> gap`, the last three filled, infinity where a
+covariance is singular. `independents` are the parts of the covariances that are known to be independent
+of all others; only split CI looks at them.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from recorders.errors import BadInput
+from replay.compile import compile_over_runs
+from replay.estimators.gaussian import Floats, Function, cholesky
+
+Criterion = Literal["trace", "determinant"]
+# what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
+SINGULAR = 1e-13
+ITERATIONS = 10_000
+GOLDEN = 0.6180339887498949
+SIGHTING_STEPS = 40
+
+
+class Fused(NamedTuple):
+    """Mean (..., n), covariance (..., n, n), the weights (..., K) and their certificate `gap` (...,).
+
+    By the conditions of Karush, Kuhn and Tucker no weights better the criterion (the trace's logarithm,
+    or the determinant's divided by n) by more than the gap; it is 0 where a rule optimises nothing. A
+    rule that fuses one after another states, at i > 0, the weight of what was fused before i.
+    """
+
+    mean: Floats
+    covariance: Floats
+    weights: Floats
+    gap: Floats
+
+
+class Estimate(NamedTuple):
+    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others."""
+
+    mean: Floats
+    covariance: Floats
+    independent: Floats
+
+
+def inverted(matrix: Floats, inverse: Floats) -> bool:
+    """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular."""
+    size = len(matrix)
+    factor = np.zeros((size, size))
+    if not cholesky(factor, matrix, size):
+        return False
+    for row in range(size):
+        if not factor[row, row] ** 2 > SINGULAR * matrix[row, row]:
+            return False
+    half = np.zeros((size, size))  # of the factor
+    for column in range(size):
+        half[column, column] = 1.0 / factor[column, column]
+        for row in range(column + 1, size):
+            entry = 0.0
+            for k in range(column, row):
+                entry -= factor[row, k] * half[k, column]
+            half[row, column] = entry / factor[row, row]
+    for row in range(size):
+        for column in range(row + 1):
+            entry = 0.0
+            for k in range(row, size):
+                entry += half[k, row] * half[k, column]
+            inverse[row, column] = entry
+            inverse[column, row] = entry
+    return True
+
+
+def multiply(left: Floats, right: Floats, product: Floats) -> None:
+    """Fill left @ right."""
+    for row in range(left.shape[0]):
+        for column in range(right.shape[1]):
+            entry = 0.0
+            for k in range(left.shape[1]):
+                entry += left[row, k] * right[k, column]
+            product[row, column] = entry
+
+
+def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
+    """Fill matrix @ vector."""
+    for row in range(len(vector)):
+        image[row] = 0.0
+        for k in range(len(vector)):
+            image[row] += matrix[row, k] * vector[k]
+
+
+def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats) -> None:
+    """Fill share * left + rest * right."""
+    for row in range(len(total)):
+        for column in range(len(total)):
+            total[row, column] = share * left[row, column] + rest * right[row, column]
+
+
+def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
+    """Fill the covariance of the weighted sum of informations, (14)."""
+    size = len(covariance)
+    total = np.zeros((size, size))
+    for i in range(count):
+        for row in range(size):
+            for column in range(row + 1):
+                total[row, column] += weights[i] * information[i, row, column]
+    return inverted(total, covariance)
+
+
+def combined(
+    count: int, weights: Floats, information: Floats, means: Floats, mean: Floats, covariance: Floats
+) -> bool:
+    """Fill mean and covariance of the weighted sum of informations, (14) and (15)."""
+    if not summed(count, weights, information, covariance):
+        return False
+    size = len(mean)
+    vector = np.zeros(size)
+    for i in range(count):
+        for row in range(size):
+            for k in range(size):
+                vector[row] += weights[i] * information[i, row, k] * means[i, k]
+    transform(covariance, vector, mean)
+    return True
+
+
+def trace_slope(covariance: Floats, slope: Floats) -> None:
+    """Fill P^2 / tr P: the criterion gains tr(I_i slope) by weight i."""
+    trace = 0.0
+    for row in range(len(covariance)):
+        trace += covariance[row, row]
+        for column in range(row + 1):
+            squared = 0.0
+            for k in range(len(covariance)):
+                squared += covariance[row, k] * covariance[column, k]
+            slope[row, column] = squared
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            slope[row, column] /= trace
+            slope[column, row] = slope[row, column]
+
+
+def determinant_slope(covariance: Floats, slope: Floats) -> None:
+    """Fill P / n: the criterion gains tr(I_i slope) by weight i."""
+    size = len(covariance)
+    for row in range(size):
+        for column in range(size):
+            slope[row, column] = covariance[row, column] / size
+
+
+def optimised(fill_slope: Function, power: float, tolerance: float, iterations: int) -> Function:
+    """Weights by w_i <- w_i g_i^power, normalised, until none can gain more than the tolerance.
+
+    At the least criterion no gain g_i = tr(I_i slope) exceeds 1, and those of weights above 0 are 1.
+    """
+
+    def weigh(
+        count: int,
+        covariances: Floats,  # noqa: ARG001
+        information: Floats,
+        means: Floats,
+        weights: Floats,
+        mean: Floats,
+        covariance: Floats,
+    ) -> float:
+        gap = np.inf
+        size = len(mean)
+        slope, better = np.empty((size, size)), np.empty(count)
+        for i in range(count):
+            weights[i] = 1.0 / count
+        for _ in range(iterations):
+            if not summed(count, weights, information, covariance):
+                return np.inf
+            fill_slope(covariance, slope)
+            total, gap = 0.0, -np.inf
+            for i in range(count):
+                gain = 0.0
+                for row in range(size):
+                    for k in range(size):
+                        gain += information[i, row, k] * slope[row, k]
+                gap = max(gap, gain - 1.0)
+                better[i] = weights[i] * gain**power
+                total += better[i]
+            if gap <= tolerance:
+                break
+            for i in range(count):
+                weights[i] = better[i] / total
+        return gap if combined(count, weights, information, means, mean, covariance) else np.inf
+
+    return weigh
+
+
+def weigh_by_trace_inverse(
+    count: int,
+    covariances: Floats,
+    information: Floats,
+    means: Floats,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+) -> float:
+    """Niehsen: weights in proportion to 1 / tr P_i."""
+    total = 0.0
+    for i in range(count):
+        trace = 0.0
+        for row in range(len(mean)):
+            trace += covariances[i, row, row]
+        weights[i] = 1.0 / trace
+        total += weights[i]
+    for i in range(count):
+        weights[i] /= total
+    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+
+
+def determinant(matrix: Floats) -> float:
+    """The determinant of a matrix that is positive definite, else 0."""
+    size = len(matrix)
+    factor = np.zeros((size, size))
+    if not cholesky(factor, matrix, size):
+        return 0.0
+    product = 1.0
+    for row in range(size):
+        product *= factor[row, row] ** 2
+    return product
+
+
+def weigh_by_shares(
+    count: int,
+    covariances: Floats,  # noqa: ARG001
+    information: Floats,
+    means: Floats,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+) -> float:
+    """Franken and Huepper: weights by what is lost from |sum of I| without I_i, plus |I_i|."""
+    size = len(mean)
+    whole = np.zeros((size, size))
+    rest = np.empty((size, size))
+    for i in range(count):
+        blend(1.0, whole, 1.0, information[i], whole)
+    full = determinant(whole)
+    total = 0.0
+    for i in range(count):
+        blend(1.0, whole, -1.0, information[i], rest)
+        weights[i] = full - determinant(rest) + determinant(information[i])
+        total += weights[i]
+    for i in range(count):
+        weights[i] /= total
+    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+
+
+def weigh_fully(
+    count: int,
+    covariances: Floats,  # noqa: ARG001
+    information: Floats,
+    means: Floats,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+) -> float:
+    """Naive Kalman fusion, as if all errors were independent: every weight is 1."""
+    for i in range(count):
+        weights[i] = 1.0
+    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+
+
+def weighted(weigh: Function) -> Function:
+    """The rule that adds up weighted informations."""
+
+    def fuse(
+        count: int,
+        means: Floats,
+        covariances: Floats,
+        independents: Floats,  # noqa: ARG001
+        weights: Floats,
+        mean: Floats,
+        covariance: Floats,
+    ) -> float:
+        information = np.empty_like(covariances)
+        for i in range(count):
+            if not inverted(covariances[i], information[i]):
+                return np.inf
+        return weigh(count, covariances, information, means, weights, mean, covariance)
+
+    return fuse
+
+
+def put(mean: Floats, covariance: Floats, independent: Floats, place: Estimate) -> None:
+    """Fill an estimate; loops, since slices are very slow to compile."""
+    for row in range(len(mean)):
+        place.mean[row] = mean[row]
+        for column in range(len(mean)):
+            place.covariance[row, column] = covariance[row, column]
+            place.independent[row, column] = independent[row, column]
+
+
+def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
+    """Inverse CI of two estimates at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
+    size, shares = len(fused.mean), (weight, 1.0 - weight)
+    covariance, information = np.zeros((3, size, size)), np.empty((3, size, size))
+    for i in range(2):
+        for row in range(size):
+            for k in range(size):
+                covariance[i, row, k] = pair.covariance[i, row, k]
+                covariance[2, row, k] += shares[i] * pair.covariance[i, row, k]
+                fused.independent[row, k] = 0.0
+    for i in range(3):
+        if not inverted(covariance[i], information[i]):
+            return False
+    total, vector, common = np.empty((size, size)), np.zeros(size), information[2]
+    blend(1.0, information[0], 1.0, information[1], total)
+    blend(1.0, total, -1.0, common, total)
+    if not inverted(total, fused.covariance):
+        return False
+    for i in range(2):
+        for row in range(size):
+            for k in range(size):
+                entry = information[i, row, k] - shares[i] * common[row, k]
+                vector[row] += entry * pair.mean[i, k]
+    transform(fused.covariance, vector, fused.mean)
+    return True
+
+
+def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
+    """Split CI of two estimates at a weight: only the correlated parts are divided by it."""
+    size, shares = len(fused.mean), (weight, 1.0 - weight)
+    part, information = np.empty((size, size)), np.empty((2, size, size))
+    for i in range(2):
+        inverse = 1.0 / shares[i]
+        blend(inverse, pair.covariance[i], 1.0 - inverse, pair.independent[i], part)
+        if not inverted(part, information[i]):
+            return False
+    blend(1.0, information[0], 1.0, information[1], part)
+    if not inverted(part, fused.covariance):
+        return False
+    gain, spread, moved = np.empty((size, size)), np.empty((size, size)), np.empty(size)
+    for i in range(2):
+        multiply(fused.covariance, information[i], gain)
+        multiply(gain, pair.independent[i], part)
+        multiply(part, gain.T, spread)
+        transform(gain, pair.mean[i], moved)
+        for row in range(size):
+            fused.mean[row] = moved[row] + (fused.mean[row] if i > 0 else 0.0)
+            for k in range(size):
+                before = fused.independent[row, k] if i > 0 else 0.0
+                fused.independent[row, k] = before + spread[row, k]
+    return True
+
+
+def steps_for(tolerance: float) -> int:
+    """How many steps of a golden section leave a tenth of the root of the tolerance."""
+    return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
+
+
+def golden(step: int, steps: int, value: float, section: Floats) -> float:
+    """Where in (0, 1) a search for the least value looks next, after `value` at the last place.
+
+    Golden section; the last of all steps is the middle of what is left. `section` (7,) is what the
+    search remembers: both ends, both inner places and their values, and which one was asked for. Written
+    like this, the function that is searched is called in one place, and compiled once.
+    """
+    if step == 0:
+        section[0], section[1] = 1e-9, 1.0 - 1e-9
+        section[2], section[3] = 1.0 - GOLDEN, GOLDEN
+        section[6] = 2
+        return section[2]
+    section[2 + int(section[6])] = value  # 4: at the left place, 5: at the right one
+    if step == 1:
+        section[6] = 3
+        return section[3]
+    if step == steps - 1:
+        return 0.5 * (section[0] + section[1])
+    if section[4] < section[5]:
+        section[1], section[3], section[5] = section[3], section[2], section[4]
+        section[2] = section[1] - GOLDEN * (section[1] - section[0])
+        section[6] = 2
+    else:
+        section[0], section[2], section[4] = section[2], section[3], section[5]
+        section[3] = section[0] + GOLDEN * (section[1] - section[0])
+        section[6] = 3
+    return section[int(section[6])]
+
+
+def pairwise(mix: Function, steps: int) -> Function:
+    """The rule that fuses one estimate after another, each at the weight of the least trace."""
+
+    def trace_at(weight: float, pair: Estimate, fused: Estimate) -> float:
+        if not mix(weight, pair, fused):
+            return np.inf
+        trace = 0.0
+        for row in range(len(fused.mean)):
+            trace += fused.covariance[row, row]
+        return trace
+
+    def fuse(
+        count: int,
+        means: Floats,
+        covariances: Floats,
+        independents: Floats,
+        weights: Floats,
+        mean: Floats,
+        covariance: Floats,
+    ) -> float:
+        size = len(mean)
+        pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
+        first = Estimate(pair.mean[0], pair.covariance[0], pair.independent[0])
+        second = Estimate(pair.mean[1], pair.covariance[1], pair.independent[1])
+        fused = Estimate(mean, covariance, np.empty((size, size)))
+        weights[0] = 1.0
+        put(means[0], covariances[0], independents[0], fused)
+        for i in range(1, count):
+            put(mean, covariance, fused.independent, first)
+            put(means[i], covariances[i], independents[i], second)
+            section = np.empty(7)
+            trace = np.inf
+            for step in range(steps):
+                weights[i] = golden(step, steps, trace, section)
+                trace = trace_at(weights[i], pair, fused)
+            if trace == np.inf:
+                return np.inf
+        return 0.0
+
+    return fuse
+
+
+RULES: dict[str, Callable[[float], Function]] = {
+    "ci-trace": lambda tolerance: weighted(optimised(trace_slope, 0.5, tolerance, ITERATIONS)),
+    "ci-determinant": lambda tolerance: weighted(
+        optimised(determinant_slope, 1.0, tolerance, ITERATIONS)
+    ),
+    "niehsen": lambda _: weighted(weigh_by_trace_inverse),
+    "franken": lambda _: weighted(weigh_by_shares),
+    "naive": lambda _: weighted(weigh_fully),
+    "inverse-ci": lambda tolerance: pairwise(mix_inverse, steps_for(tolerance)),
+    "split-ci": lambda tolerance: pairwise(mix_split, steps_for(tolerance)),
+}
+
+
+def rule(name: str, tolerance: float) -> Function:
+    """The rule of a name of RULES.
+
+    `tolerance` bounds the gap where weights are optimised together, and the square of ten times a
+    single weight's error.
+    Raises BadInput for another name.
+    """
+    if name not in RULES:
+        raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
+    return RULES[name](tolerance)
+
+
+@lru_cache(maxsize=16)
+def _over_runs(name: str, tolerance: float) -> Function:
+    fuse_one = rule(name, tolerance)
+
+    def fuse_run(
+        run: int, means: Floats, covariances: Floats, independents: Floats, fused: Fused
+    ) -> None:
+        fused.gap[run] = fuse_one(
+            means.shape[1],
+            means[run],
+            covariances[run],
+            independents[run],
+            fused.weights[run],
+            fused.mean[run],
+            fused.covariance[run],
+        )
+
+    return compile_over_runs(fuse_run)
+
+
+def fuse(
+    name: str,
+    means: ArrayLike,
+    covariances: ArrayLike,
+    independents: ArrayLike | None = None,
+    tolerance: float = 1e-9,
+) -> Fused:
+    """Fuse K estimates of one state, batch axes first.
+
+    Args:
+        name: one of RULES.
+        means: (..., K, n).
+        covariances: (..., K, n, n).
+        independents: (..., K, n, n), for "split-ci": the parts independent of all other errors.
+        tolerance: what the certificate of an optimised rule must reach.
+
+    Raises BadInput where shapes do not fit, a number is not finite, a covariance is not symmetric and
+    positive definite, an independent part exceeds its covariance, or the weights do not converge.
+    """
+    mean, covariance = np.asarray(means, float), np.asarray(covariances, float)
+    if mean.ndim < 2 or covariance.shape != (*mean.shape, mean.shape[-1]) or mean.shape[-2] == 0:
+        raise BadInput(
+            f"means {mean.shape} and covariances {covariance.shape}: (..., K, n) and (..., K, n, n) "
+            "of one estimate or more are needed"
+        )
+    known = np.zeros_like(covariance) if independents is None else np.asarray(independents, float)
+    if known.shape != covariance.shape:
+        raise BadInput(f"independent parts {known.shape}, covariances {covariance.shape}: not alike")
+    for part in (mean, covariance, known):
+        if not np.isfinite(part).all():
+            raise BadInput("an estimate is not finite; leave it out")
+    if not np.allclose(covariance, np.swapaxes(covariance, -1, -2), rtol=1e-9, atol=0):
+        raise BadInput("a covariance is not symmetric; give the full matrix")
+    least = np.linalg.eigvalsh(covariance)[..., 0]
+    if np.any(least <= 0):
+        raise BadInput("a covariance is singular; fuse what is certain as a constraint, not by rules")
+    if np.any(np.linalg.eigvalsh(covariance - known)[..., 0] < -1e-9 * least):
+        raise BadInput("an independent part exceeds its covariance; it is a part of it")
+    batch, (count, size) = mean.shape[:-2], mean.shape[-2:]
+    runs = int(np.prod(batch))
+    fused = Fused(
+        np.empty((runs, size)), np.empty((runs, size, size)), np.empty((runs, count)), np.empty(runs)
+    )
+    _over_runs(name, tolerance)(
+        runs,
+        mean.reshape(runs, count, size),
+        covariance.reshape(runs, count, size, size),
+        known.reshape(runs, count, size, size),
+        fused,
+    )
+    if np.any(np.isinf(fused.gap)):
+        raise BadInput("a covariance is singular to working precision; state it in like units")
+    if np.any(fused.gap > tolerance):
+        raise BadInput(
+            f"the weights did not converge: the certificate is {fused.gap.max():.1e}, not {tolerance}"
+        )
+    return Fused(*(part.reshape(batch + part.shape[1:]) for part in fused))
+
+
+def sighting_weight(states: int, spread: Floats, shared: Floats, own: Floats) -> float:
+    """The weight w of `fuse_sighting` for n states; NaN where a covariance is singular.
+
+    `spread` is the innovation's part from the state, H P H'. The fused determinant is in proportion to
+    |R| / (w^n |S|) with R = shared / (1 - w) + own and S = spread / w + R, which is convex in w.
+    """
+    noise, total = np.empty_like(own), np.empty_like(own)
+    section = np.empty(7)
+    value, weight = np.inf, 0.5
+    for step in range(SIGHTING_STEPS):
+        weight = golden(step, SIGHTING_STEPS, value, section)
+        blend(1.0 / (1.0 - weight), shared, 1.0, own, noise)
+        blend(1.0 / weight, spread, 1.0, noise, total)
+        value = np.log(determinant(noise) / determinant(total)) - states * np.log(weight)
+    return weight if np.isfinite(value) else np.nan
+
+
+def fuse_sighting(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    rows: ArrayLike,
+    innovation: ArrayLike,
+    shared: ArrayLike,
+    own: ArrayLike,
+) -> tuple[Floats, Floats, float]:
+    """The update by a measurement of part of a state that rests on another node's estimate.
+
+    The innovation (m,), with rows (m, n), has a part with covariance `shared` that is correlated with
+    the state in an unknown way, and one that is not, `own`, the sensor's: P / w against
+    shared / (1 - w) + own, at the w of the least determinant, which no unit changes. It is above 0: at 0
+    whatever the measurement does not see would be lost.
+
+    Returns mean (n,), covariance (n, n) and w. Raises BadInput where a covariance is singular.
+    """
+    x, p, h, v, r, q = (
+        np.asarray(part, float) for part in (mean, covariance, rows, innovation, shared, own)
+    )
+    spread = h @ p @ h.T
+    weight = sighting_weight(len(x), spread, r, q) if determinant(p) > 0 else np.nan
+    if not np.isfinite(weight):
+        raise BadInput("a covariance of the sighting is singular; it needs the sensor's own noise")
+    gain = np.linalg.solve(spread / weight + r / (1 - weight) + q, h @ p / weight).T
+    return x + gain @ v, p / weight - gain @ h @ p / weight, weight

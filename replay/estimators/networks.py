@@ -1,0 +1,490 @@
+"""Replay of a sensor network: every node filters with its own sensor and fuses what arrives from others.
+
+Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
+prediction (not x*) with the x* received, by a rule of `covariance_intersection`; update with the own
+measurement again. The log says which message was sent when and where it arrived; what was in it is this
+replay's output, so that one run is replayed with any rule. The state is (positions, velocities).
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Topic, make_stream, schemas
+from recorders.models.constant_velocity import noise_moments
+from recorders.parameters import Parameters
+from replay.blocks import Ragged
+from replay.compile import compile_over_runs
+from replay.engine import Batch, Bound, Estimator
+from replay.estimators.covariance_intersection import rule
+from replay.estimators.gaussian import Floats, Function
+
+Integers = NDArray[np.int64]
+ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
+Rule = Literal[
+    "alone",
+    "centralised",
+    "naive",
+    "ci-trace",
+    "ci-determinant",
+    "niehsen",
+    "franken",
+    "split-ci",
+    "inverse-ci",
+    "own-again",
+]
+FAILURES = ("a covariance is singular or no longer finite",)
+
+
+class NetworkParameters(Parameters):
+    """The fusion rule, and how exactly its weights are optimised.
+
+    "alone" fuses nothing, "centralised" is one filter with all sensors and no links, "own-again" is a
+    trap: it fuses the own x* and then uses its measurement a second time.
+    """
+
+    rule: Rule = "ci-trace"
+    tolerance: PositiveFloat = 1e-3
+
+
+class Activities(NamedTuple):
+    """Every moment of every node at which it measures, sends or receives, by run, time and node.
+
+    Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
+    measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
+    in which a message was sent.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    node: Integers
+    measured: Integers
+    received: Integers
+    message: Integers
+
+
+class Sensing(NamedTuple):
+    """Measurements in the order of their activities: (k, n), NaN where a component is not measured.
+
+    `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
+    """
+
+    value: Floats
+    sensor: Integers
+    variance: Floats
+    density: Floats
+
+
+class Results(NamedTuple):
+    """What the kernel fills, a row per activity: estimates, and x* as it is sent."""
+
+    mean: Floats
+    covariance: Floats
+    sent_mean: Floats
+    sent_covariance: Floats
+    sent_independent: Floats
+
+
+def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
+    """Predict with constant velocity, in place."""
+    half = len(mean) // 2
+    position, both, velocity = noise_moments(density, duration_s)
+    for row in range(half):
+        mean[row] += duration_s * mean[half + row]
+    for row in range(half):
+        for column in range(len(mean)):
+            covariance[row, column] += duration_s * covariance[half + row, column]
+    for row in range(len(mean)):
+        for column in range(half):
+            covariance[row, column] += duration_s * covariance[row, half + column]
+    for row in range(half):
+        covariance[row, row] += position
+        covariance[row, half + row] += both
+        covariance[half + row, row] += both
+        covariance[half + row, half + row] += velocity
+
+
+def observe(
+    mean: Floats, covariance: Floats, independent: Floats, value: Floats, variance: Floats
+) -> None:
+    """Update with what is measured, component by component, in place.
+
+    `independent` is the part of the covariance that stems from measurements since it was zero.
+    """
+    size = len(mean)
+    gain, crossed = np.empty(size), np.empty(size)
+    for seen in range(size):
+        if np.isnan(value[seen]):
+            continue
+        spread = covariance[seen, seen] + variance[seen]
+        error = value[seen] - mean[seen]
+        for row in range(size):
+            gain[row] = covariance[row, seen] / spread
+        at = independent[seen, seen]
+        for row in range(size):
+            crossed[row] = independent[seen, row]
+        for row in range(size):
+            mean[row] += gain[row] * error
+            for column in range(size):
+                independent[row, column] += (
+                    gain[row] * gain[column] * (at + variance[seen])
+                    - gain[row] * crossed[column]
+                    - crossed[row] * gain[column]
+                )
+        for row in range(size):
+            for column in range(row + 1):
+                covariance[row, column] -= gain[row] * gain[column] * spread
+                covariance[column, row] = covariance[row, column]
+
+
+def assign(mean: Floats, covariance: Floats, new_mean: Floats, new_covariance: Floats) -> None:
+    """Fill the first two from the others; loops, since slices are very slow to compile."""
+    for row in range(len(mean)):
+        mean[row] = new_mean[row]
+        for column in range(len(mean)):
+            covariance[row, column] = new_covariance[row, column]
+
+
+def network(fuse: Function) -> Function:
+    """The loop over the activities of one run; `own_first` fuses the own x*, not the prediction."""
+
+    def follow(
+        run: int,
+        activities: Activities,
+        sensing: Sensing,
+        prior_mean: Floats,
+        prior_covariance: Floats,
+        prior_ns: Integers,
+        own_first: bool,
+        results: Results,
+        failed_ns: Integers,
+    ) -> None:
+        nodes, size = len(sensing.density), prior_mean.shape[1]
+        mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
+        time_ns = np.empty(nodes, np.int64)
+        for node in range(nodes):
+            assign(mean[node], covariance[node], prior_mean[run], prior_covariance[run])
+            time_ns[node] = prior_ns[run]
+        begin, last = activities.offsets[run], activities.offsets[run + 1]
+        most = 1
+        for activity in range(begin, last):
+            most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
+        means, weights = np.empty((most, size)), np.empty(most)
+        covariances, independents = np.empty((most, size, size)), np.empty((most, size, size))
+        while begin < last:
+            now = activities.time_ns[begin]
+            end = begin
+            while end < last and activities.time_ns[end] == now:
+                node = activities.node[end]
+                if now > time_ns[node]:
+                    span_s = (now - time_ns[node]) * 1e-9
+                    move(mean[node], covariance[node], sensing.density[node], span_s)
+                    time_ns[node] = now
+                sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
+                assign(sent_mean, sent_covariance, mean[node], covariance[node])
+                for k in range(activities.measured[end], activities.measured[end + 1]):
+                    observe(
+                        sent_mean,
+                        sent_covariance,
+                        results.sent_independent[end],
+                        sensing.value[k],
+                        sensing.variance[sensing.sensor[k]],
+                    )
+                end += 1
+            for activity in range(begin, end):
+                node = activities.node[activity]
+                first = activities.received[activity]
+                count = 1 + activities.received[activity + 1] - first
+                if count > 1:
+                    for i in range(count):
+                        source = activities.message[first + i - 1] if i > 0 else activity
+                        if i > 0 or own_first:
+                            its_mean, its_covariance = (
+                                results.sent_mean[source],
+                                results.sent_covariance[source],
+                            )
+                        else:
+                            its_mean, its_covariance = mean[node], covariance[node]
+                        assign(means[i], covariances[i], its_mean, its_covariance)
+                        late_s = (now - activities.time_ns[source]) * 1e-9
+                        # what was new in a late one others may have passed on
+                        new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
+                        for row in range(size):
+                            for column in range(size):
+                                independents[i, row, column] = (
+                                    new * results.sent_independent[source, row, column]
+                                )
+                        if late_s > 0.0:
+                            move(means[i], covariances[i], sensing.density[node], late_s)
+                    gap = fuse(
+                        count, means, covariances, independents, weights, mean[node], covariance[node]
+                    )
+                    if not gap < np.inf:
+                        failed_ns[run] = now
+                        return
+                for k in range(activities.measured[activity], activities.measured[activity + 1]):
+                    observe(
+                        mean[node],
+                        covariance[node],
+                        independents[0],  # of no use any more
+                        sensing.value[k],
+                        sensing.variance[sensing.sensor[k]],
+                    )
+                assign(
+                    results.mean[activity], results.covariance[activity], mean[node], covariance[node]
+                )
+            begin = end
+
+    return follow
+
+
+@lru_cache(maxsize=16)
+def _compiled(name: str, tolerance: float) -> Function:
+    fused_by = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
+    return compile_over_runs(network(rule(fused_by, tolerance)))
+
+
+def message_bytes(name: str, states: int) -> int:
+    """What one message carries: stamp, mean and the covariance's triangle, twice that for split CI."""
+    triangle = states * (states + 1) // 2
+    doubles = {ALONE: 0, "split-ci": 1 + states + 2 * triangle}.get(name, 1 + states + triangle)
+    return 8 * doubles
+
+
+def solve(
+    whole: Mapping[str, Ragged],
+    *,
+    name: str,
+    sensors: Mapping[int, Topic],
+    components: Sequence[str],
+    parameters: NetworkParameters,
+) -> list[Ragged]:
+    """Replay the network, see the module; `sensors` are the topics by node.
+
+    Raises BadInput where a run has no proper prior, or a link names an unknown node or arrives before it
+    was sent.
+    """
+    prior = whole["/prior"]
+    rows = prior.offsets[:-1]
+    if np.any(np.diff(prior.offsets) == 0):
+        raise BadInput("topic /prior: a run has no prior message; the nodes cannot start")
+    size = len(components)
+    covariance = prior["covariance"][rows].reshape(-1, size, size)
+    if np.any(np.linalg.eigvalsh(covariance)[:, 0] <= 0):
+        raise BadInput("topic /prior: the prior's covariance is not positive definite")
+    prior_ns = prior.stream.publish_time_ns[rows]
+    activities, sensing, sent = _schedule(whole, sensors, components, prior_ns, parameters.rule)
+    count = len(activities.node)
+    blank = np.full((count, size), np.nan)
+    square = np.full((count, size, size), np.nan)
+    results = Results(blank, square, blank.copy(), square.copy(), np.zeros_like(square))
+    failed_ns = np.full(prior.runs, -1)
+    _compiled(parameters.rule, parameters.tolerance)(
+        prior.runs,
+        activities,
+        sensing,
+        prior["mean"][rows],
+        covariance,
+        prior_ns,
+        parameters.rule == TRAP,
+        results,
+        failed_ns,
+    )
+    metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * size)}
+    outputs = [_failures(f"/estimates/{name}/failure", failed_ns)]
+    places = [f"node{number}" for number in sensors] if parameters.rule != CENTRALISED else ["centre"]
+    done = np.isfinite(results.mean[:, 0])
+    for node, place in enumerate(places):
+        outputs.append(
+            _estimates(
+                f"/estimates/{name}/{place}/state",
+                activities,
+                (activities.node == node) & done,
+                metadata | {"truth": "/truth"},
+                results.mean,
+                results.covariance,
+            )
+        )
+        if parameters.rule not in (ALONE, CENTRALISED):
+            outputs.append(
+                _estimates(
+                    f"/estimates/{name}/{place}/sent",
+                    activities,
+                    (activities.node == node) & done & sent,
+                    metadata,
+                    results.sent_mean,
+                    results.sent_covariance,
+                )
+            )
+    return outputs
+
+
+def _schedule(
+    whole: Mapping[str, Ragged],
+    sensors: Mapping[int, Topic],
+    components: Sequence[str],
+    prior_ns: Integers,
+    name: str,
+) -> tuple[Activities, Sensing, NDArray[np.bool_]]:
+    """The activities of all nodes and runs, their measurements, and in which something is sent."""
+    numbers = list(sensors)
+    centralised = name == CENTRALISED
+    sensing = _sensing(whole, sensors, components)
+    run, time_ns, node = _events([whole[topic.name] for topic in sensors.values()])
+    if centralised:
+        node = np.zeros_like(node)
+    links = whole["/links"]
+    link_run = np.repeat(np.arange(links.runs), np.diff(links.offsets))
+    ends = {}
+    for end in ("sender_id", "receiver_id"):
+        if not np.isin(links[end], numbers).all():
+            raise BadInput(f"topic /links: {end} names a node without a topic /nodeN/sensor")
+        ends[end] = np.searchsorted(numbers, links[end])
+    sent_ns, arrival_ns = links.stream.publish_time_ns, links["arrival_time_ns"]
+    if np.any(arrival_ns < sent_ns):
+        raise BadInput("topic /links: a message arrives before it was sent; mend the link's clocks")
+    arrived = links["lost"] == 0
+    if centralised or name == ALONE:
+        arrived = np.zeros(len(links), bool)
+        if centralised:
+            ends = {end: np.zeros_like(ids) for end, ids in ends.items()}
+    events = [
+        np.stack(each)
+        for each in (
+            (run, time_ns, node),
+            (link_run, sent_ns, ends["sender_id"]),
+            (link_run[arrived], arrival_ns[arrived], ends["receiver_id"][arrived]),
+        )
+    ]
+    stacked = np.concatenate(events, axis=1)
+    usable = stacked[1] >= prior_ns[stacked[0]]
+    instants, rank = np.unique(stacked[1], return_inverse=True)
+    keys = (stacked[0] * len(instants) + rank) * len(numbers) + stacked[2]
+    found, activity = np.unique(np.where(usable, keys, -1), return_inverse=True)
+    early = int(found[0] == -1) if len(found) else 0  # what happened before the prior
+    found, activity = found[early:], activity - early
+    moment, node_of = np.divmod(found, len(numbers))
+    run_of, instant = np.divmod(moment, len(instants))
+    cuts = np.cumsum([part.shape[1] for part in events])[:-1]
+    of_measurement, of_send, of_arrival = np.split(activity, cuts)
+    order = np.argsort(of_measurement, kind="stable")
+    order = order[of_measurement[order] >= 0]
+    source = of_send[arrived]
+    received = np.argsort(of_arrival, kind="stable")
+    received = received[source[received] >= 0]
+    sent = np.zeros(len(found), bool)
+    sent[of_send[of_send >= 0]] = True
+    bounds = np.arange(len(found) + 1)
+    return (
+        Activities(
+            np.searchsorted(run_of, np.arange(len(prior_ns) + 1)),
+            instants[instant],
+            node_of,
+            np.searchsorted(of_measurement[order], bounds),
+            np.searchsorted(of_arrival[received], bounds),
+            source[received],
+        ),
+        sensing._replace(value=sensing.value[order], sensor=sensing.sensor[order]),
+        sent,
+    )
+
+
+def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
+    """Run, stamp and index of the part, of all messages, part by part."""
+    run = [np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts]
+    index = [np.full(len(part), number) for number, part in enumerate(parts)]
+    time_ns = [part.stream.publish_time_ns for part in parts]
+    return np.concatenate(run), np.concatenate(time_ns), np.concatenate(index)
+
+
+def _sensing(
+    whole: Mapping[str, Ragged], sensors: Mapping[int, Topic], components: Sequence[str]
+) -> Sensing:
+    values, index = [], []
+    variance = np.full((len(sensors), len(components)), np.nan)
+    density = np.empty(len(sensors))
+    for number, topic in enumerate(sensors.values()):
+        part = whole[topic.name]
+        try:
+            seen = [components.index(name) for name in topic.metadata["components"].split(",")]
+            variance[number, seen] = np.square([float(x) for x in topic.metadata["sigmas"].split(",")])
+            density[number] = float(topic.metadata["acceleration_density"])
+        except (KeyError, ValueError):
+            raise BadInput(
+                f"topic {topic.name}: the channel's metadata must name components of the state, sigmas "
+                "and acceleration_density"
+            ) from None
+        if part["value"].size != len(part) * len(seen):
+            raise BadInput(
+                f"topic {topic.name}: its values do not have the {len(seen)} components named"
+            )
+        value = np.full((len(part), len(components)), np.nan)
+        value[:, seen] = part["value"].reshape(len(part), len(seen))
+        values.append(value)
+        index.append(np.full(len(part), number))
+    if not np.all(np.nan_to_num(variance, nan=1.0) > 0):
+        raise BadInput("a sensor's sigma is not positive; a perfect sensor makes covariances singular")
+    return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
+
+
+def _estimates(
+    topic: str,
+    activities: Activities,
+    chosen: NDArray[np.bool_],
+    metadata: Mapping[str, str],
+    mean: Floats,
+    covariance: Floats,
+) -> Ragged:
+    rows = np.flatnonzero(chosen)
+    stream = make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        activities.time_ns[rows],
+        metadata=metadata,
+        mean=mean[rows],
+        covariance=covariance[rows].reshape(len(rows), covariance.shape[1] ** 2),
+    )
+    return Ragged(stream, np.searchsorted(rows, activities.offsets))
+
+
+def _failures(topic: str, failed_ns: Integers) -> Ragged:
+    failed = np.flatnonzero(failed_ns >= 0)
+    stream = make_stream(
+        topic,
+        schemas.FAILURE,
+        failed_ns[failed],
+        metadata={"reasons": "; ".join(FAILURES)},
+        reason=np.zeros(len(failed), int),
+    )
+    return Ragged(stream, np.searchsorted(failed, np.arange(len(failed_ns) + 1)))
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:
+    sensors: dict[int, Topic] = {}
+    for topic in topics.values():
+        node = topic.name.removeprefix("/node").removesuffix("/sensor")
+        if node.isdigit() and topic.name == f"/node{node}/sensor":
+            sensors[int(node)] = topic
+    if not sensors or "/links" not in topics or "/prior" not in topics:
+        return []
+    sensors = dict(sorted(sensors.items()))
+    components = topics["/prior"].metadata.get("components", "").split(",")
+    if len(components) % 2:
+        raise BadInput("topic /prior: the state must be positions and as many velocities")
+    read = ("/links", *(topic.name for topic in sensors.values()))
+    work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
+    return [Batch(name, read, ("/prior",), work)]
+
+
+NETWORK = Estimator(
+    "nodes that follow one thing and fuse what they send each other, by any fusion rule",
+    "/prior, /links and, per node, /nodeN/sensor",
+    NetworkParameters,
+    _bind,
+    variant="rule",
+)

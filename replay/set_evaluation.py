@@ -1,0 +1,118 @@
+"""Sets against truth: area, whether the true position is inside, and how often there is no set."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from replay.blocks import Ragged
+from replay.estimators.feasible_sets import excess_rad, signed_area
+from replay.estimators.set_membership import frames, map_and_arena
+from replay.evaluation import split_topic, truth_at
+from replay.sources import Source
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JudgedSets:
+    """The sets of one estimator and case, a row per frame.
+
+    `inside` says whether the truth is in the set, where it is `known`, and `bound_holds` whether all
+    relative bearings of the frame keep their bound there; an empty set has area 0.
+    """
+
+    estimator: str
+    case: str
+    run: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    area_m2: Floats
+    known: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+    bound_holds: NDArray[np.bool_]
+    faults: int
+
+    @property
+    def violations(self) -> int:
+        """How many sets miss the truth although their bounds hold: with guaranteed sets, none."""
+        return int((self.known & self.bound_holds & ~self.inside).sum())
+
+
+def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
+    """The rings (n, 2) of every frame; none where its set is empty."""
+    ends = np.cumsum(sizes["elements"].astype(np.int64))
+    ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
+    frames = []
+    for first, end in zip(np.append(0, ends[:-1]), ends, strict=True):
+        cuts = np.flatnonzero(np.diff(ring[first:end])) + 1
+        frames.append(np.split(vertex[first:end], cuts) if end > first else [])
+    return frames
+
+
+def areas_of(frames: Sequence[Sequence[Floats]]) -> Floats:
+    """The area (n,) inside the rings of every frame; holes run the other way round."""
+    return np.array([abs(sum(map(signed_area, rings))) for rings in frames])
+
+
+def judge_sets(
+    outputs: dict[str, Ragged], sources: Sequence[Source], gap_limit_s: float
+) -> list[JudgedSets]:
+    """Every set estimate of a replay against the truth that its channel names."""
+    found = []
+    for topic, sizes in outputs.items():
+        if sizes.stream.schema.full_name == schemas.ESTIMATE_SIZE.full_name and topic.endswith("/size"):
+            base = topic.removesuffix("size")
+            if f"{base}set" in outputs:
+                fault = outputs[f"{base}fault"]
+                found.append(_judge(sizes, outputs[f"{base}set"], len(fault), sources, gap_limit_s))
+    return found
+
+
+def _judge(
+    sizes: Ragged, sets: Ragged, faults: int, sources: Sequence[Source], gap_limit_s: float
+) -> JudgedSets:
+    run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
+    topic = sizes.stream.metadata["truth"]
+    truth = [
+        truth_at(
+            source.read([topic])[topic],
+            sizes.of_run(number).publish_time_ns,
+            source.topics[topic].metadata.get("kinds", "linear,linear").split(","),
+            gap_limit_s,
+        )[:, :2]
+        for number, source in enumerate(sources)
+    ]
+    places = np.concatenate(truth)
+    holds = [
+        _bounds_hold(sizes.stream.metadata, source, there)
+        for source, there in zip(sources, truth, strict=True)
+    ]
+    sets_of_frames = frames_of(sizes.stream, sets.stream)
+    inside = np.zeros(len(places), bool)
+    for frame, rings in enumerate(sets_of_frames):
+        for ring in rings:
+            inside[frame] ^= Path(ring, closed=False).contains_point(places[frame])
+    estimator, case = split_topic(sizes.stream.topic)
+    return JudgedSets(
+        estimator,
+        case,
+        run,
+        sizes.stream.publish_time_ns,
+        areas_of(sets_of_frames),
+        np.asarray(np.isfinite(places).all(axis=1)),
+        inside,
+        np.concatenate(holds),
+        faults,
+    )
+
+
+def _bounds_hold(stated: Mapping[str, str], source: Source, places: Floats) -> NDArray[np.bool_]:
+    """Whether each frame's relative bearings keep the bound at the places (frames, 2)."""
+    known, _ = map_and_arena(source.read(["/landmarks"])["/landmarks"], 0.0)
+    seen = source.read([stated["measured"]])[stated["measured"]]
+    found = frames(seen, known, float(stated["bound_rad"]), int(stated["least_landmarks"]))
+    excess = [excess_rad(frame.pairs, at) for frame, at in zip(found, places, strict=True)]
+    return np.array([bool(np.all(each <= 0)) for each in excess], bool)
