@@ -33,7 +33,7 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 class LcdOptions(Parameters):
     """The (dimension, count) of the sets to optimise, from so many starts, and samplings to draw."""
 
-    sizes: tuple[Size, ...] = ((2, 5), (2, 12), (2, 50))
+    sizes: Annotated[tuple[Size, ...], Field(min_length=1)] = ((2, 5), (2, 12), (2, 50))
     starts: PositiveInt = 4
     contained: tuple[PositiveInt, ...] = (2, 3)
     drawn: tuple[str, ...] = ("s2kf-12", "ukf", "gf-7", "rukf-3")

@@ -121,7 +121,10 @@ def as_bingham(noise: Noise) -> Bingham:
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
-    return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
+    try:
+        return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
+    except BadInput as error:
+        raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
 
 
 def as_covariance(noise: Noise) -> Floats:
