@@ -42,7 +42,7 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
     if not np.isfinite(state).all():
         raise BadInput(
             f"start = {parameters.start}, step_s = {parameters.step_s:g}: the reaction runs away; "
-            "start at pressures from 0 on, and take shorter steps"
+            "start at pressures from 0 on, and take shorter or fewer steps"
         )
     (total,) = total_pressure(state[1:].T)
     read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)

@@ -424,6 +424,11 @@ def _bind(
     def solve(streams: dict[str, Ragged]) -> list[Ragged]:
         runs = [streams[TOPIC].of_run(run) for run in range(streams[TOPIC].runs)]
         compared = [comparisons_of(run) for run in runs]
+        users = {len(each.scores) for each in compared}
+        if len(users) > 1:
+            raise BadInput(
+                f"topic {TOPIC}: {min(users)} to {max(users)} users; replay such logs in turn"
+            )
         return [
             gather(
                 [

@@ -268,6 +268,14 @@ def test_too_few_users_for_the_folds_and_unknown_subsets_are_refused():
         replay_ensemble([source], {"score-mixture": {"components_of": {"al": 2}}}, gap_limit_s=1)
 
 
+def test_runs_of_different_users_are_refused():
+    """The folds stand in the metadata of the topic, which all runs share."""
+    settings = ({"users": users, "low_galleries": 1} for users in (20, 30))
+    sources = [memory_source(*record_run("biometric-scores", each, 0)) for each in settings]
+    with pytest.raises(BadInput, match="20 to 30 users; replay such logs in turn"):
+        replay_ensemble(sources, {"score-rule": {}}, gap_limit_s=1)
+
+
 def test_scores_that_cannot_be_scaled_or_learnt_from_are_refused_in_words():
     with pytest.raises(BadInput, match="matcher 2 of 2 have a standard deviation of 0"):
         normalise(np.arange(18.0).reshape(3, 3, 2) * [1, 0], "z")
