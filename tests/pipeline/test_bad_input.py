@@ -46,7 +46,11 @@ TABLE: dict[str, tuple[str, ...]] = {
     "record landmarks --set range.rate=1": ("no parameter 'range.rate'", "'rate_hz'"),
     "record landmarks --set range=1": ("'range' is 1", "dictionary"),
     "record axis --set step_s=1e12": ("lasts 1e+14 s", "2262"),
-    "record batch-reactor --set start=[-1,-1]": ("start = (-1.0, -1.0)", "runs away", "shorter or fewer steps"),
+    "record batch-reactor --set start=[-1,-1]": (
+        "start = (-1.0, -1.0)",
+        "runs away",
+        "shorter or fewer steps",
+    ),
     "record biometric-scores --set users=100000": ("'users' is 100000", "5000"),
     "record landmarks --seed -1": ("--seed", "-1"),
     "record landmarks --run -1": ("--run", "-1"),
