@@ -191,9 +191,8 @@ def run_experiment(
     for label, values in experiment.estimators.items():
         configure(label, values)
     find_metrics(experiment.metrics)
-    with result_folder(folder) as part:
-        with foreign_code(f"study {experiment.study}"):
-            outcome = study.run(experiment, Setting(part, data, logs, options, progress))
+    with result_folder(folder) as part, foreign_code(f"study {experiment.study}"):
+        outcome = study.run(experiment, Setting(part, data, logs, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)
