@@ -210,7 +210,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
 ) -> None:
     """Studies are registered code like recorders and estimators: theirs are no tracebacks either."""
 
-    def divide(experiment: Experiment, setting: Setting) -> Outcome:
+    def divide(_: Experiment, setting: Setting) -> Outcome:
         (setting.folder / "half").write_text("written")
         raise ZeroDivisionError("no runs")
 
