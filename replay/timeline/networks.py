@@ -134,7 +134,7 @@ def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
         views.append(
             rrb.Vertical(
                 plane_view(canvas, ways, [truth], paths, places),
-                plane_view(canvas, errors, [], [], extent, "Errors and 95 % ellipses"),
+                plane_view(canvas, errors, [], [], extent, name="Errors and 95 % ellipses"),
                 name=estimator,
             )
         )
