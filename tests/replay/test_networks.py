@@ -99,6 +99,20 @@ def test_late_and_duplicate_messages_leave_ci_consistent_and_are_predicted_forwa
     assert rmse.mean() < 0.5 * judged(sources, "alone")[0].mean()
 
 
+def test_a_message_that_arrives_twice_counts_once_for_ci():
+    """Every message doubled: what is fused stays, but for the tolerance of the weights."""
+    once, twice = (ensemble(3, duplicate_probability=share) for share in (0.0, 1.0))
+    assert len(twice[0].streams["/links"]) == 2 * len(once[0].streams["/links"])
+    errors = [
+        replay_ensemble(each, {"ci": {"kind": "network:ci-trace"}}, gap_limit_s=0.2).errors
+        for each in (once, twice)
+    ]
+    for single, double in zip(*errors, strict=True):
+        sigma = np.sqrt(single.covariance[:, 0, 0])
+        assert np.all(np.abs(single.error[:, 0] - double.error[:, 0]) < 0.2 * sigma)
+        np.testing.assert_allclose(double.covariance[:, 0, 0], single.covariance[:, 0, 0], rtol=0.03)
+
+
 def test_a_node_that_is_lost_and_rejoins_recovers():
     outage = [{"node": 4, "start_s": 2.0, "end_s": 6.0}]
     sources = ensemble(60, outages=outage)
