@@ -93,7 +93,7 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
         _link_events(parameters, links, times_s[1:], link_rng),
     ]
     for number, node in enumerate(nodes, start=1):
-        steps = np.arange(node.every_steps, parameters.steps + 1, node.every_steps)
+        steps = np.arange(1, parameters.steps + 1, node.every_steps)
         steps = steps[~_is_out(parameters, number, times_s[steps])]
         seen = [COMPONENTS.index(name) for name in node.components]
         noise = sensor_rng.normal(size=(len(steps), len(seen))) * node.sigmas
