@@ -18,7 +18,7 @@ def test_the_room(tmp_path):
     assert found["ci-trace.rmse_ratio"] == pytest.approx(1.075, abs=0.05)
     assert found["ci-trace.nees"] < 4.4
     assert found["naive.nees"] > 1000
-    # until its first message a node stands at the prior
+    # at first a node knows little but its own measurement
     assert found["ci-trace.rmse_ratio.all-steps"] > found["ci-trace.rmse_ratio"]
     # 100 messages of stamp, mean and triangle; split CI sends its independent part as well
     assert found["ci-trace.load_bytes_per_link"] == 100 * 8 * (1 + 4 + 10)

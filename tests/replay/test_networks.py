@@ -110,7 +110,7 @@ def test_a_message_that_arrives_twice_counts_once_for_ci():
     for single, double in zip(*errors, strict=True):
         sigma = np.sqrt(single.covariance[:, 0, 0])
         assert np.all(np.abs(single.error[:, 0] - double.error[:, 0]) < 0.2 * sigma)
-        np.testing.assert_allclose(double.covariance[:, 0, 0], single.covariance[:, 0, 0], rtol=0.03)
+        np.testing.assert_allclose(double.covariance[:, 0, 0], single.covariance[:, 0, 0], rtol=0.1)
 
 
 def test_a_node_that_is_lost_and_rejoins_recovers():
