@@ -2,7 +2,7 @@
 
 Claims: Jin, Lee, Hashimoto, DIND networks. RMSE, over all runs and steps, and NEES are those after
 `settle_s`, when every node has measured; ratios are the nodes' mean RMSE over that of one filter with
-all sensors. Over all steps ratios are larger: until its first message a node knows only the prior.
+all sensors. Over all steps ratios are larger: at first a node knows little but its own measurement.
 """
 
 from collections.abc import Mapping, Sequence

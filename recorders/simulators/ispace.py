@@ -26,7 +26,8 @@ Index = Annotated[int, Field(ge=1)]
 class Node(Parameters):
     """A node's sensor: which components of the state it measures, how well, and at every how many steps.
 
-    `acceleration_density` is what the node's own motion model believes; None is the truth.
+    It measures at the first step, and then at every so many. `acceleration_density` is what the node's
+    own motion model believes; None is the truth.
     """
 
     components: tuple[str, ...] = ("x_m", "y_m")

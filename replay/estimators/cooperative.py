@@ -24,7 +24,7 @@ from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
-from replay.estimators.covariance_intersection import blend, sighting_weight
+from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
 from replay.estimators.gaussian import (
     ALL_WELL,
     FAILURES,
@@ -52,9 +52,14 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """How sightings of robots are used, and who uses landmarks; None takes what the channels state."""
+    """How sightings of robots are used, and who uses landmarks; None takes what the channels state.
+
+    `criterion` is what CI makes least: the trace of a pose's covariance, in m^2 + rad^2, or its
+    determinant.
+    """
 
     mode: Mode = "ci"
+    criterion: Criterion = "trace"
     anchors: tuple[int, ...] = (3,)
     forward_noise_density: NonNegativeFloat | None = None
     turn_noise_density: NonNegativeFloat | None = None
@@ -162,6 +167,23 @@ def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) ->
             spread[row, column] = spread[column, row] = entry
 
 
+def fill_square(covariance: Floats, first: int, rows: Floats, square: Floats) -> float:
+    """Fill rows P P rows' with the block P (3, 3) of one robot; returns its trace."""
+    cross, trace = np.empty((3, 2)), 0.0
+    for k in range(3):
+        trace += covariance[first + k, first + k]
+        for row in range(2):
+            cross[k, row] = 0.0
+            for m in range(3):
+                cross[k, row] += covariance[first + k, first + m] * rows[row, m]
+    for row in range(2):
+        for column in range(2):
+            square[row, column] = 0.0
+            for k in range(3):
+                square[row, column] += cross[k, row] * cross[k, column]
+    return trace
+
+
 def scale(covariance: Floats, first: int, factor: float) -> None:
     """Scale the block of one robot."""
     for row in range(3):
@@ -212,7 +234,7 @@ def improve(
     return correct(mean, covariance, Innovation(difference, spread, cross), gate)
 
 
-def cooperation(joint: bool, intersect: bool) -> Function:
+def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
     """The loop over the events of one run."""
 
     def meet(
@@ -224,7 +246,7 @@ def cooperation(joint: bool, intersect: bool) -> Function:
         gate: Floats,
     ) -> bool:
         """Use a sighting; False where a covariance is not positive definite."""
-        own, noise = np.zeros((2, 2)), np.empty((2, 2))
+        own, noise, square = np.zeros((2, 2)), np.empty((2, 2)), np.empty((2, 2))
         for row in range(2):
             own[row, row] = variance[row]
         first, both = 3 * robots, robots[1] >= 0
@@ -235,8 +257,9 @@ def cooperation(joint: bool, intersect: bool) -> Function:
             if both and not joint:
                 share = 1.0
                 if intersect:
-                    here, there = sighting.spread[side], sighting.spread[1 - side]
-                    weight = sighting_weight(3, here, there, own)
+                    trace = fill_square(covariance, first[side], sighting.rows[side], square)
+                    stake = Stake(3, trace, sighting.spread[side], square)
+                    weight = sighting_weight(by_trace, stake, sighting.spread[1 - side], own)
                     share = 1.0 / (1.0 - weight)
             blend(1.0, own, share, sighting.spread[1 - side], noise)
             scale(covariance, first[side], 1.0 / weight)
@@ -288,9 +311,9 @@ def cooperation(joint: bool, intersect: bool) -> Function:
     return cooperate
 
 
-@lru_cache(maxsize=4)
-def _compiled(mode: Mode) -> Function:
-    return compile_over_runs(cooperation(mode == "joint", mode == "ci"))
+@lru_cache(maxsize=8)
+def _compiled(mode: Mode, criterion: Criterion) -> Function:
+    return compile_over_runs(cooperation(mode == "joint", mode == "ci", criterion == "trace"))
 
 
 def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> tuple[Carried, Landmarks]:
@@ -317,6 +340,7 @@ def run(
     name: str,
     prefixes: tuple[str, ...],
     mode: Mode,
+    criterion: Criterion,
     settings: Settings,
 ) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
@@ -325,7 +349,8 @@ def run(
     events = _events(block, landmarks, prefixes, mode, settings, carried.time_ns)
     count = int(events.emit.max(initial=-1)) + 1
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
-    _compiled(mode)(len(carried.mean), events, landmarks.positions, settings, carried, results)
+    loop = _compiled(mode, criterion)
+    loop(len(carried.mean), events, landmarks.positions, settings, carried, results)
     poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
     return (carried, landmarks), [*poses, _failures(name, before, carried)]
 
@@ -426,7 +451,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
                 f"estimator {name}: anchor {anchor} is none of the robots "
                 f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
             )
-    given = parameters.model_dump(exclude={"mode", "anchors"})
+    given = parameters.model_dump(exclude={"mode", "criterion", "anchors"})
     density, variance = np.empty((len(prefixes), 2)), np.empty((len(prefixes), 2))
     for row, prefix in enumerate(prefixes):
         for column, key in enumerate(("forward_noise_density", "turn_noise_density")):
@@ -445,7 +470,14 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
             tuple(f"{prefix}/{leaf}" for prefix in prefixes for leaf in ("odometry", "range_bearing")),
             (*(f"{prefix}/prior" for prefix in prefixes), "/landmarks"),
             partial(begin, prefixes=prefixes),
-            partial(run, name=name, prefixes=prefixes, mode=parameters.mode, settings=settings),
+            partial(
+                run,
+                name=name,
+                prefixes=prefixes,
+                mode=parameters.mode,
+                criterion=parameters.criterion,
+                settings=settings,
+            ),
         )
     ]
 

@@ -533,20 +533,45 @@ def fuse(
     return Fused(*(part.reshape(batch + part.shape[1:]) for part in fused))
 
 
-def sighting_weight(states: int, spread: Floats, shared: Floats, own: Floats) -> float:
-    """The weight w of `fuse_sighting` for n states; NaN where a covariance is singular.
+class Stake(NamedTuple):
+    """What a state (n,) has at stake in a sighting with rows H (m, n): what its best weight depends on.
 
-    `spread` is the innovation's part from the state, H P H'. The fused determinant is in proportion to
-    |R| / (w^n |S|) with R = shared / (1 - w) + own and S = spread / w + R, which is convex in w.
+    Attributes:
+        states: n.
+        trace: of the covariance P.
+        spread: H P H' (m, m).
+        square: H P P H' (m, m).
     """
-    noise, total = np.empty_like(own), np.empty_like(own)
+
+    states: int
+    trace: float
+    spread: Floats
+    square: Floats
+
+
+def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
+    """The weight w of `fuse_sighting`; NaN where a covariance is singular.
+
+    With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
+    tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
+    logarithm are convex in w.
+    """
+    noise, total, precision = np.empty_like(own), np.empty_like(own), np.empty_like(own)
     section = np.empty(7)
     value, weight = np.inf, 0.5
     for step in range(SIGHTING_STEPS):
         weight = golden(step, SIGHTING_STEPS, value, section)
         blend(1.0 / (1.0 - weight), shared, 1.0, own, noise)
-        blend(1.0 / weight, spread, 1.0, noise, total)
-        value = np.log(determinant(noise) / determinant(total)) - states * np.log(weight)
+        blend(1.0 / weight, stake.spread, 1.0, noise, total)
+        if not inverted(total, precision):
+            return np.nan
+        if by_trace:
+            value = stake.trace / weight
+            for row in range(len(own)):
+                for column in range(len(own)):
+                    value -= precision[row, column] * stake.square[row, column] / weight**2
+        else:
+            value = np.log(determinant(noise) / determinant(total)) - stake.states * np.log(weight)
     return weight if np.isfinite(value) else np.nan
 
 
@@ -557,13 +582,14 @@ def fuse_sighting(
     innovation: ArrayLike,
     shared: ArrayLike,
     own: ArrayLike,
+    criterion: Criterion = "trace",
 ) -> tuple[Floats, Floats, float]:
     """The update by a measurement of part of a state that rests on another node's estimate.
 
     The innovation (m,), with rows (m, n), has a part with covariance `shared` that is correlated with
     the state in an unknown way, and one that is not, `own`, the sensor's: P / w against
-    shared / (1 - w) + own, at the w of the least determinant, which no unit changes. It is above 0: at 0
-    whatever the measurement does not see would be lost.
+    shared / (1 - w) + own, at the w of the least trace, which depends on the state's units, or the least
+    determinant, which does not. It is above 0: at 0 whatever the measurement does not see would be lost.
 
     Returns mean (n,), covariance (n, n) and w. Raises BadInput where a covariance is singular.
     """
@@ -571,7 +597,8 @@ def fuse_sighting(
         np.asarray(part, float) for part in (mean, covariance, rows, innovation, shared, own)
     )
     spread = h @ p @ h.T
-    weight = sighting_weight(len(x), spread, r, q) if determinant(p) > 0 else np.nan
+    stake = Stake(len(x), float(np.trace(p)), spread, h @ p @ p @ h.T)
+    weight = sighting_weight(criterion == "trace", stake, r, q) if determinant(p) > 0 else np.nan
     if not np.isfinite(weight):
         raise BadInput("a covariance of the sighting is singular; it needs the sensor's own noise")
     gain = np.linalg.solve(spread / weight + r / (1 - weight) + q, h @ p / weight).T

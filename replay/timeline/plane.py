@@ -187,6 +187,7 @@ def plane_view(
     paths: list[str],
     places: Floats,
     trail_s: float = TRAIL_S,
+    *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
     """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.

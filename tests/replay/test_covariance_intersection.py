@@ -119,22 +119,31 @@ def test_batches_equal_their_members_and_all_rules_keep_equal_estimates():
         np.testing.assert_allclose(same.mean[0], means[0, 0], rtol=1e-9)
 
 
-def test_a_sighting_of_part_of_the_state_fuses_as_ci_of_the_full_one_would():
+@pytest.mark.parametrize("criterion", ["trace", "determinant"])
+def test_a_sighting_of_all_of_the_state_fuses_as_ci_does(criterion):
     """All of the state seen without noise: CI. What is not seen keeps its variance / w."""
     rng = np.random.default_rng(7)
     means, covariances = rng.normal(size=(2, 3)), positive(rng, 2)
-    whole = fuse("ci-determinant", means, covariances)
+    whole = fuse(f"ci-{criterion}", means, covariances)
+    innovation, exact = means[1] - means[0], np.zeros((3, 3))
     mean, covariance, weight = fuse_sighting(
-        means[0], covariances[0], np.eye(3), means[1] - means[0], covariances[1], np.zeros((3, 3))
+        means[0], covariances[0], np.eye(3), innovation, covariances[1], exact, criterion
     )
     np.testing.assert_allclose(weight, whole.weights[0], atol=1e-4)
     np.testing.assert_allclose(mean, whole.mean, atol=1e-3)
     np.testing.assert_allclose(covariance, whole.covariance, atol=1e-3)
-    _, covariance, weight = fuse_sighting(
-        [0.0, 0.0], np.diag([4.0, 1.0]), [[1.0, 0.0]], [1.0], [[0.1]], [[0.1]]
-    )
+
+
+@pytest.mark.parametrize("criterion", ["trace", "determinant"])
+def test_a_sighting_of_part_of_the_state_has_the_best_weight_and_keeps_the_rest(criterion):
+    state, seen = np.diag([4.0, 1.0]), np.array([[1.0, 0.0]])
+    _, covariance, weight = fuse_sighting([0, 0], state, seen, [1.0], [[0.1]], [[0.1]], criterion)
     assert weight > 0.1
     assert covariance[1, 1] == pytest.approx(1.0 / weight)
+    size = {"trace": np.trace, "determinant": np.linalg.det}[criterion]
+    for other in np.linspace(0.01, 0.99, 99):
+        information = other * np.linalg.inv(state) + seen.T @ seen / (0.1 / (1 - other) + 0.1)
+        assert size(covariance) <= size(np.linalg.inv(information)) * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(
