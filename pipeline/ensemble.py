@@ -66,20 +66,23 @@ class Replayed:
 
     @property
     def failures(self) -> list[str]:
-        """A sentence for every run that an estimator could not follow to the end."""
-        sentences = []
+        """A sentence for every run that an estimator could not follow to the end, or not at all."""
+        failed: dict[tuple[str, int], str] = {}
+        silent: dict[tuple[str, int], str] = {}
         for topic, rows in self.outputs.items():
-            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
-                reasons = dict(enumerate(rows.stream.metadata.get("reasons", "").split("; ")))
-                for run, source in enumerate(self.sources):
-                    failure = rows.of_run(run)
-                    if len(failure) == 0:
-                        continue
-                    elapsed_s = (int(failure.publish_time_ns[0]) - source.epoch_ns) * 1e-9
-                    reason = reasons.get(int(failure["reason"][0]), "no reason given")
-                    what = " ".join(filter(None, split_topic(topic)))
-                    sentences.append(f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}")
-        return sentences
+            what = " ".join(filter(None, split_topic(topic)))
+            reasons = dict(enumerate(rows.stream.metadata.get("reasons", "").split("; ")))
+            for run, source in enumerate(self.sources):
+                found = rows.of_run(run)
+                if rows.stream.schema.full_name == schemas.FAILURE.full_name and len(found):
+                    elapsed_s = (int(found.publish_time_ns[0]) - source.epoch_ns) * 1e-9
+                    reason = reasons.get(int(found["reason"][0]), "no reason given")
+                    failed[what, run] = f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}"
+                elif rows.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name and not len(
+                    found
+                ):
+                    silent[what, run] = f"{source.name}: {what} gave no estimates"
+        return list({**silent, **failed}.values())
 
 
 def record_ensemble(

@@ -14,7 +14,7 @@ from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge
 from recorders.recording import Recorder
-from recorders.registry import available, load
+from recorders.registry import available, foreign_code, load
 from replay.engine import configure
 from replay.metrics import find_metrics
 
@@ -191,7 +191,7 @@ def run_experiment(
     for label, values in experiment.estimators.items():
         configure(label, values)
     find_metrics(experiment.metrics)
-    with result_folder(folder) as part:
+    with result_folder(folder) as part, foreign_code(f"study {experiment.study}"):
         outcome = study.run(experiment, Setting(part, data, logs, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:

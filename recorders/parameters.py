@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import shorten
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -49,11 +49,23 @@ def _nested_defaults(kind: type[Parameters]) -> dict[str, Any]:
 
 
 def _names_at(kind: type[BaseModel], path: Sequence[str]) -> list[str]:
-    """The names of the parameters in the table at `path`."""
-    names = [each.name for each in describe(kind)]
-    prefix = "".join(f"{part}." for part in path)
-    below = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
-    return list(dict.fromkeys(name.partition(".")[0] for name in below))
+    """The names of the parameters in the table at `path`, which may lead through lists and by keys."""
+    names = _annotations(kind)
+    for part in path:
+        table = _table_in(names.get(part))
+        names = _annotations(table) if table else names
+    return list(names)
+
+
+def _annotations(kind: type[BaseModel]) -> dict[str, Any]:
+    return {each.alias or name: each.annotation for name, each in kind.model_fields.items()}
+
+
+def _table_in(annotation: Any) -> type[BaseModel] | None:
+    """The type of the tables that an annotation such as list[Matcher] speaks of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_table_in, get_args(annotation))), None)
 
 
 class Described(NamedTuple):

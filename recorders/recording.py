@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Generic
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream
@@ -15,6 +16,20 @@ from recorders.registry import foreign_code, load
 
 # Simulated runs start at 2026-01-01T00:00:00Z: stamps are never negative and tools show a date.
 SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
+
+
+def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
+    """Stamps in ns of times in s since the epoch of simulations, of the same shape.
+
+    Raises BadInput where a stamp would be beyond what a log can hold.
+    """
+    with np.errstate(over="ignore"):
+        elapsed_ns = np.rint(np.asarray(elapsed_s, float) * 1e9)
+    stamps_ns = SIMULATION_EPOCH_NS + elapsed_ns
+    if not ((stamps_ns >= 0) & (stamps_ns < 2**63)).all():
+        longest_s = float(np.max(np.abs(elapsed_s)))
+        raise BadInput(f"the run lasts {longest_s:.3g} s; make it shorter: stamps end in the year 2262")
+    return SIMULATION_EPOCH_NS + elapsed_ns.astype(np.int64)
 
 
 @dataclass(frozen=True)

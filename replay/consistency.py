@@ -47,8 +47,12 @@ def component_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
-    """Area of the error ellipse of covariances (..., 2, 2) that holds this probability."""
-    return np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(np.linalg.det(covariance))
+    """Area of the error ellipse of covariances (..., 2, 2) that holds this probability.
+
+    Zero where rounding makes the determinant of a singular one negative.
+    """
+    squared = np.maximum(np.linalg.det(covariance), 0.0)
+    return np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:

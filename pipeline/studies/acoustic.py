@@ -19,6 +19,7 @@ from pipeline.studies.acoustic_cases import (
 )
 from pipeline.studies.acoustic_claims import claims
 from pipeline.studies.acoustic_figures import figures
+from pipeline.studies.repetitions import require_spread
 from replay.consistency import component_error_squared, ellipse_area
 from replay.evaluation import chi_square_interval
 
@@ -26,6 +27,7 @@ from replay.evaluation import chi_square_interval
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: AcousticOptions = setting.options
+    require_spread(experiment.runs)
     pairs = [
         (number, multiplier)
         for number in range(1, len(options.scenarios) + 1)

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
 from pipeline.ensemble import hash_streams, record_ensemble, replay_ensemble
 from pipeline.experiment import Experiment, Setting, load_scenario
@@ -41,12 +41,23 @@ class Maps(Parameters):
 
 
 class AcousticOptions(Parameters):
-    """Scenario files, multiples of the angular noise, the estimators that go at all of them, maps."""
+    """The paper's three scenarios as files, multiples of the angular noise, maps.
 
-    scenarios: list[str]
-    multipliers: list[PositiveFloat]
+    `modes` are the estimators that go at all multiples.
+    """
+
+    scenarios: Annotated[list[str], Field(min_length=3, max_length=3)]
+    multipliers: Annotated[list[PositiveFloat], Field(min_length=1)]
     modes: list[str]
     maps: Maps
+
+    @model_validator(mode="after")
+    def _has_what_claims_need(self) -> Self:
+        if 1.0 not in self.multipliers:
+            raise ValueError("multipliers must have 1, the paper's noise, among them")
+        if not {BEARINGS, LOCAL, NATIVE} <= set(self.modes):
+            raise ValueError(f"modes must have {BEARINGS}, {LOCAL} and {NATIVE} among them")
+        return self
 
 
 @dataclass(frozen=True)

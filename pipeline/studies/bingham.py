@@ -18,6 +18,7 @@ from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study, load_scenario
 from pipeline.results import Claim, Outcome
 from pipeline.studies.cases import replay_cases, rmse_of_runs
+from pipeline.studies.repetitions import require_spread
 from recorders.errors import BadInput
 from recorders.models.orientation import axis_angle_between
 from recorders.parameters import Parameters, build, merge
@@ -48,6 +49,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     missing = {options.estimator, options.additive, options.rotated} - set(experiment.estimators)
     if missing:
         raise BadInput(f"experiment '{experiment.title}': estimator {min(missing)} is missing")
+    require_spread(experiment.runs)
     stated = _stated(experiment)
     sources: list[MemorySource] = []
     errors_deg: dict[str, dict[str, Floats]] = {}

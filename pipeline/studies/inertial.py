@@ -56,7 +56,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.metrics.update(measure(replayed.judged, find_metrics(experiment.metrics)))
     outcome.tables["trials"] = trials
     outcome.figures["trials"] = trials_figure(trials)
-    outcome.claims = _claims(means, options, trials["trial"].nunique())
+    outcome.claims = _claims(means, options, int((trials["estimator"] == options.estimator).sum()))
     return outcome
 
 

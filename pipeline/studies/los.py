@@ -26,13 +26,14 @@ from pipeline.studies.los_cases import (
 )
 from pipeline.studies.los_claims import claims
 from pipeline.studies.los_figures import figures
-from pipeline.studies.repetitions import root_mean_square
+from pipeline.studies.repetitions import require_spread, root_mean_square
 from recorders.models.optical import ANGLES
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: LosOptions = setting.options
+    require_spread(experiment.runs)
     cases = [
         run_case(experiment, setting, number, name, condition)
         for condition in options.conditions

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 
 from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
 from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.studies.localization import write_logs
 from pipeline.studies.repetitions import Floats, by_repetition, errors_named, root_mean_square
+from recorders.errors import BadInput
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters, build, merge
 from recorders.simulators.optical import OpticalParameters
@@ -58,8 +59,16 @@ class LosOptions(Parameters):
     """Scenario files, conditions by name (the first is the paper's), and what the paper prints."""
 
     scenarios: list[str]
-    conditions: dict[str, Condition]
+    conditions: Annotated[dict[str, Condition], Field(min_length=1)]
     paper: Printed
+
+    @model_validator(mode="after")
+    def _are_the_papers(self) -> Self:
+        if len(self.scenarios) != len(self.paper.sensor_position_m):
+            raise ValueError(
+                f"scenarios must be the paper's {len(self.paper.sensor_position_m)}, in order"
+            )
+        return self
 
 
 @dataclass(frozen=True)
@@ -137,6 +146,9 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     options: LosOptions = setting.options
     chosen = options.conditions[condition]
     recorder, values, _ = load_scenario(name)
+    sensors = len(options.paper.sensor_position_m[number - 1])
+    if recorder != "optical-los" or len(values.get("bias_deg", [])) != sensors:
+        raise BadInput(f"scenario {name}: no optical-los scenario with bias_deg of {sensors} sensors")
     bias_deg = (chosen.bias_deg * np.array(values["bias_deg"])).tolist()
     values = merge(values, {"sigma_rad": chosen.sigma_rad, "bias_deg": bias_deg})
     values = merge(values, experiment.record.parameters if experiment.record else {})

@@ -14,9 +14,16 @@ from scipy.stats import norm
 
 from pipeline.ensemble import Replayed
 from pipeline.results import Verdict
+from recorders.errors import BadInput
 from replay.evaluation import Errors
 
 Floats = NDArray[np.float64]
+
+
+def require_spread(solutions: int) -> None:
+    """Raise BadInput where `solutions` of one experiment have no standard error."""
+    if solutions < 2:
+        raise BadInput("one run has no standard error to judge claims by; give --runs 2 or more")
 
 
 def errors_named(replayed: Replayed, estimator: str) -> Errors:

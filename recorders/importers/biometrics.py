@@ -17,18 +17,25 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, field_validator
 
 from recorders.errors import BadInput
 from recorders.models.scores import Matcher, score_stream
 from recorders.parameters import Parameters, build
-from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
+from recorders.recording import Importer, Recording, simulation_stamps_ns
 
 
 class Matchers(Parameters):
     """What matchers.toml says."""
 
     matchers: list[Matcher] = []
+
+    @field_validator("matchers")
+    @classmethod
+    def _differ(cls, matchers: list[Matcher]) -> list[Matcher]:
+        if len({each.name for each in matchers}) < len(matchers):
+            raise ValueError("give every matcher a name of its own")
+        return matchers
 
 
 class ScoreMatricesParameters(Matchers):
@@ -51,6 +58,8 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     Raises BadInput that names the file where it is missing, malformed, has other users than the first,
     or contradicts the sense that is declared for its scores.
     """
+    if not folder.is_dir():
+        raise BadInput(f"{folder}: not a folder; give the folder that holds a CSV per matcher")
     matchers = parameters.matchers or _described(folder)
     matrices = [_matrix(folder / f"{each.name}.csv") for each in matchers]
     first = matrices[0]
@@ -65,7 +74,7 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
             )
         _check_sense(path, matcher, matrix.scores)
     arrival_s = parameters.probe_interval_s * np.arange(len(first.probes))
-    arrival_ns = SIMULATION_EPOCH_NS + np.rint(arrival_s * 1e9).astype(np.int64)
+    arrival_ns = simulation_stamps_ns(arrival_s)
     scores = np.stack([matrix.scores for matrix in matrices], axis=-1)
     notes = {"times": f"made up: a probe every {parameters.probe_interval_s:g} s"}
     return Recording([score_stream(matchers, scores, arrival_ns)], notes=notes)

@@ -16,7 +16,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import require_unit
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording
+from recorders.recording import SIMULATION_EPOCH_NS, Importer, Recording, simulation_stamps_ns
 
 ORIENTATION = {
     "components": "orientation_w,orientation_x,orientation_y,orientation_z",
@@ -50,7 +50,7 @@ def read(path: Path, parameters: BroadParameters) -> Recording:
 def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> list[Stream]:
     data, rate_hz = _datasets(file)
     count = len(data["movement"])
-    time_ns = SIMULATION_EPOCH_NS + np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    time_ns = simulation_stamps_ns(np.arange(count) / rate_hz)
     inertial = np.concatenate([data["imu_acc"], data["imu_gyr"], data["imu_mag"]], axis=1)
     sampled = np.isfinite(inertial).all(axis=1)
     seen = np.isfinite(data["opt_quat"]).all(axis=1)
@@ -102,9 +102,13 @@ def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
     if not rate_hz > 0.0 or not np.isfinite(rate_hz):
         raise BadInput(f"{file}: attribute sampling_rate must be a positive number of Hz, as published")
     count = len(data["movement"]) if data["movement"].ndim else 0
+    if count == 0:
+        raise BadInput(f"{file}: dataset movement holds no samples; give a BROAD trial")
     for name, width in DATASETS.items():
+        if data[name].dtype.kind not in "biuf":
+            raise BadInput(f"{file}: dataset {name} is of {data[name].dtype}; expected real numbers")
         expected = (count,) if width is None else (count, width)
-        if data[name].shape != expected or count == 0:
+        if data[name].shape != expected:
             raise BadInput(f"{file}: dataset {name} has shape {data[name].shape}; expected {expected}")
     return data, rate_hz
 

@@ -5,23 +5,26 @@ metadata say which matchers are distances, and what a matcher gives where it cou
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.parameters import Parameters
 
 TOPIC = "/scores"
+# Part of a file's name, of a topic's and of a list.
+Name = Annotated[str, Field(pattern=r"^[^/,\s]+$")]
 
 
 class Matcher(Parameters):
     """A matcher: its name, what it looks at, the sense of its scores, and its score of a failure."""
 
-    name: str
-    modality: str
+    name: Name
+    modality: Name
     score: Literal["similarity", "distance"] = "similarity"
     failure: float | None = None
 

@@ -23,7 +23,7 @@ from recorders.models.acoustic import (
 from recorders.models.planar import wrap_angle
 from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Array = NDArray[np.float64]
 Place = tuple[float, float]
@@ -74,7 +74,7 @@ def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Record
     travel_s = np.linalg.norm(sensors - shooter, axis=1) / parameters.speed_of_sound_mps
     if travel_s.max() >= parameters.interval_s:
         raise BadInput(
-            f"interval_s = {parameters.interval_s}: the sound travels {travel_s.max():.2f} s to the "
+            f"interval_s = {parameters.interval_s}: the sound travels {travel_s.max():.3g} s to the "
             "farthest sensor; fire less often"
         )
     shots_s = parameters.interval_s * np.arange(float(parameters.shots))
@@ -93,7 +93,7 @@ def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> S
     numbers = range(1, len(travel_s) + 1)
     components = [*SHOT_COMPONENTS, *(name for s in numbers for name in sensor_components(s))]
     shot = [*parameters.shooter_position_m, wrap_angle(np.radians(parameters.trajectory_deg))]
-    times_ns = np.unique(_stamps(shots_s[:, None] + np.append(0.0, travel_s)))
+    times_ns = np.unique(simulation_stamps_ns(shots_s[:, None] + np.append(0.0, travel_s)))
     return make_stream(
         "/shooter/truth",
         schemas.TRUTH_STATE,
@@ -115,7 +115,7 @@ def _fixes(
     return make_stream(
         f"/sensor{number}/position",
         schemas.POSITION_FIX,
-        _stamps(shots_s),
+        simulation_stamps_ns(shots_s),
         position_m=place + sigma * rng.normal(size=(len(shots_s), 2)),
         covariance_m2=np.tile(sigma**2 * np.eye(2).ravel(), (len(shots_s), 1)),
     )
@@ -139,17 +139,13 @@ def _detections(
     return make_stream(
         f"/sensor{number}/detections",
         schemas.SHOT_DETECTION,
-        _stamps(heard_s[heard]),
+        simulation_stamps_ns(heard_s[heard]),
         metadata=stated_metadata(noise, medium),
         shot_id=np.flatnonzero(heard) + 1,
         muzzle_blast_azimuth_rad=wrap_angle(measured[heard, 0]),
         shockwave_azimuth_rad=wrap_angle(measured[heard, 1]),
         time_difference_s=measured[heard, 2],
     )
-
-
-def _stamps(seconds: Array) -> NDArray[np.int64]:
-    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
 
 
 ACOUSTIC_SHOTS = Simulator(

@@ -13,7 +13,7 @@ from scipy.stats import norm, rankdata
 
 from recorders.models.scores import Matcher, score_stream
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 FAILURE = -1.0
@@ -75,7 +75,7 @@ LOWEST = 0.1
 class BiometricScoresParameters(Parameters):
     """The scenario; counts of special users are those of the real 517."""
 
-    users: Annotated[int, Field(ge=20)] = 517
+    users: Annotated[int, Field(ge=20, le=5000)] = 517
     probe_interval_s: PositiveFloat = 1.0
     failures_to_enrol: NonNegativeInt = 1
     low_galleries: NonNegativeInt = 27
@@ -111,7 +111,7 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
     scores[:, :, FINGERS] = np.rint(scores[:, :, FINGERS])
     scores[:, rng.permutation(count)[: parameters.failures_to_enrol], C] = FAILURE
     arrival_s = np.cumsum(rng.exponential(parameters.probe_interval_s, count))
-    arrival_ns = SIMULATION_EPOCH_NS + np.rint(arrival_s * 1e9).astype(np.int64)
+    arrival_ns = simulation_stamps_ns(arrival_s)
     return Recording([score_stream(MATCHERS, scores, arrival_ns)])
 
 

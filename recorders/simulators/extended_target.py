@@ -12,7 +12,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from recorders.log import make_stream, schemas
 from recorders.models.extended_target import surface_point
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = {
     "components": "half_x_m,half_y_m,x_m,y_m",
@@ -40,8 +40,7 @@ def simulate(parameters: ExtendedTargetParameters, rng: np.random.Generator) -> 
     scale = rng.uniform(-1, 1, (2, parameters.points))
     seen = np.stack(surface_point(target, scale), axis=1)
     seen += rng.normal(size=seen.shape) * np.sqrt(parameters.point_variance_m2)
-    step_ns = round(parameters.step_s * 1e9)
-    stamps_ns = SIMULATION_EPOCH_NS + np.arange(parameters.points + 1) * step_ns
+    stamps_ns = simulation_stamps_ns(parameters.step_s * np.arange(parameters.points + 1))
     return Recording(
         [
             make_stream(

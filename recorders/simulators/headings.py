@@ -15,7 +15,7 @@ from recorders.log import make_stream, schemas
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Correlation = Annotated[float, Field(gt=-1, lt=1)]
 HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
@@ -61,7 +61,7 @@ def simulate(parameters: HeadingsParameters, rng: np.random.Generator) -> Record
         )
         truth[step] = x = np.array(moved) + each
     elapsed_s = parameters.step_s * np.arange(parameters.steps + 1)
-    time_ns = SIMULATION_EPOCH_NS + np.rint(1e9 * elapsed_s).astype(np.int64)
+    time_ns = simulation_stamps_ns(elapsed_s)
     stated = parameters.model_dump(exclude={"steps", "step_s", "prior_sigma_rad"})
     return Recording(
         [

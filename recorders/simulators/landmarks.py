@@ -14,7 +14,12 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from recorders.log import Schema, Stream, make_stream, schemas
 from recorders.models.planar import drive, range_bearing, wrap_angle
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import (
+    SIMULATION_EPOCH_NS,
+    Recording,
+    Simulator,
+    simulation_stamps_ns,
+)
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 FieldOfView = Annotated[float, Field(gt=0, le=360)]
@@ -160,7 +165,7 @@ def _robot_streams(
 ) -> list[Stream]:
     robot = drives[number - 1]
     prefix = f"/robot{number}"
-    stamps_ns = _stamps(robot.times_s)
+    stamps_ns = simulation_stamps_ns(robot.times_s)
     truth = robot.poses.copy()
     truth[:, 2] = wrap_angle(truth[:, 2])
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
@@ -179,7 +184,7 @@ def _robot_streams(
             f"{prefix}/odometry",
             schemas.ODOMETRY,
             stamps_ns[:-1],
-            log_time_ns=_stamps(robot.times_s[:-1] + parameters.odometry_latency_s),
+            log_time_ns=simulation_stamps_ns(robot.times_s[:-1] + parameters.odometry_latency_s),
             metadata={
                 "forward_noise_density": repr(parameters.forward_noise_density),
                 "turn_noise_density": repr(parameters.turn_noise_density),
@@ -278,9 +283,9 @@ def _clocks(
     """The three clocks of every message; messages of one look share them."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
     return {
-        "publish_time_ns": _stamps(times_s + sensor.stamp_offset_s)[look],
-        "log_time_ns": _stamps(times_s + delay_s)[look],
-        "sensor_time_ns": _stamps(times_s + sensor.clock_offset_s)[look],
+        "publish_time_ns": simulation_stamps_ns(times_s + sensor.stamp_offset_s)[look],
+        "log_time_ns": simulation_stamps_ns(times_s + delay_s)[look],
+        "sensor_time_ns": simulation_stamps_ns(times_s + sensor.clock_offset_s)[look],
     }
 
 
@@ -316,12 +321,8 @@ def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _outages(topic: str, seen: Sightings) -> Stream:
-    spans_ns = _stamps(seen.outages_s)
+    spans_ns = simulation_stamps_ns(seen.outages_s)
     return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
-
-
-def _stamps(seconds: NDArray[np.float64]) -> NDArray[np.int64]:
-    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
 
 
 LANDMARKS = Simulator(

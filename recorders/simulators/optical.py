@@ -18,7 +18,7 @@ from recorders.models.optical import bias_components, line_of_sight, target_comp
 from recorders.models.planar import wrap_angle
 from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -79,7 +79,7 @@ def _look_times(parameters: OpticalParameters, targets: int) -> NDArray[np.int64
     """When each target is looked at in each pass, (passes, targets)."""
     per_pass = 1 if parameters.all_at_once else targets
     look = np.arange(parameters.passes)[:, None] * per_pass + np.arange(targets) % per_pass
-    return SIMULATION_EPOCH_NS + np.rint(look * parameters.interval_s * 1e9).astype(np.int64)
+    return simulation_stamps_ns(look * parameters.interval_s)
 
 
 def _truth(looks_ns: NDArray[np.int64], targets: Array, bias: Array) -> Stream:

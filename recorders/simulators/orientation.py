@@ -17,7 +17,7 @@ from recorders.log import Schema, make_stream, schemas
 from recorders.models.directional_noise import sample_bingham, sample_projected_gaussian
 from recorders.models.orientation import compose
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class Noise(Parameters):
@@ -102,7 +102,7 @@ def simulate(
         truth[step] = x = x / np.linalg.norm(x)
     measured = compose(truth, parameters.measurement.sample(parameters.steps, measurement_rng))
     elapsed_s = parameters.step_s * np.arange(1, parameters.steps + 1)
-    time_ns = SIMULATION_EPOCH_NS + np.rint(1e9 * elapsed_s).astype(np.int64)
+    time_ns = simulation_stamps_ns(elapsed_s)
     named = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
     stated = {
         each: getattr(parameters, each).model_dump_json() for each in ("prior", "system", "measurement")

@@ -9,10 +9,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
+from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.reactor import react, total_pressure
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = {"components": "pressure_a,pressure_b", "kinds": "linear,linear"}
 Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
@@ -35,12 +36,17 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
     state = np.empty((parameters.steps + 1, 2))
     state[0] = parameters.start
     noise = rng.normal(size=(parameters.steps, 2)) * np.sqrt(parameters.process_variance)
-    for step in range(parameters.steps):
-        state[step + 1] = np.array(react(state[step], parameters.step_s)) + noise[step]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for step in range(parameters.steps):
+            state[step + 1] = np.array(react(state[step], parameters.step_s)) + noise[step]
+    if not np.isfinite(state).all():
+        raise BadInput(
+            f"start = {parameters.start}, step_s = {parameters.step_s:g}: the reaction runs away; "
+            "start at pressures from 0 on, and take shorter or fewer steps"
+        )
     (total,) = total_pressure(state[1:].T)
     read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)
-    step_ns = round(parameters.step_s * 1e9)
-    stamps_ns = SIMULATION_EPOCH_NS + np.arange(parameters.steps + 1) * step_ns
+    stamps_ns = simulation_stamps_ns(parameters.step_s * np.arange(parameters.steps + 1))
     prior_covariance = parameters.prior_variance * np.eye(2)
     return Recording(
         [

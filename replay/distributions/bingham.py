@@ -124,8 +124,9 @@ def fit(second_moment: ArrayLike) -> Bingham:
     )
     if not converged.all():
         index = np.unravel_index(int(np.argmin(converged)), shape)
+        place = f" at {tuple(map(int, index))}" if shape else ""
         raise BadInput(
-            f"no Bingham distribution has the second moment at {tuple(map(int, index))}: an eigenvalue "
+            f"no Bingham distribution has the second moment{place}: an eigenvalue "
             "is not positive and its concentration diverges; give a positive definite matrix"
         )
     return Bingham(axes, z)

@@ -5,7 +5,7 @@ JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case e
 `/estimates/NAME/CASE/fused`, and learns from other users than those that it judges.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
@@ -127,11 +127,11 @@ def normalise(scores: Floats, how: str) -> Floats:
     """Scores (users, users, matchers) on a common scale; missing ones (NaN) stay missing.
 
     `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
-    column whose scores are all equal becomes 0.
+    column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
     """
     match how:
         case "z" | "tanh":
-            z = (scores - np.nanmean(scores, axis=(0, 1))) / np.nanstd(scores, axis=(0, 1), ddof=1)
+            z = (scores - np.nanmean(scores, axis=(0, 1))) / _deviations(scores)
             return z if how == "z" else 0.5 * (np.tanh(TANH_SCALE * z) + 1)
         case "min-max" | "column-min-max":
             over = (0, 1) if how == "min-max" else (0,)
@@ -139,6 +139,19 @@ def normalise(scores: Floats, how: str) -> Floats:
             width = np.nanmax(scores, axis=over, keepdims=True) - low
             return np.where(width > 0, (scores - low) / np.where(width > 0, width, 1.0), 0.0)
     return scores
+
+
+def _deviations(scores: Floats) -> Floats:
+    """The standard deviation (matchers,) of each matcher's scores, missing ones left out."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviations = np.nanstd(scores, axis=(0, 1), ddof=1)
+    unusable = ~(np.isfinite(deviations) & (deviations > 0))
+    if unusable.any():
+        raise BadInput(
+            f"topic {TOPIC}: the scores of matcher {np.argmax(unusable) + 1} of {len(unusable)} have a "
+            f"standard deviation of {deviations[unusable][0]:g}; leave the matcher out, or scale it"
+        )
+    return deviations
 
 
 RULES: dict[str, Callable[..., Floats]] = {
@@ -172,7 +185,8 @@ def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
 def user_folds(users: int, folds: int, rng: np.random.Generator) -> Indices:
     """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
     if users < 2 * folds:
-        raise BadInput(f"{users} users are too few for {folds} folds; give at most {users // 2} folds")
+        fewer = f", or at most {users // 2} folds" if users >= 4 else ""
+        raise BadInput(f"{users} users are too few for {folds} folds; give {2 * folds} users{fewer}")
     return rng.permutation(users) % folds
 
 
@@ -209,7 +223,15 @@ def learn_classifier(
     model = _classifier(parameters, int(rng.integers(2**31)))
     if parameters.calibrated:
         model = CalibratedClassifierCV(model, method="sigmoid", cv=3)
-    model.fit(vectors, genuine)
+    try:
+        if parameters.classifier == "knn" and parameters.neighbours > len(vectors):
+            raise ValueError(f"{parameters.neighbours} neighbours")
+        model.fit(vectors, genuine)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise BadInput(
+            f"classifier {parameters.classifier} cannot be fitted to {len(vectors)} score vectors "
+            f"({error}); give more users, other matchers, or another classifier"
+        ) from error
     if parameters.calibrated or parameters.classifier == "logistic":
         prior = np.log(genuine.sum() / (~genuine).sum())
         return lambda scores: _log_odds(model.predict_proba(np.nan_to_num(scores))) - prior
@@ -303,7 +325,7 @@ def _bind_mixture(name: str, topics: Mapping[str, Topic], parameters: MixturePar
         learner = partial(learn_mixture, parameters, components, sequence)
         return _learnt(compared, chosen, parameters, learner, True)
 
-    return _bind(name, topics, parameters, fuse)
+    return _bind(name, topics, parameters, fuse, parameters.components_of)
 
 
 def _sequence(
@@ -383,19 +405,30 @@ def _bind(
     topics: Mapping[str, Topic],
     parameters: Subsets,
     fuse: Callable[[Comparisons, str, list[int]], Stream],
+    named: Collection[str] = (),
 ) -> list[Bound]:
-    """A batch estimator of all chosen subsets; none where the log has no scores to fuse."""
+    """A batch estimator of all chosen subsets; none where the log has no scores to fuse.
+
+    `named` are subsets that other parameters speak of.
+    """
     if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
         return []
     subsets = subsets_of(matchers_of(topics[TOPIC].metadata))
-    for case in parameters.subsets:
+    for case in (*parameters.subsets, *named):
         if case not in subsets:
             raise BadInput(f"estimator {name}: no subset '{case}' of matchers; {choices(case, subsets)}")
     cases = parameters.subsets or [case for case, chosen in subsets.items() if len(chosen) > 1]
+    if not cases:
+        return []
 
     def solve(streams: dict[str, Ragged]) -> list[Ragged]:
         runs = [streams[TOPIC].of_run(run) for run in range(streams[TOPIC].runs)]
         compared = [comparisons_of(run) for run in runs]
+        users = {len(each.scores) for each in compared}
+        if len(users) > 1:
+            raise BadInput(
+                f"topic {TOPIC}: {min(users)} to {max(users)} users; replay such logs in turn"
+            )
         return [
             gather(
                 [

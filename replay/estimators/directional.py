@@ -15,7 +15,7 @@ from pydantic import Field, PositiveFloat, ValidationError
 from recorders.errors import BadInput
 from recorders.log import Schema, schemas
 from recorders.parameters import Parameters
-from recorders.simulators.headings import equal_sigmas
+from recorders.simulators.headings import Correlation, equal_sigmas
 from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Noise
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
@@ -64,9 +64,9 @@ class HeadingsFilterParameters(Parameters):
     drift1_rad: float | None = None
     drift2_rad: float | None = None
     system_sigma_rad: PositiveFloat | None = None
-    system_correlation: float | None = None
+    system_correlation: Correlation | None = None
     measurement_sigma_rad: PositiveFloat | None = None
-    measurement_correlation: float | None = None
+    measurement_correlation: Correlation | None = None
 
 
 class TorusParameters(HeadingsFilterParameters):
@@ -121,7 +121,10 @@ def as_bingham(noise: Noise) -> Bingham:
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
-    return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
+    try:
+        return bingham.fit_projected_gaussian(np.eye(d)[0], np.diag(noise.diagonal))
+    except BadInput as error:
+        raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
 
 
 def as_covariance(noise: Noise) -> Floats:

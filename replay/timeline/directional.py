@@ -191,7 +191,8 @@ def _draw_density(canvas: Canvas, root: str, track: Track) -> None:
     pictures = []
     for mean, covariance in zip(*found, strict=True):
         density = wrapped_normal.density(WrappedNormal(mean, covariance), grid)
-        shown = colours(density / density.max(), bytes=True)[:, :3]
+        peak = max(density.max(), np.finfo(float).tiny)  # zero where it lies between the cells
+        shown = colours(density / peak, bytes=True)[:, :3]
         pictures.append(np.ascontiguousarray(shown).ravel())
     image = ImageFormat(
         width=CELLS, height=CELLS, color_model=rr.ColorModel.RGB, channel_datatype=rr.ChannelDatatype.U8

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.registry import available, load
 from replay.blocks import Ragged, gather
 from replay.evaluation import Errors
@@ -48,7 +48,7 @@ def show(
     of_run = {topic: ragged.of_run(run) for topic, ragged in outputs.items()}
     scene = Scene(source, of_run, [_errors_of_run(each, run) for each in errors], focus)
     if focus is not None and focus not in scene.cases:
-        raise BadInput(f"nothing called '{focus}' to show; there is: {', '.join(scene.cases)}")
+        raise BadInput(f"nothing called '{focus}' to show; {choices(focus, scene.cases)}")
     scenario = source.run.scenario if source.run else ""
     timeline: Timeline = load("timelines", scenario) if scenario in available("timelines") else GENERIC
     application = f"fuselog-{scenario}" if scenario else "fuselog"

@@ -14,7 +14,9 @@ import pandas as pd
 import pytest
 
 from pipeline.ensemble import hash_streams, record_ensemble
+from pipeline.experiment import Experiment, Setting, Study, run_experiment
 from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from recorders.errors import BadInput
 from recorders.log import open_log
 
 Fuselog = Callable[..., Any]
@@ -201,3 +203,18 @@ def test_recording_on_an_executor_gives_the_same_runs() -> None:
     assert hash_streams(there) == hash_streams(here)
     first, second = (source.streams["/robot1/truth"]["state"] for source in here[:2])
     assert not np.array_equal(first, second)
+
+
+def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Studies are registered code like recorders and estimators: theirs are no tracebacks either."""
+
+    def divide(_: Experiment, setting: Setting) -> Outcome:
+        (setting.folder / "half").write_text("written")
+        raise ZeroDivisionError("no runs")
+
+    monkeypatch.setattr("pipeline.experiment.load", lambda *_: Study("fails", divide))
+    with pytest.raises(BadInput, match="study mine raised ZeroDivisionError: no runs"):
+        run_experiment("x", Experiment(title="x", study="mine"), tmp_path / "out")
+    assert not list(tmp_path.iterdir())

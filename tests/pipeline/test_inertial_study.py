@@ -1,9 +1,14 @@
 """The BROAD experiment on the trials at hand, and on what is no trial."""
 
+import numpy as np
 import pytest
 
+from pipeline.ensemble import replay_ensemble
 from pipeline.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
+from recorders.log import RunMetadata, make_stream, schemas
+from recorders.recording import SIMULATION_EPOCH_NS, Recording
+from replay.sources import memory_source
 
 
 def test_broad_reaches_its_target(real_data, tmp_path):
@@ -23,3 +28,19 @@ def test_a_folder_without_trials_is_refused(tmp_path):
     name, experiment = load_experiment("broad", {}, {})
     with pytest.raises(BadInput, match=r"no \.hdf5 files"):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
+
+
+def test_an_estimator_without_estimates_is_told():
+    """Force and field are parallel: there is no attitude to start from, and no number is one."""
+    count = 3000
+    samples = make_stream(
+        "/trial/inertial",
+        schemas.INERTIAL_SAMPLE,
+        SIMULATION_EPOCH_NS + 10_000_000 * np.arange(count),
+        specific_force_mps2=np.tile([0.0, 0.0, 9.8], (count, 1)),
+        turn_rate_radps=np.zeros((count, 3)),
+        magnetic_field_ut=np.tile([0.0, 0.0, 40.0], (count, 1)),
+    )
+    source = memory_source(Recording([samples]), RunMetadata("broad"))
+    replayed = replay_ensemble([source], {"bingham-inertial": {}}, gap_limit_s=1)
+    assert replayed.failures == [f"{source.name}: bingham-inertial trial gave no estimates"]

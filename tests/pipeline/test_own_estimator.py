@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.command_line import main
 from recorders.log import open_log, read_streams
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own-estimator.md").read_text()
@@ -186,3 +188,16 @@ def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
     listed = str(said["fuselog estimators"]["out"])
     assert "raised ModuleNotFoundError" in listed
     assert "extended Kalman filter" in listed
+
+
+def test_the_readme_brings_a_log_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The README's snippet writes a log and its command replays it; a renamed field would break both."""
+    page = (Path(__file__).parents[2] / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (command,) = re.findall(r"```\n(fuselog replay own\.mcap .*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    assert main(shlex.split(command.replace("\\\n", ""))[1:]) == 0
+    pose = "/estimates/ekf/robot1/pose"
+    assert len(read_streams(open_log(tmp_path / "own.estimates.mcap"), [pose])[pose]["mean"]) == 100
+    assert (tmp_path / "own.rrd").exists()

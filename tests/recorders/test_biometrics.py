@@ -6,6 +6,7 @@ import pytest
 from recorders.errors import BadInput
 from recorders.importers.biometrics import Matchers, ScoreMatricesParameters, read
 from recorders.models.scores import comparisons_of
+from recorders.parameters import build
 from recorders.recording import record_run
 from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, R
 from replay.verification import identified
@@ -76,6 +77,13 @@ def test_matchers_are_named_in_the_folder_where_the_parameters_name_none(folder)
         read(folder, ScoreMatricesParameters())
     (folder / "matchers.toml").write_text('[[matchers]]\nname = "face"\nmodality = "face"\n')
     assert len(read(folder, ScoreMatricesParameters()).streams[0]["scores"][0]) == 1
+
+
+@pytest.mark.parametrize("names", [("face", "face"), ("face", "../finger"), ("face", "left,right")])
+def test_matchers_have_names_of_their_own_that_files_topics_and_lists_can_hold(names):
+    matchers = [{"name": name, "modality": "face"} for name in names]
+    with pytest.raises(BadInput, match="name"):
+        build(ScoreMatricesParameters, {"matchers": matchers}, "x")
 
 
 def test_a_missing_pair_is_refused(folder):

@@ -70,7 +70,9 @@ def test_what_is_not_finite_is_dropped_and_its_gaps_are_told(tmp_path):
         ({"imu_gyr": np.full((ROWS, 3), np.nan)}, "no inertial samples"),
         ({"imu_mag": np.zeros((ROWS, 2))}, r"imu_mag has shape \(400, 2\); expected \(400, 3\)"),
         ({"imu_acc": None}, "dataset imu_acc"),
-        ({"movement": np.zeros(0, bool)}, "shape"),
+        ({"movement": np.zeros(0, bool)}, "movement holds no samples"),
+        ({"opt_quat": np.full((ROWS, 4), b"x")}, "opt_quat is of .*; expected real numbers"),
+        ({"imu_gyr": np.ones((ROWS, 3), complex)}, "imu_gyr is of complex128"),
     ],
 )
 def test_what_cannot_be_judged_is_refused(tmp_path, changes, message):

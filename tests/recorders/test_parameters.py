@@ -24,6 +24,7 @@ class Outer(Parameters):
     count: int
     sigma_m: PositiveFloat | None = None
     inner: Inner = Inner(rate_hz=7.0)
+    others: list[Inner] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "Outer":
@@ -38,7 +39,8 @@ class Outer(Parameters):
         ({}, "x: parameter 'count' is missing"),
         ({"count": "many"}, "x: parameter 'count' is 'many'; it should be a valid integer"),
         ({"count": 1, "cuont": 2}, "x: no parameter 'cuont'; did you mean 'count'?"),
-        ({"count": 1, "zzz": 2}, "x: no parameter 'zzz'; there are: count, sigma_m, inner"),
+        ({"count": 1, "zzz": 2}, "x: no parameter 'zzz'; there are: count, sigma_m, inner, others"),
+        ({"count": 1, "others": [{"rate": 2}]}, "'others.0.rate'; did you mean 'rate_hz'?"),
         ({"count": 1, "inner": {"rate": 2}}, "x: no parameter 'inner.rate'; did you mean 'rate_hz'?"),
         ({"count": 1, "inner": {"rate_hz": 100}}, "'inner.rate_hz' is 100; it should be less than 100"),
         ({"count": 1, "sigma_m": 0}, "'sigma_m' is 0; it should be greater than 0"),
@@ -66,6 +68,7 @@ def test_descriptions_have_full_names_defaults_and_bounds() -> None:
         "sigma_m": (None, "number > 0 or none"),
         "inner.rate_hz": (7.0, "number >= 0 < 100"),
         "inner.name": ("c", "string"),
+        "others": (None, "array or none"),
     }
 
 

@@ -256,12 +256,36 @@ def test_classifiers_find_the_likelihood_ratio_of_gaussians(classifier, calibrat
 
 def test_too_few_users_for_the_folds_and_unknown_subsets_are_refused():
     source = memory_source(*record_run("biometric-scores", {"users": 20, "low_galleries": 1}, 0))
-    with pytest.raises(BadInput, match="20 users are too few for 11 folds; give at most 10"):
+    with pytest.raises(
+        BadInput, match="20 users are too few for 11 folds; give 22 users, or at most 10"
+    ):
         user_folds(20, 11, np.random.default_rng(0))
     with pytest.raises(BadInput, match="no subset 'fase' of matchers; did you mean 'face'"):
         replay_ensemble([source], {"score-rule": {"subsets": ["fase"]}}, gap_limit_s=1)
     with pytest.raises(BadInput, match="give more users or fewer components"):
         replay_ensemble([source], {"score-mixture": {"genuine_components": 19}}, gap_limit_s=1)
+    with pytest.raises(BadInput, match="no subset 'al' of matchers; did you mean 'all'"):
+        replay_ensemble([source], {"score-mixture": {"components_of": {"al": 2}}}, gap_limit_s=1)
+
+
+def test_runs_of_different_users_are_refused():
+    """The folds stand in the metadata of the topic, which all runs share."""
+    settings = ({"users": users, "low_galleries": 1} for users in (20, 30))
+    sources = [memory_source(*record_run("biometric-scores", each, 0)) for each in settings]
+    with pytest.raises(BadInput, match="20 to 30 users; replay such logs in turn"):
+        replay_ensemble(sources, {"score-rule": {}}, gap_limit_s=1)
+
+
+def test_scores_that_cannot_be_scaled_or_learnt_from_are_refused_in_words():
+    with pytest.raises(BadInput, match="matcher 2 of 2 have a standard deviation of 0"):
+        normalise(np.arange(18.0).reshape(3, 3, 2) * [1, 0], "z")
+    with pytest.raises(BadInput, match="matcher 1 of 1 have a standard deviation of inf"):
+        normalise(1e300 * np.arange(9.0).reshape(3, 3, 1), "tanh")
+    rng = np.random.default_rng(0)
+    alike = np.repeat(rng.normal(size=(30, 1)), 2, axis=1)
+    for parameters in (ClassifierParameters(), ClassifierParameters(classifier="knn", neighbours=31)):
+        with pytest.raises(BadInput, match="cannot be fitted to 30 score vectors"):
+            learn_classifier(parameters, alike, np.arange(30) < 15, rng)
 
 
 def test_a_fusion_of_two_runs_is_that_of_each():

@@ -40,6 +40,14 @@ def test_ellipse_area() -> None:
     assert ellipse_area(np.diag([4.0, 9.0])) == pytest.approx(np.pi * 5.991464547 * 6.0)
 
 
+def test_a_singular_ellipse_has_no_area() -> None:
+    """Two errors span a line; rounding can make the determinant of their covariance negative."""
+    error = np.random.default_rng(0).normal(size=(100, 2))
+    singular = error[:, :, None] * error[:, None, :]
+    assert (np.linalg.det(singular) < 0).any()
+    np.testing.assert_allclose(ellipse_area(singular), 0.0, atol=1e-6)
+
+
 def test_dilution_of_precision() -> None:
     """Eq (32): an error of range times total noise has dilution one."""
     assert dilution_of_precision(5.0, 1000.0, np.array([3e-3, 4e-3])) == pytest.approx(1.0)

@@ -372,7 +372,7 @@ def test_what_cannot_be_shown_is_refused(ensemble: Replayed, tmp_path: Path) -> 
         show(source, outputs, errors)
     with pytest.raises(BadInput, match="no run 2 to show; the runs are 0 to 1"):
         show(source, outputs, errors, run=2, save=tmp_path / "a.rrd")
-    with pytest.raises(BadInput, match="nothing called 'robot9' to show; there is: robot1"):
+    with pytest.raises(BadInput, match="nothing called 'robot9' to show; did you mean 'robot1'"):
         show(source, outputs, errors, focus="robot9", save=tmp_path / "a.rrd")
     with pytest.raises(BadInput, match="cannot be written"):
         show(source, outputs, errors, save=tmp_path / "nowhere" / "a.rrd")
