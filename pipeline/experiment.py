@@ -1,6 +1,7 @@
 """Experiments: scenario (or real data) x estimators x metrics, one TOML file each."""
 
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -191,7 +192,13 @@ def run_experiment(
     for label, values in experiment.estimators.items():
         configure(label, values)
     find_metrics(experiment.metrics)
-    with result_folder(folder) as part, foreign_code(f"study {experiment.study}"):
+    with (
+        result_folder(folder) as part,
+        foreign_code(f"study {experiment.study}"),
+        warnings.catch_warnings(),
+    ):
+        # of runs that all failed there is no mean: a null in the results, not a warning
+        warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
         outcome = study.run(experiment, Setting(part, data, logs, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:

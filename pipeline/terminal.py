@@ -63,10 +63,14 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
 
 
 def format_value(value: object) -> str:
-    """Four significant digits for floats, nothing for None, the range of a long list, or text."""
+    """Four significant digits for floats, nothing for None, the range of many numbers, or text."""
     if isinstance(value, list):
         known = [each for each in value if each is not None]
-        if len(known) > 4:
+        if any(isinstance(each, dict) for each in known):
+            return f"{len(value)} tables"
+        if any(isinstance(each, list) for each in known):
+            return ", ".join(map(format_value, value))
+        if len(known) > 4 and all(isinstance(each, int | float) for each in known):
             return f"{format_value(min(known))} to {format_value(max(known))}"
         return " ".join(map(format_value, value))
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
