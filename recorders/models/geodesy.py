@@ -1,0 +1,52 @@
+"""Places in a local tangent plane (east, north) as latitude and longitude on the WGS 84 ellipsoid."""
+
+import numpy as np
+
+from recorders.models.planar import Component, Components
+
+SEMI_MAJOR_M = 6378137.0
+FLATTENING = 1.0 / 298.257223563
+SEMI_MINOR_M = SEMI_MAJOR_M * (1.0 - FLATTENING)
+ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
+
+
+def earth_centred(
+    latitude_deg: Component, longitude_deg: Component
+) -> tuple[Component, Component, Component]:
+    """The point of the ellipsoid in the frame that turns with the earth, in m."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
+    return (
+        normal * np.cos(latitude) * np.cos(longitude),
+        normal * np.cos(latitude) * np.sin(longitude),
+        normal * (1.0 - ECCENTRICITY_SQUARED) * np.sin(latitude),
+    )
+
+
+def out_of_tangent_plane(
+    place_m: Components, origin_deg: Components
+) -> tuple[Component, Component, Component]:
+    """Latitude, longitude (deg) and height (m) of a place (east, north) in the plane at the origin.
+
+    Bowring's formula, Survey Review 23, 1976: exact to less than a micrometre near the ground.
+    """
+    latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
+    east, north = place_m
+    x, y, z = earth_centred(*origin_deg)
+    outward = -np.sin(latitude) * north
+    x = x - np.sin(longitude) * east + np.cos(longitude) * outward
+    y = y + np.cos(longitude) * east + np.sin(longitude) * outward
+    z = z + np.cos(latitude) * north
+    from_axis = np.hypot(x, y)
+    reduced = np.arctan2(z * SEMI_MAJOR_M, from_axis * SEMI_MINOR_M)
+    ratio = ECCENTRICITY_SQUARED / (1.0 - ECCENTRICITY_SQUARED)
+    up = z + ratio * SEMI_MINOR_M * np.sin(reduced) ** 3
+    out = from_axis - ECCENTRICITY_SQUARED * SEMI_MAJOR_M * np.cos(reduced) ** 3
+    found = np.arctan2(up, out)
+    sine = np.sin(found)
+    height = (
+        from_axis * np.cos(found)
+        + z * sine
+        - SEMI_MAJOR_M * np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
+    )
+    return np.degrees(found), np.degrees(np.arctan2(y, x)), height

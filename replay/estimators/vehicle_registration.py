@@ -1,0 +1,80 @@
+"""Where an infrastructure sensor stands, from unordered detections and where vehicles are thought to be.
+
+Places are complex numbers here: a turn is a factor of length one, and the best one between centred
+points is the phase of their inner product (Procrustes in the plane). Which detection is of which vehicle
+is found by trying all permutations.
+"""
+
+from functools import lru_cache
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+MOST_VEHICLES = 8
+# By how many squared sigmas the next permutation must fit worse for the best to be believed.
+LEAST_LEAD = 30.0
+# Least spread of the vehicles, in sigmas of a place: without it no heading can be told.
+LEAST_SPREAD = 5.0
+
+
+class Registration(NamedTuple):
+    """Sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
+
+    pose: Floats
+    detection: Integers
+    is_clear: NDArray[np.bool_]
+
+
+def register(places: Floats, detections: Floats, variance_m2: float) -> Registration:
+    """The pose that lays full scans (runs, vehicles, 2) best on places (runs, vehicles, 2), any order.
+
+    It is not clear where another order fits nearly as well, or the vehicles are too close together:
+    `variance_m2` is that of a place and a detection together. Raises BadInput for too many vehicles.
+    """
+    vehicles = places.shape[1]
+    if vehicles > MOST_VEHICLES:
+        raise BadInput(
+            f"registration tries all permutations of {vehicles} vehicles; give {MOST_VEHICLES} at most"
+        )
+    order = _permutations(vehicles)
+    there, seen = _centred(places), _centred(detections)
+    fit = np.abs(np.einsum("rv,rpv->rp", there, seen[:, order].conj()))
+    best = fit.argmax(axis=1)
+    second = np.partition(fit, -2, axis=1)[:, -2] if vehicles > 1 else np.zeros(len(fit))
+    lead = 2.0 * (fit.max(axis=1) - second) / variance_m2
+    spread = np.sqrt(np.mean(np.abs(there) ** 2, axis=1) / variance_m2)
+    detection = order[best]
+    pose = fitted_pose(places, np.take_along_axis(detections, detection[..., None], 1))
+    return Registration(pose, detection, (lead > LEAST_LEAD) & (spread > LEAST_SPREAD))
+
+
+def fitted_pose(places: Floats, detections: Floats) -> Floats:
+    """The poses (runs, 3) that lay detections best on places in the same order, (runs, vehicles, 2).
+
+    Pairs where either is NaN are left out.
+    """
+    missing = np.isnan(places + detections).any(axis=2)[..., None]
+    places, detections = np.where(missing, np.nan, places), np.where(missing, np.nan, detections)
+    product = np.nansum(_centred(places) * _centred(detections).conj(), axis=1)
+    heading = np.angle(product)
+    middle = np.nanmean(detections @ [1.0, 1j], axis=1)
+    place = np.nanmean(places @ [1.0, 1j], axis=1) - np.exp(1j * heading) * middle
+    return np.stack([place.real, place.imag, heading], axis=1)
+
+
+def _centred(places: Floats) -> NDArray[np.complex128]:
+    """Places (runs, vehicles, 2) about their mean, as complex numbers."""
+    numbers: NDArray[np.complex128] = places @ np.array([1.0, 1j])
+    return numbers - np.nanmean(numbers, axis=1, keepdims=True)
+
+
+@lru_cache(maxsize=MOST_VEHICLES)
+def _permutations(count: int) -> Integers:
+    return np.array(list(permutations(range(count))))
