@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from recorders.errors import BadInput
 
@@ -18,6 +19,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MOST_VEHICLES = 8
+# A fit with so improbable a residual is of other things than the vehicles.
+IMPROBABLE = 1e-4
 # By how many squared sigmas the next permutation must fit worse for the best to be believed.
 LEAST_LEAD = 30.0
 # Least spread of the vehicles, in sigmas of a place: without it no heading can be told.
@@ -35,8 +38,9 @@ class Registration(NamedTuple):
 def register(places: Floats, detections: Floats, variance_m2: float) -> Registration:
     """The pose that lays full scans (runs, vehicles, 2) best on places (runs, vehicles, 2), any order.
 
-    It is not clear where another order fits nearly as well, or the vehicles are too close together:
-    `variance_m2` is that of a place and a detection together. Raises BadInput for too many vehicles.
+    It is not clear where even the best fits badly (something else was taken for a vehicle), another order
+    fits nearly as well, or the vehicles are too close together. `variance_m2` is that of a place and a
+    detection together. Raises BadInput for too many vehicles.
     """
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
@@ -45,14 +49,20 @@ def register(places: Floats, detections: Floats, variance_m2: float) -> Registra
         )
     order = _permutations(vehicles)
     there, seen = _centred(places), _centred(detections)
-    fit = np.abs(np.einsum("rv,rpv->rp", there, seen[:, order].conj()))
-    best = fit.argmax(axis=1)
-    second = np.partition(fit, -2, axis=1)[:, -2] if vehicles > 1 else np.zeros(len(fit))
-    lead = 2.0 * (fit.max(axis=1) - second) / variance_m2
-    spread = np.sqrt(np.mean(np.abs(there) ** 2, axis=1) / variance_m2)
-    detection = order[best]
+    fit = 2.0 * np.abs(np.einsum("rv,rpv->rp", there, seen[:, order].conj())) / variance_m2
+    detection = order[fit.argmax(axis=1)]
     pose = fitted_pose(places, np.take_along_axis(detections, detection[..., None], 1))
-    return Registration(pose, detection, (lead > LEAST_LEAD) & (spread > LEAST_SPREAD))
+    if vehicles < 2:
+        return Registration(pose, detection, np.zeros(len(fit), bool))
+    squared = np.sum(np.abs(there) ** 2, axis=1) / variance_m2
+    residual = squared + np.sum(np.abs(seen) ** 2, axis=1) / variance_m2 - fit.max(axis=1)
+    second, first = np.partition(fit, -2, axis=1)[:, -2:].T
+    is_clear = (
+        (residual < chi2.isf(IMPROBABLE, 2 * vehicles - 3))
+        & (first - second > LEAST_LEAD)
+        & (squared > vehicles * LEAST_SPREAD**2)
+    )
+    return Registration(pose, detection, is_clear)
 
 
 def fitted_pose(places: Floats, detections: Floats) -> Floats:
@@ -71,8 +81,8 @@ def fitted_pose(places: Floats, detections: Floats) -> Floats:
 
 def _centred(places: Floats) -> NDArray[np.complex128]:
     """Places (runs, vehicles, 2) about their mean, as complex numbers."""
-    numbers: NDArray[np.complex128] = places @ np.array([1.0, 1j])
-    return numbers - np.nanmean(numbers, axis=1, keepdims=True)
+    numbers = places @ np.array([1.0, 1j])
+    return np.asarray(numbers - np.nanmean(numbers, axis=1, keepdims=True))
 
 
 @lru_cache(maxsize=MOST_VEHICLES)

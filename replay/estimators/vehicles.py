@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from recorders.models.vehicles import into_frame, noise_moments, turn
 from replay.estimators.vehicle_association import Hypotheses
@@ -19,6 +20,8 @@ Integers = NDArray[np.int64]
 
 STATES = 4  # of a vehicle
 POSE = 3  # components of the sensor's pose
+# A topology so improbable, chi-square with one degree of freedom, is of other things than the vehicles.
+TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
 # How little is known of a sensor's pose before it is estimated.
 UNKNOWN_POSE_VARIANCE = np.array([1e6, 1e6, 10.0])
 
@@ -194,14 +197,19 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
 
 
 def update_by_topology(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Joint:
-    """The topology pseudo-measurement of full scans (runs, vehicles, 2), whatever frame and order."""
+    """The topology pseudo-measurement of scans (runs, vehicles, 2), whatever their frame and order.
+
+    Where it is too improbable, something was missed and something else taken for a vehicle: left out.
+    """
     places = positions(motion, joint.mean)
-    added, variance = topology_moments(places, variance_m2)
+    added, noise = topology_moments(places, variance_m2)
     innovation = topology(detections) - added - topology(places)
     count, states = motion.vehicles, joint.mean.shape[1]
     gradient = 2.0 * count * (places - places.mean(axis=1, keepdims=True))
     rows = gradient.reshape(-1, 1, 2 * count) @ position_rows(count, states)
-    return update(joint, rows, innovation[:, None], variance[:, None, None])
+    variance = (rows @ joint.covariance @ rows.swapaxes(1, 2))[:, 0, 0] + noise
+    innovation[innovation**2 > TOPOLOGY_GATE * variance] = np.nan
+    return update(joint, rows, innovation[:, None], noise[:, None, None])
 
 
 class Sight(NamedTuple):
