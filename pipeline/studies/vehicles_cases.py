@@ -1,0 +1,125 @@
+"""Cooperative vehicles in several cases: what each estimator comes to, run by run and step by step."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeInt
+
+from recorders.parameters import Parameters
+from replay.blocks import Ragged
+from replay.estimators.vehicle_streams import vehicle_numbers
+from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
+from replay.sources import Source
+
+Floats = NDArray[np.float64]
+
+# What a message's parts take, in bytes.
+POSITION_BYTES, IDENTITY_BYTES, NUMBER_BYTES = 16, 4, 8
+# State and covariance of a vehicle, the latter without its mirror image.
+TRACK_BYTES = NUMBER_BYTES * (4 + 10)
+
+
+class VehiclesOptions(Parameters):
+    """Cases: what differs in the scenario's parameters. `reference` is the Kalman filter's label.
+
+    `few` are estimators that are too slow for all runs; they get the first `few_runs` of the first case.
+    """
+
+    cases: dict[str, dict[str, Any]] = {"deterministic": {}}
+    reference: str = "kf"
+    few: dict[str, dict[str, Any]] = {}
+    few_runs: NonNegativeInt = 0
+
+
+class Scores(NamedTuple):
+    """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+
+    By step the squared errors (runs, steps); `failed` counts runs that did not reach the end.
+    """
+
+    fixed: Floats
+    assigned: Floats
+    fixed_by_step: Floats
+    assigned_by_step: Floats
+    failed: int
+
+    def of_first(self, runs: int) -> "Scores":
+        """The scores of the first runs."""
+        return Scores(*(part[:runs] for part in self[:4]), self.failed)
+
+
+class Case(NamedTuple):
+    """One case: its runs, every estimator's scores by label, and what each sends per step in bytes."""
+
+    name: str
+    sources: Sequence[Source]
+    scores: Mapping[str, Scores]
+    bytes_per_step: Mapping[str, float]
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether the truth has process noise."""
+        stated = self.sources[0].run
+        return bool(stated and stated.parameters["stochastic"])
+
+
+def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
+    """The stamps (runs, steps) after the start, and the true places (runs, steps, vehicles, 2)."""
+    numbers = vehicle_numbers(sources[0].topics)
+    topics = [f"/vehicle{number}/truth" for number in numbers]
+    read = [source.read(topics) for source in sources]
+    places = [np.stack([run[topic]["state"][1:, 0::2] for topic in topics], axis=1) for run in read]
+    return np.array([run[topics[0]].publish_time_ns[1:] for run in read]), np.array(places)
+
+
+def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np.int64]) -> Floats:
+    """The estimated places (runs, steps, vehicles, 2) at the truth's stamps, NaN where there is none."""
+    topics = [topic for topic in outputs if topic.startswith(f"/estimates/{label}/vehicle")]
+    states = [topic for topic in topics if topic.endswith("/state")]
+    found = np.full((*times_ns.shape, len(states), 2), np.nan)
+    for vehicle, topic in enumerate(states):
+        ragged = outputs[topic]
+        for run, times in enumerate(times_ns):
+            stream = ragged.of_run(run)
+            step = np.searchsorted(times, stream.publish_time_ns)
+            found[run, step, vehicle] = stream["mean"][:, 0::2]
+    return found
+
+
+def score(estimates: Floats, truths: Floats) -> Scores:
+    """Total errors of estimated places (runs, steps, vehicles, 2)."""
+    fixed = fixed_squared_error(estimates, truths)
+    assigned = assigned_squared_error(estimates, truths)
+    failed = int(np.isnan(fixed).any(axis=1).sum())
+    return Scores(total_error(fixed), total_error(assigned), fixed, assigned, failed)
+
+
+def scores_of(
+    sources: Sequence[Source], outputs: Mapping[str, Ragged], labels: Iterable[str]
+) -> dict[str, Scores]:
+    """The scores of all estimators of the runs."""
+    times_ns, truths = truths_of(sources)
+    return {label: score(estimates_of(outputs, label, times_ns), truths) for label in labels}
+
+
+def bytes_per_step(sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """What the members of the network send per scan of the network, on average, by estimator.
+
+    Fixes with identity where the association must be known, without else; of the infrastructure
+    sensor nothing, its one number, or its detections.
+    """
+    scans = [source.read(["/network/scan", "/infrastructure/scan"]) for source in sources]
+    steps = sum(len(run["/network/scan"]) for run in scans) or 1
+    fixes = sum(int(run["/network/scan"]["detections"].sum()) for run in scans) / steps
+    seen = sum(int(run["/infrastructure/scan"]["detections"].sum()) for run in scans) / steps
+    looks = sum(len(run["/infrastructure/scan"]) for run in scans) / steps
+    found = {}
+    for label, settings in estimators.items():
+        kind, _, method = str(settings.get("kind", label)).partition(":")
+        own, _, sensor = method.partition("-")
+        is_known = kind == "vehicle-kalman" or own == "known"
+        used = {"topology": NUMBER_BYTES * looks, "": 0.0}.get(sensor, POSITION_BYTES * seen)
+        found[label] = fixes * (POSITION_BYTES + IDENTITY_BYTES * is_known) + used
+    return found
