@@ -102,33 +102,43 @@ def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
 
 
 def update_root(
-    mean: Floats, root: Floats, rows: Numbers, innovation: Numbers, factor: Numbers
+    mean: Floats, root: Floats, measured: Numbers, innovation: Numbers, factor: Numbers
 ) -> tuple[Floats, Floats]:
-    """Kalman's update in square-root form: means (..., n), roots L (..., n, n) with P = L L'.
+    """Kalman's update in square-root form: means (..., n), factors X (..., n, k) with P = X X'.
 
-    One QR decomposition of [[W', 0], [L' H', L']] gives the root of the innovation's covariance, the
-    gain and the new root. Rows are scaled to one first: sums of powers differ by many decades.
+    NaN where the numbers have grown beyond all measure, or the innovation's covariance is singular.
+    One QR decomposition of [[W', 0], [Z', X']] gives the root of the innovation's covariance, the gain
+    and the new root. Rows are scaled to one first: sums of powers differ by many decades.
 
     Args:
         mean, root: before.
-        rows: H (..., m, n); complex rows stand for their real and imaginary parts.
+        measured: Z (..., m, k), how the measurement changes along the columns of X: H X, or its
+            deviations at samples. Complex rows stand for their real and imaginary parts.
         innovation: (..., m).
         factor: W (..., m, terms).
     """
-    if np.iscomplexobj(rows):
-        rows = np.concatenate([rows.real, rows.imag], axis=-2)
+    if np.iscomplexobj(measured):
+        measured = np.concatenate([measured.real, measured.imag], axis=-2)
         innovation = np.concatenate([innovation.real, innovation.imag], axis=-1)
-        # circular noise w has Re(W w) = Re W Re w - Im W Im w, each part with half the variance
+        # of circular noise w both parts have half the variance
         upper = np.concatenate([factor.real, -factor.imag], axis=-1)
         lower = np.concatenate([factor.imag, factor.real], axis=-1)
         factor = np.concatenate([upper, lower], axis=-2) * np.sqrt(0.5)
     scale = 1.0 / np.linalg.norm(factor, axis=-1)
-    rows, factor, innovation = rows * scale[..., None], factor * scale[..., None], innovation * scale
+    measured, factor, innovation = (
+        measured * scale[..., None],
+        factor * scale[..., None],
+        innovation * scale,
+    )
     m, n, terms = innovation.shape[-1], mean.shape[-1], factor.shape[-1]
-    array = np.zeros((*mean.shape[:-1], terms + n, m + n))
+    array = np.zeros((*mean.shape[:-1], terms + root.shape[-1], m + n))
     array[..., :terms, :m] = np.swapaxes(factor, -1, -2)
-    array[..., terms:, :m] = np.swapaxes(rows @ root, -1, -2)
+    array[..., terms:, :m] = np.swapaxes(measured, -1, -2)
     array[..., terms:, m:] = np.swapaxes(root, -1, -2)
     triangle = np.swapaxes(np.linalg.qr(array, mode="r"), -1, -2)
+    is_usable = np.isfinite(triangle).all(axis=(-2, -1)) & np.isfinite(innovation).all(axis=-1)
+    is_usable &= (np.diagonal(triangle, axis1=-2, axis2=-1)[..., :m] != 0.0).all(axis=-1)
+    triangle = np.where(is_usable[..., None, None], triangle, np.eye(m + n))
     whitened = np.linalg.solve(triangle[..., :m, :m], innovation[..., None])
-    return mean + (triangle[..., m:, :m] @ whitened)[..., 0], triangle[..., m:, m:]
+    moved = mean + (triangle[..., m:, :m] @ whitened)[..., 0]
+    return np.where(is_usable[..., None], moved, np.nan), triangle[..., m:, m:]

@@ -22,7 +22,6 @@ from pipeline.studies.vehicles_cases import (
 )
 from pipeline.studies.vehicles_claims import claims
 from recorders.errors import BadInput
-from recorders.simulators.vehicles import VehiclesParameters
 from replay.estimators.vehicle_bounds import bounds, exact_total_error
 
 
@@ -103,9 +102,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
     """The Kalman filter's exact total error, and bounds of the settled filters, case by case."""
     rows = []
     for case in cases:
-        stated = case.sources[0].run
-        assert stated is not None
-        given = VehiclesParameters.model_validate(stated.parameters)
+        given = case.parameters
         count = given.vehicles or len(given.start)
         fix, sensor = given.fix.variance_m2, given.infrastructure.variance_m2
         steps = int(given.duration_s * given.fix.rate_hz)
@@ -117,9 +114,7 @@ def _table_of_bounds(cases: list[Case]) -> pd.DataFrame:
 
 def _table_of_bytes(cases: list[Case]) -> pd.DataFrame:
     """What each method sends per step, and what exchanging all tracks would."""
-    rows = [
-        (case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()
-    ]
+    rows = [(case.name, label, value) for case in cases for label, value in case.bytes_per_step.items()]
     for case in cases:
         tracks = TRACK_BYTES * _vehicles(case)
         rows.append((case.name, "all states and covariances", float(tracks)))
@@ -162,5 +157,7 @@ def _figure(case: Case) -> Figure:
 
 
 VEHICLES = Study(
-    "total errors of cooperative vehicles by method, against bounds and the paper", study, VehiclesOptions
+    "total errors of cooperative vehicles by method, against bounds and the paper",
+    study,
+    VehiclesOptions,
 )

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
 from recorders.parameters import Parameters
+from recorders.simulators.vehicles import VehiclesParameters
 from replay.blocks import Ragged
-from replay.estimators.vehicle_streams import vehicle_numbers
+from replay.estimators.vehicle_streams import split_method, vehicle_numbers
 from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
 from replay.sources import Source
 
@@ -59,10 +60,17 @@ class Case(NamedTuple):
     bytes_per_step: Mapping[str, float]
 
     @property
-    def is_stochastic(self) -> bool:
-        """Whether the truth has process noise."""
+    def parameters(self) -> VehiclesParameters:
+        """What was recorded."""
         stated = self.sources[0].run
-        return bool(stated and stated.parameters["stochastic"])
+        assert stated is not None
+        return VehiclesParameters.model_validate(stated.parameters)
+
+    @property
+    def has_losses(self) -> bool:
+        """Whether detections are missed or false."""
+        network = self.parameters.network
+        return network.detection_probability < 1.0 or network.clutter_per_scan > 0.0
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
@@ -104,22 +112,25 @@ def scores_of(
     return {label: score(estimates_of(outputs, label, times_ns), truths) for label in labels}
 
 
-def bytes_per_step(sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+def bytes_per_step(
+    sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]
+) -> dict[str, float]:
     """What the members of the network send per scan of the network, on average, by estimator.
 
     Fixes with identity where the association must be known, without else; of the infrastructure
     sensor nothing, its one number, or its detections.
     """
-    scans = [source.read(["/network/scan", "/infrastructure/scan"]) for source in sources]
-    steps = sum(len(run["/network/scan"]) for run in scans) or 1
-    fixes = sum(int(run["/network/scan"]["detections"].sum()) for run in scans) / steps
-    seen = sum(int(run["/infrastructure/scan"]["detections"].sum()) for run in scans) / steps
-    looks = sum(len(run["/infrastructure/scan"]) for run in scans) / steps
+    fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
+    names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]
+    counts = {name: sum(source.topics[name].messages for source in sources) for name in [*names, *fixes]}
+    steps, told, looks, seen = (counts[name] for name in names)
+    own = sum(counts[name] for name in fixes)
     found = {}
     for label, settings in estimators.items():
         kind, _, method = str(settings.get("kind", label)).partition(":")
-        own, _, sensor = method.partition("-")
-        is_known = kind == "vehicle-kalman" or own == "known"
-        used = {"topology": NUMBER_BYTES * looks, "": 0.0}.get(sensor, POSITION_BYTES * seen)
-        found[label] = fixes * (POSITION_BYTES + IDENTITY_BYTES * is_known) + used
+        association, sensor = split_method(method)
+        is_known = kind == "vehicle-kalman" or association == "known"
+        sent = own * (POSITION_BYTES + IDENTITY_BYTES) if is_known else told * POSITION_BYTES
+        sent += {"topology": NUMBER_BYTES * looks, "": 0}.get(sensor, POSITION_BYTES * seen)
+        found[label] = sent / max(steps, 1)
     return found

@@ -135,3 +135,26 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
         column = np.where(is_detected, column, MISSED)
         chosen = np.concatenate([chosen[row], column[:, None]], axis=1)
     return Hypotheses(run, chosen, score)
+
+
+def log_permanents(logs: Floats) -> Floats:
+    """The logarithms of the permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
+
+    Row by row over the sets of columns that are taken, n 2^(n-1) products of positive numbers each.
+    """
+    n = logs.shape[-1]
+    greatest = np.max(logs, axis=-1, keepdims=True)
+    entries = np.exp(logs - greatest)
+    sets = np.arange(1 << n)
+    partial = np.zeros((*logs.shape[:-2], 1 << n))
+    partial[..., 0] = 1.0
+    for row in range(n):
+        extended = np.zeros_like(partial)
+        for column in range(n):
+            without = sets[(sets >> column) & 1 == 0]
+            extended[..., without | (1 << column)] += (
+                partial[..., without] * entries[..., row, column, None]
+            )
+        partial = extended
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(partial[..., -1]) + greatest[..., 0].sum(axis=-1))

@@ -74,9 +74,7 @@ def bounds(
     return Bounds(*(float(np.sqrt((n - k) * a + k * b)) for k in (1, n - 3, n)))
 
 
-def exact_total_error(
-    vehicles: int, fix_variance_m2: float, steps: int, *, stochastic: bool
-) -> float:
+def exact_total_error(vehicles: int, fix_variance_m2: float, steps: int, *, stochastic: bool) -> float:
     """The Kalman filter's root of the expected squared total error over so many steps, in m."""
     axis = follow_axis(fix_variance_m2, steps=steps)
     squared = axis.stochastic if stochastic else axis.deterministic

@@ -50,7 +50,12 @@ def start(given: Given[KalmanParameters]) -> tuple[Motion, State]:
 
 
 def move(
-    motion: Motion, mean: Floats, covariance: Floats, duration_s: float, transition: Floats, product: Floats
+    motion: Motion,
+    mean: Floats,
+    covariance: Floats,
+    duration_s: float,
+    transition: Floats,
+    product: Floats,
 ) -> None:
     """Predict in place; the other two arrays are scratch."""
     rate = motion.turn_rate_radps

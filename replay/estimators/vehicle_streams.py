@@ -5,6 +5,7 @@ associated, and what is made of the infrastructure sensor. What came at one time
 frame after frame is filtered in all runs at once.
 """
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -43,8 +44,16 @@ from replay.estimators.vehicles import (
     positions,
     predict,
     sight_of,
+    topology_measurement,
     update,
-    update_by_topology,
+    update_by_scalar,
+)
+from replay.symmetric_sums import (
+    power_sums,
+    power_sums_at,
+    product_sums,
+    product_sums_at,
+    update_root,
 )
 
 Booleans = NDArray[np.bool_]
@@ -54,6 +63,10 @@ FIXES = {
     "hungarian": "unordered fixes, the most probable map",
     "set": "unordered fixes, exact collapse over all maps",
     "axes": "unordered x and unordered y, exact collapse of each: what separate sums of powers tell",
+    "powers": "sums of powers of x and of y, linearised",
+    "unscented-powers": "the same, sampled",
+    "products": "sums of products of x and of y, linearised",
+    "complex": "sums of powers of x + iy, linearised",
 }
 SENSOR = {
     "": "not used",
@@ -135,10 +148,20 @@ class Results(NamedTuple):
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> list[Bound]:
-    fixes, _, sensor = parameters.method.partition("-")
-    for part, known in ((fixes, FIXES), (sensor, SENSOR)):
-        if part not in known:
-            raise BadInput(f"estimator {name}: no method '{part}'; {choices(part, known)}")
+    fixes, sensor = split_method(parameters.method)
+    if fixes not in FIXES:
+        raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
+    bound = bind_vehicles(name, topics, fixes, sensor, parameters.registration_scan)
+    if bound is None:
+        return []
+    setup, used, priors = bound
+    return [Recursive(name, used, priors, partial(start, setup), partial(run, setup))]
+
+
+def bind_vehicles(
+    name: str, topics: Mapping[str, Topic], fixes: str, sensor: str, registration_scan: int
+) -> tuple[Setup, tuple[str, ...], tuple[str, ...]] | None:
+    """What a method is told by a log, the topics it follows, and the priors; None where one is missing."""
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -146,18 +169,23 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
     if sensor:
         used += ["/infrastructure/scan", "/infrastructure/detection"]
     if not numbers or not set(used) <= set(topics):
-        return []
+        return None
     setup = Setup(
         name,
         fixes,
         sensor,
-        parameters.registration_scan,
+        registration_scan,
         motion_of(topics, numbers),
         scanning_of(topics, "/network/scan"),
         scanning_of(topics, "/infrastructure/scan"),
     )
-    priors = tuple(f"/vehicle{number}/prior" for number in numbers)
-    return [Recursive(name, tuple(used), priors, partial(start, setup), partial(run, setup))]
+    return setup, tuple(used), tuple(f"/vehicle{number}/prior" for number in numbers)
+
+
+def split_method(method: str) -> tuple[str, str]:
+    """What is done with the fixes, and with the infrastructure sensor: empty where that is not used."""
+    fixes, _, sensor = method.rpartition("-")
+    return (fixes, sensor) if fixes and sensor in SENSOR else (method, "")
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
@@ -215,6 +243,7 @@ def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Rag
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
     before = carried.failed
+    carried = copy.deepcopy(carried)
     results = Results(
         np.full((runs, count, setup.states), np.nan),
         np.full((runs, count, setup.states, setup.states), np.nan),
@@ -223,8 +252,9 @@ def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Rag
     for number in range(count):
         rows = np.flatnonzero((number < frames.counts) & ~carried.failed)
         if len(rows):
-            carried = _advance(setup, carried, frames, number, rows, results)
-    return carried, list(_outputs(setup, frames, results, carried.failed & ~before))
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges fails, no more
+                _advance(setup, carried, frames, number, rows, results)
+    return carried, list(outputs_of(setup, frames, results, carried.failed & ~before))
 
 
 def frames_of(setup: Setup, block: Block) -> Frames:
@@ -273,9 +303,8 @@ def frames_of(setup: Setup, block: Block) -> Frames:
 
 def _advance(
     setup: Setup, carried: Carried, frames: Frames, number: int, rows: Integers, results: Results
-) -> Carried:
-    """Take some runs through one frame; fills their rows of the results."""
-    carried = Carried(*(column.copy() for column in carried))
+) -> None:
+    """Take some runs through one frame: changes their rows of what is carried, and fills the results."""
     joint = Joint(carried.mean[rows], carried.covariance[rows])
     time_ns = frames.time_ns[rows, number]
     duration_ns = time_ns - carried.time_ns[rows]
@@ -285,6 +314,10 @@ def _advance(
         )
     if setup.fixes == "known":
         joint = _update_by_fixes(setup, joint, frames.fixes[rows, number], frames.noise[rows, number])
+    elif setup.fixes not in ("hungarian", "set", "axes"):
+        scanned = np.flatnonzero(frames.has_network[rows, number])
+        seen = frames.network[rows[scanned], number]
+        joint = _put(joint, scanned, _update_by_sums(setup, joint.of(scanned), seen))
     else:
         scanned = np.flatnonzero(frames.has_network[rows, number])
         own, detection = _update_by_set(setup, joint.of(scanned), frames.network[rows[scanned], number])
@@ -308,7 +341,6 @@ def _advance(
     well = ~carried.failed[rows]
     results.mean[rows[well], number] = joint.mean[well]
     results.covariance[rows[well], number] = joint.covariance[well]
-    return carried
 
 
 def _put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
@@ -345,16 +377,66 @@ def _update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Join
         noise = setup.network.variance_m2 * np.ones(vehicles * len(axes))
         spread = rows @ joint.covariance @ rows.T + np.diag(noise)
         places = detections[..., axes]
-        likelihood = log_likelihoods(predicted, _blocks(spread, vehicles), places)
+        likelihood = log_likelihoods(predicted, blocks_of(spread, vehicles), places)
         maps = (best_maps if setup.fixes == "hungarian" else all_maps)(likelihood, setup.network)
-        joint = collapse(joint, rows, _innovations(maps, predicted, places), noise, maps)
+        joint = collapse(joint, rows, innovations_of(maps, predicted, places), noise, maps)
     detection = np.full((len(joint.mean), vehicles), MISSED)
     if setup.fixes == "hungarian":
         detection = maps.detection
     return joint, detection
 
 
-def _blocks(matrices: Floats, vehicles: int) -> Floats:
+def _update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
+    """Symmetric sums of full scans (runs, detections, 2); others have no such sums and tell nothing.
+
+    Sums of numbers less their expected mean are linear combinations of the sums themselves, with other
+    numbers of digits lost.
+    """
+    vehicles, states = setup.motion.vehicles, setup.states
+    full = np.flatnonzero(np.isfinite(detections[..., 0]).sum(axis=1) == vehicles)
+    own, places = joint.of(full), detections[full, :vehicles]
+    sigma = float(np.sqrt(setup.network.variance_m2))
+    if setup.fixes == "complex":
+        combinations = [
+            position_rows(vehicles, states, (0,)) + 1j * position_rows(vehicles, states, (1,))
+        ]
+        numbers = [places @ np.array([1.0, 1j])]
+    else:
+        combinations = [position_rows(vehicles, states, (axis,)) for axis in (0, 1)]
+        numbers = [places[..., axis] for axis in (0, 1)]
+    measure, expect = (
+        (lambda m: product_sums(m), product_sums_at)
+        if setup.fixes == "products"
+        else (lambda m: power_sums(m, sigma), power_sums_at)
+    )
+    for rows, m in zip(combinations, numbers, strict=True):
+        root = _root(own.covariance)
+        p = own.mean @ rows.T
+        middle = p.mean(axis=1, keepdims=True)
+        pseudo = expect(p - middle, sigma)
+        expected, measured = pseudo.expected, pseudo.jacobian @ (rows @ root)
+        if setup.fixes == "unscented-powers":
+            root = np.concatenate([root, -root], axis=2) * np.sqrt(0.5)
+            steps = np.sqrt(2.0 * states) * np.swapaxes(rows @ root, 1, 2)
+            samples = expect((p - middle)[:, None] + steps, sigma).expected
+            expected = samples.mean(axis=1)
+            measured = np.swapaxes(samples - expected[:, None], 1, 2) / np.sqrt(2.0 * states)
+        innovation = measure(m - middle) - expected
+        mean, root = update_root(own.mean, root, measured, innovation, pseudo.factor)
+        own = Joint(mean, root @ np.swapaxes(root, 1, 2))
+    return _put(joint, full, own)
+
+
+def _root(covariance: Floats) -> Floats:
+    """Factors X with X X' = covariances that rounding may have made a little indefinite."""
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        values, axes = np.linalg.eigh(np.nan_to_num(covariance))
+        return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[:, None, :])
+
+
+def blocks_of(matrices: Floats, vehicles: int) -> Floats:
     """The blocks (runs, vehicles, a, a) on the diagonals of matrices (runs, vehicles a, vehicles a)."""
     size = matrices.shape[-1] // vehicles
     split = matrices.reshape(-1, vehicles, size, vehicles, size)
@@ -362,7 +444,7 @@ def _blocks(matrices: Floats, vehicles: int) -> Floats:
     return np.moveaxis(split[:, index, :, index, :], 0, 1)
 
 
-def _innovations(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
+def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
     """Detections less predictions, (h, vehicles * axes), in the vehicles' order; NaN where missed."""
     if places.shape[1] == 0:
         return np.full((len(maps.run), predicted[0].size), np.nan)
@@ -378,10 +460,10 @@ def _update_by_shape(setup: Setup, joint: Joint, seen: Floats) -> Joint:
     rows = np.flatnonzero(is_full)
     if len(rows) == 0:
         return joint
-    own = update_by_topology(
-        setup.motion, joint.of(rows), seen[rows, :vehicles], setup.infrastructure.variance_m2
-    )
-    return _put(joint, rows, own)
+    own = joint.of(rows)
+    variance_m2 = setup.infrastructure.variance_m2
+    measured = topology_measurement(setup.motion, own, seen[rows, :vehicles], variance_m2)
+    return _put(joint, rows, update_by_scalar(own, measured))
 
 
 def _update_by_pose(
@@ -424,7 +506,7 @@ def _update_by_pose(
 
 def _position_blocks(setup: Setup, joint: Joint) -> Floats:
     rows = position_rows(setup.motion.vehicles, setup.states)
-    return _blocks(rows @ joint.covariance @ rows.T, setup.motion.vehicles)
+    return blocks_of(rows @ joint.covariance @ rows.T, setup.motion.vehicles)
 
 
 def _recognised(setup: Setup, joint: Joint, seen: Floats) -> Floats:
@@ -434,14 +516,14 @@ def _recognised(setup: Setup, joint: Joint, seen: Floats) -> Floats:
     spread = sight.rows @ joint.covariance @ sight.rows.swapaxes(1, 2)
     spread += setup.infrastructure.variance_m2 * np.eye(2 * vehicles)
     predicted = sight.predicted.reshape(-1, vehicles, 2)
-    maps = best_maps(log_likelihoods(predicted, _blocks(spread, vehicles), seen), setup.infrastructure)
+    maps = best_maps(log_likelihoods(predicted, blocks_of(spread, vehicles), seen), setup.infrastructure)
     if seen.shape[1] == 0:
         return np.full((len(seen), vehicles, 2), np.nan)
     chosen = np.take_along_axis(seen, np.maximum(maps.detection, 0)[..., None], 1)
     return np.where((maps.detection == MISSED)[..., None], np.nan, chosen)
 
 
-def _outputs(setup: Setup, frames: Frames, results: Results, failing: Booleans) -> Iterator[Ragged]:
+def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans) -> Iterator[Ragged]:
     """Every vehicle's estimates, the pose's where it is estimated, and who failed."""
     runs, count = frames.time_ns.shape
     said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])

@@ -113,40 +113,61 @@ def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joi
     return Joint(joint.mean + (found.gain @ innovation[..., None])[..., 0], found.covariance)
 
 
+class Weighed(NamedTuple):
+    """Hypotheses with their scores: log weight and likelihood of the innovations, zero where missed.
+
+    `group` (h,) says which row of the gains a hypothesis has; those of a run that miss the same vehicles
+    share one. `group_run` is the run of each row.
+    """
+
+    score: Floats
+    innovations: Floats
+    group: Integers
+    group_run: Integers
+    gains: Gain
+
+
+def weigh(
+    joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
+) -> Weighed:
+    """The likelihood of every hypothesis, by all vehicles together.
+
+    Args:
+        joint: before the measurement.
+        rows: takes the measured components of all vehicles from the state, (m, n).
+        innovations: of every hypothesis, (h, m), NaN for a vehicle that was not detected.
+        noise: the variance of every measured component, (m,).
+        hypotheses: sorted by run, at least one for every run.
+    """
+    there = ~np.isnan(innovations)
+    innovations = np.where(there, innovations, 0.0)
+    groups, group = _distinct(np.concatenate([hypotheses.run[:, None], there], axis=1))
+    run, seen = groups[:, 0], groups[:, 1:].astype(bool)
+    masked = rows if seen.all() else rows * seen[:, :, None]
+    matrices = np.where(seen, noise, 1.0)[:, :, None] * np.eye(len(noise))
+    gains = gain_of(joint.covariance[run], masked, matrices)
+    distance = np.einsum("hi,hij,hj->h", innovations, gains.inverse[group], innovations)
+    counted = np.log(2.0 * np.pi) * there.sum(axis=1)
+    likelihood = -0.5 * (distance + gains.log_determinant[group] + counted)
+    return Weighed(hypotheses.log_weight + likelihood, innovations, group, run, gains)
+
+
 def collapse(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Joint:
     """The Gaussian with the moments of the mixture over all associations of an unordered set.
 
     Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
-    is what an exact symmetric measurement equation filter collapses to.
-
-    Args:
-        joint: before the measurement.
-        rows: takes the measured components of all vehicles from the state, (m, n).
-        innovations: of every hypothesis, (h, m), NaN for a vehicle that was not detected.
-        noise: of one detection's components, (m / vehicles,) squared sigma on the diagonal.
-        hypotheses: sorted by run, at least one for every run.
+    is what an exact symmetric measurement equation filter collapses to. Args as for `weigh`.
     """
-    m = innovations.shape[1]
-    there = ~np.isnan(innovations)
-    innovations = np.where(there, innovations, 0.0)
-    pattern = np.concatenate([hypotheses.run[:, None], there], axis=1)
-    groups, group = _distinct(pattern)
-    run, seen = groups[:, 0], groups[:, 1:].astype(bool)
-    masked = rows * seen[:, :, None] if not seen.all() else rows
-    found = gain_of(joint.covariance[run], masked, np.where(seen, noise, 1.0)[:, :, None] * np.eye(m))
-    distance = np.einsum("hi,hij,hj->h", innovations, found.inverse[group], innovations)
-    counted = 0.5 * np.log(2.0 * np.pi) * there.sum(axis=1)
-    score = hypotheses.log_weight - counted - 0.5 * (distance + found.log_determinant[group])
-    weight = _normalised(score, hypotheses.run)
-    total = _sums(weight, group, len(groups))
-    first = _sums(weight[:, None] * innovations, group, len(groups))
-    second = _sums(
-        weight[:, None, None] * innovations[:, :, None] * innovations[:, None, :], group, len(groups)
-    )
-    moved = (found.gain @ first[..., None])[..., 0]
-    spread = found.gain @ second @ found.gain.swapaxes(1, 2) + total[:, None, None] * found.covariance
+    score, innovations, group, run, gains = weigh(joint, rows, innovations, noise, hypotheses)
+    weight = normalised(score, hypotheses.run)
+    total = _sums(weight, group, len(run))
+    first = _sums(weight[:, None] * innovations, group, len(run))
+    squares = innovations[:, :, None] * innovations[:, None, :]
+    second = _sums(weight[:, None, None] * squares, group, len(run))
+    moved = (gains.gain @ first[..., None])[..., 0]
+    spread = gains.gain @ second @ gains.gain.swapaxes(1, 2) + total[:, None, None] * gains.covariance
     shift = _sums(moved, run, len(joint.mean))
     covariance = _sums(spread, run, len(joint.mean)) - shift[:, :, None] * shift[:, None, :]
     return Joint(joint.mean + shift, covariance)
@@ -170,7 +191,7 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
     return out
 
 
-def _normalised(score: Floats, run: Integers) -> Floats:
+def normalised(score: Floats, run: Integers) -> Floats:
     """exp(score), scaled to sum one in each run; runs are sorted."""
     first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
     count = np.diff(np.append(first, len(run)))
@@ -196,10 +217,23 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
     return np.full(places.shape[:-2], added), variance
 
 
-def update_by_topology(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Joint:
-    """The topology pseudo-measurement of scans (runs, vehicles, 2), whatever their frame and order.
+class Scalar(NamedTuple):
+    """A linearised scalar measurement: rows (runs, 1, n), innovations (runs,) with their variances.
 
-    Where it is too improbable, something was missed and something else taken for a vehicle: left out.
+    `noise` (runs,) is the measurement's part of the variance.
+    """
+
+    rows: Floats
+    innovation: Floats
+    variance: Floats
+    noise: Floats
+
+
+def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
+    """The topology of scans (runs, vehicles, 2), whatever their frame and order.
+
+    The innovation is NaN where it is too improbable: something was missed and something else taken for
+    a vehicle.
     """
     places = positions(motion, joint.mean)
     added, noise = topology_moments(places, variance_m2)
@@ -209,7 +243,12 @@ def update_by_topology(motion: Motion, joint: Joint, detections: Floats, varianc
     rows = gradient.reshape(-1, 1, 2 * count) @ position_rows(count, states)
     variance = (rows @ joint.covariance @ rows.swapaxes(1, 2))[:, 0, 0] + noise
     innovation[innovation**2 > TOPOLOGY_GATE * variance] = np.nan
-    return update(joint, rows, innovation[:, None], noise[:, None, None])
+    return Scalar(rows, innovation, variance, noise)
+
+
+def update_by_scalar(joint: Joint, measured: Scalar) -> Joint:
+    """Kalman's update by a scalar measurement."""
+    return update(joint, measured.rows, measured.innovation[:, None], measured.noise[:, None, None])
 
 
 class Sight(NamedTuple):

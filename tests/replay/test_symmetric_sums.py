@@ -101,7 +101,7 @@ def test_root_update_equals_kalman_s() -> None:
     pseudo = power_sums_at(p, 0.4)
     root = np.tril(rng.normal(size=(3, 3))) + 2 * np.eye(3)
     innovation = rng.normal(size=3)
-    mean, after = update_root(p, root, pseudo.jacobian, innovation, pseudo.factor)
+    mean, after = update_root(p, root, pseudo.jacobian @ root, innovation, pseudo.factor)
     covariance, noise = root @ root.T, pseudo.factor @ pseudo.factor.T
     cross = covariance @ pseudo.jacobian.T
     gain = cross @ np.linalg.inv(pseudo.jacobian @ cross + noise)
@@ -123,7 +123,9 @@ def test_sums_of_equal_multisets_are_equal() -> None:
 
 def test_topology_has_the_sheet_s_numbers() -> None:
     """The nominal vehicles at t = 10, with the infrastructure sensor's noise."""
-    start = np.array([[0, -1.5, 100, -1], [0, -1.5, 0, 1], [0, 0, 0, 3], [0, 1.5, 0, 1], [0, 1.5, 100, -1]])
+    start = np.array(
+        [[0, -1.5, 100, -1], [0, -1.5, 0, 1], [0, 0, 0, 3], [0, 1.5, 0, 1], [0, 1.5, 100, -1]]
+    )
     places = start[:, 0::2] + 10.0 * start[:, 1::2]
     added, variance = topology_moments(places, 0.1)
     assert_allclose(topology(places), 38100.0)
