@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -30,6 +30,7 @@ from replay.evaluation import (
     split_topic,
 )
 from replay.metrics import Output
+from replay.set_errors import SetErrors, set_errors
 from replay.sources import MemorySource, Source, memory_source
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
@@ -52,15 +53,16 @@ class Replayed:
     outputs: dict[str, Ragged]
     errors: list[Errors]
     innovations: list[Innovations]
+    sets: list[SetErrors] = field(default_factory=list)
 
     @property
-    def judged(self) -> list[Errors | Innovations | Output]:
+    def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
         """All that metrics may judge."""
         outputs = [
             Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
             for topic, rows in self.outputs.items()
         ]
-        return [*self.errors, *self.innovations, *outputs]
+        return [*self.errors, *self.innovations, *self.sets, *outputs]
 
     @property
     def failures(self) -> list[str]:
@@ -127,14 +129,16 @@ def replay_in_memory(
 
 
 def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
-    """Errors and innovations of a replay's outputs."""
+    """Errors, innovations and set errors of a replay's outputs."""
     found = [errors_of(each, sources, gap_limit_s) for each in gaussian_estimates(outputs)]
     innovations = [
         innovations_of(each)
         for each in outputs.values()
         if each.stream.schema.full_name == schemas.INNOVATION.full_name
     ]
-    return Replayed(sources, outputs, [each for each in found if each is not None], innovations)
+    errors = [each for each in found if each is not None]
+    sets = set_errors(outputs, sources, gap_limit_s=gap_limit_s)
+    return Replayed(sources, outputs, errors, innovations, sets)
 
 
 def replay_to_logs(

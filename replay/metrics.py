@@ -28,15 +28,16 @@ class Output(NamedTuple):
     sources: Sequence[Source]
 
 
-Judged = TypeVar("Judged", Errors, Innovations, Output)
+Judged = TypeVar("Judged", bound=Any)
 
 
 @dataclass(frozen=True)
 class Metric(Generic[Judged]):
     """A registered metric: what it tells, what it judges, and its numbers as `quantity_unit`.
 
-    `judges` is `Errors` for what follows from estimates and truth, `Innovations` for what a filter says
-    of its measurements, and `Output` for all else; no numbers where it has nothing to say.
+    `judges` is `Errors` for what follows from estimates and truth, `SetErrors` for that of sets,
+    `Innovations` for what a filter says of its measurements, and `Output` for all else; no numbers where
+    it has nothing to say.
     """
 
     summary: str

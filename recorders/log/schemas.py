@@ -237,6 +237,13 @@ SCORE_VECTOR = _declare(
     _vector("scores", may_be_nan=True),
 )
 VECTOR_MEASUREMENT = _declare("VectorMeasurement", "A measurement of any other kind.", _vector("value"))
+COURSE_FIX = _declare(
+    "CourseFix",
+    "A position in the log's plane (east, north), course over ground clockwise from north, and speed.",
+    _vector("position_m"),
+    _real("course_rad", may_be_nan=True),
+    _real("speed_mps", may_be_nan=True),
+)
 
 # What the world is.
 
@@ -260,6 +267,11 @@ LINK_EVENT = _declare(
     _identifier("receiver_id"),
     Field("arrival_time_ns", "time_ns"),
     _identifier("lost"),
+)
+IDENTITY = _declare(
+    "Identity",
+    "Which thing the message of the same row of another topic is of, where that does not say it.",
+    _identifier("thing_id"),
 )
 
 # What estimators say; covariances are full, row-major, in the tangent space.
@@ -306,6 +318,13 @@ SOLUTION = _declare(
     _identifier("converged"),
     _identifier("rank"),
     _real("cost"),
+)
+TRACK_ESTIMATE = _declare(
+    "TrackEstimate",
+    "Mean and covariance of one of several states, known by its number.",
+    _identifier("track_id"),
+    _vector("mean"),
+    _vector("covariance"),
 )
 
 SCHEMAS: dict[str, Schema] = {

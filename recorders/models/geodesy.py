@@ -50,3 +50,20 @@ def out_of_tangent_plane(
         - SEMI_MAJOR_M * np.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
     )
     return np.degrees(found), np.degrees(np.arctan2(y, x)), height
+
+
+def into_tangent_plane(
+    place_deg: Components, origin_deg: Components
+) -> tuple[Component, Component, Component]:
+    """East, north and up (m) of a point of the ellipsoid (latitude, longitude), seen from the origin."""
+    latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
+    x, y, z = (
+        there - here
+        for there, here in zip(earth_centred(*place_deg), earth_centred(*origin_deg), strict=True)
+    )
+    outward = np.cos(longitude) * x + np.sin(longitude) * y
+    return (
+        np.cos(longitude) * y - np.sin(longitude) * x,
+        np.cos(latitude) * z - np.sin(latitude) * outward,
+        np.cos(latitude) * outward + np.sin(latitude) * z,
+    )

@@ -8,8 +8,6 @@ import numpy as np
 
 from recorders.models.planar import Component, Components
 
-STATE = ("x_m", "vx_mps", "y_m", "vy_mps")
-
 
 def turn(
     state: Components, turn_rate_radps: Component, duration_s: Component

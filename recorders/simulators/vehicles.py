@@ -15,8 +15,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
-from recorders.models.states import state_metadata
-from recorders.models.vehicles import STATE, into_frame, noise_moments, turn
+from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.models.vehicles import into_frame, noise_moments, turn
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
 
@@ -245,7 +245,7 @@ def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floa
                 f"/vehicle{index + 1}/prior",
                 schemas.GAUSSIAN_ESTIMATE,
                 _stamps(truth_s[:1]),
-                metadata=state_metadata(STATE) | motion,
+                metadata=state_metadata(PLANE_MOTION) | motion,
                 mean=drive.nominal[None, index],
                 covariance=covariance,
             ),
@@ -253,7 +253,7 @@ def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floa
                 f"/vehicle{index + 1}/truth",
                 schemas.TRUTH_STATE,
                 _stamps(truth_s),
-                metadata=state_metadata(STATE),
+                metadata=state_metadata(PLANE_MOTION),
                 state=states[:, index],
             ),
         ]

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import NonNegativeFloat
 
 from recorders.log import schemas
-from recorders.models.vehicles import STATE, noise_moments, turn
+from recorders.models.states import PLANE_MOTION
+from recorders.models.vehicles import noise_moments, turn
 from recorders.parameters import Parameters
 from replay.plain import Floats, Given, Integers, Messages, Results, recursive
 
@@ -41,7 +42,7 @@ class State(NamedTuple):
 
 def start(given: Given[KalmanParameters]) -> tuple[Motion, State]:
     """The state at every run's prior."""
-    time_ns, mean, covariance = given.prior("prior", len(STATE))
+    time_ns, mean, covariance = given.prior("prior", len(PLANE_MOTION))
     motion = Motion(
         given.stated("prior", "turn_rate_radps"), given.stated("prior", "acceleration_sigma_mps2")
     )
@@ -124,7 +125,7 @@ VEHICLE_KALMAN = recursive(
     parameters=KalmanParameters,
     streams={"fix": schemas.POSITION_FIX},
     whole={"prior": schemas.GAUSSIAN_ESTIMATE},
-    components=dict.fromkeys(STATE, "linear"),
+    components=dict.fromkeys(PLANE_MOTION, "linear"),
     truth="truth",
     measured={"x_m": "linear", "y_m": "linear"},
     start=start,

@@ -17,8 +17,7 @@ from pydantic import PositiveInt
 from recorders.errors import BadInput, choices
 from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
-from recorders.models.states import state_metadata
-from recorders.models.vehicles import STATE
+from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.engine import Bound, Estimator, Recursive
@@ -226,7 +225,7 @@ def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
         if np.any(np.diff(prior.offsets) == 0):
             raise BadInput(f"topic {topic}: a run has no prior message; the filter cannot start")
         if prior["mean"].shape[1] != STATES or prior["covariance"].shape[1] != STATES**2:
-            raise BadInput(f"topic {topic}: a prior of ({', '.join(STATE)}) is needed")
+            raise BadInput(f"topic {topic}: a prior of ({', '.join(PLANE_MOTION)}) is needed")
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
         first = prior.offsets[:-1]
         mean[:, own] = prior["mean"][first]
@@ -547,7 +546,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     vehicles = setup.motion.vehicles
     for vehicle in range(vehicles):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        yield gaussians(f"vehicle{vehicle + 1}", STATE, own)
+        yield gaussians(f"vehicle{vehicle + 1}", PLANE_MOTION, own)
     if setup.has_pose:
         yield gaussians("infrastructure", POSE_COMPONENTS, slice(STATES * vehicles, None))
     failed = np.flatnonzero(failing)

@@ -161,27 +161,23 @@ def _until_stale(
 
 
 def plane_view(
-    canvas: Canvas, root: str, others: list[str], paths: list[str], places: Floats
+    canvas: Canvas,
+    root: str,
+    others: list[str],
+    paths: list[str],
+    places: Floats,
+    trail_s: float = TRAIL_S,
 ) -> rrb.Spatial2DView:
     """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
 
-    Of the `paths` it shows what lies up to a minute before the cursor.
+    Of the `paths` it shows what lies up to `trail_s` before the cursor.
     """
     extent = extent_of(places)
     low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
     step_m = nice(extent / 10.0)
     low, high = low - 0.07 * extent, high + 0.07 * extent
     _draw_grid(canvas, f"{root}/grid", low - extent, high + extent, step_m)
-    steps = round(TRAIL_S * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
-    cursor = rrb.TimeRangeBoundary.cursor_relative
-    a_minute_ago = cursor(seconds=-TRAIL_S)
-    trail = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange("sim_time", start=a_minute_ago, end=cursor()),
-            rrb.VisibleTimeRange("utc", start=a_minute_ago, end=cursor()),
-            rrb.VisibleTimeRange("step", start=cursor(seq=-steps), end=cursor()),
-        ]
-    )
+    trail = trail_of(canvas, trail_s)
     return rrb.Spatial2DView(
         origin="/",
         contents=[f"{escaped(each)}/**" for each in (root, *others)],
@@ -189,6 +185,20 @@ def plane_view(
         overrides={escaped(path): [trail] for path in paths},
         # the bounds are outside the transform that turns y up
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
+    )
+
+
+def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
+    """What lies up to so long before the cursor, on every timeline."""
+    steps = round(trail_s * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    begin = cursor(seconds=-trail_s)
+    return rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange("sim_time", start=begin, end=cursor()),
+            rrb.VisibleTimeRange("utc", start=begin, end=cursor()),
+            rrb.VisibleTimeRange("step", start=cursor(seq=-steps), end=cursor()),
+        ]
     )
 
 

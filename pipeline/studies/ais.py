@@ -1,0 +1,119 @@
+"""The study of tracks of reports without identities: which vessels kept one track of their own.
+
+The identities that the log has are used to judge alone. A vessel's own track is the one that it is
+assigned when tracks and vessels are paired one to one: see `replay.tracks`.
+"""
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from pydantic import NonNegativeInt, PositiveFloat
+
+from pipeline.ensemble import Replayed, hash_streams, replay_ensemble
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Claim, Outcome, judged
+from pipeline.studies.localization import obtain, summary_table, write_logs
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.metrics import Output, find_metrics, measure
+from replay.timeline.show import show
+from replay.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, track_tables
+
+
+class AisOptions(Parameters):
+    """Which estimator is held to the targets, and what these are; how long a track is called live."""
+
+    estimator: str = "report-tracker"
+    kept_share: PositiveFloat = 0.7
+    mean_share: PositiveFloat = 0.88
+    more_reports_than: NonNegativeInt = MANY_REPORTS
+    live_s: PositiveFloat = 600.0
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    options: AisOptions = setting.options
+    sources = obtain(experiment, setting)
+    replayed = replay_ensemble(
+        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
+    )
+    write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    vessels = vessel_table(replayed)
+    if options.estimator not in set(vessels["estimator"]):
+        raise BadInput(f"no tracks of '{options.estimator}' with identities to judge them by")
+    outcome = Outcome(input_sha256=hash_streams(sources))
+    outcome.metrics.update(measure(replayed.judged, find_metrics(experiment.metrics)))
+    outcome.tables["summary"] = summary_table(outcome.metrics)
+    outcome.tables["vessels"] = vessels
+    notes = sources[0].run.notes.items()
+    outcome.tables["notes"] = pd.DataFrame(notes, columns=["what", "count"])
+    outcome.figures["tracks"] = tracks_figure(replayed, vessels, options)
+    outcome.claims = _claims(vessels, options)
+    return outcome
+
+
+def vessel_table(replayed: Replayed) -> pd.DataFrame:
+    """The tables of `replay.tracks.track_table` of all estimators."""
+    tables = [
+        table.assign(estimator=each.estimator)
+        for each in replayed.judged
+        if isinstance(each, Output)
+        for table in track_tables(each)
+    ]
+    if not tables:
+        raise BadInput("no tracks to judge: the log has no identities, or no estimator tells tracks")
+    return pd.concat(tables).rename(columns={"thing": "mmsi"})
+
+
+def tracks_figure(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Figure:
+    """The share of every vessel's reports in its own track, and live tracks and vessels over time."""
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    above, below = figure.subplots(2, 1)
+    many = vessels[vessels["reports"] > options.more_reports_than]
+    for estimator, rows in many.groupby("estimator", sort=False):
+        above.plot(np.sort(rows["share"])[::-1], ".-", label=str(estimator))
+    above.axhline(KEPT_SHARE, color="0.7", lw=1, label=f"kept: {KEPT_SHARE:g}")
+    above.set(
+        xlabel=f"vessels with more than {options.more_reports_than} reports, best first",
+        ylabel="share of reports in the own track",
+        ylim=(0, 1.02),
+    )
+    above.legend(loc="lower left")
+    [source] = replayed.sources
+    identity = source.read(["/identity"])["/identity"]
+    curves = {"vessels": (identity.publish_time_ns, identity["thing_id"])}
+    for each in replayed.judged:
+        if isinstance(each, Output) and each.leaf == "track":
+            stream = each.rows.stream
+            curves[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
+    for label, (time_ns, numbers) in curves.items():
+        at_ns, live = live_counts(time_ns, numbers, options.live_s)
+        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1)
+    below.set(xlabel="time (s)", ylabel=f"heard within {options.live_s:g} s", ylim=(0, None))
+    below.legend(loc="lower right")
+    return figure
+
+
+def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:
+    own = kept(vessels[vessels["estimator"] == options.estimator], reports=options.more_reports_than)
+    if own.things == 0:
+        return []
+    what = f"of {own.things} vessels with more than {options.more_reports_than} reports"
+    return [
+        judged(
+            f"{what}, at least {options.kept_share:.0%} keep one track for {KEPT_SHARE:.0%} of them",
+            "own target; plain nearest neighbour on position and velocity: 62 %",
+            f"{100 * own.kept_share:.1f} %",
+            own.kept_share >= options.kept_share,
+        ),
+        judged(
+            f"mean share of reports in the own track {what} at least {options.mean_share:g}",
+            "own target; plain nearest neighbour on position and velocity: .84",
+            f"{own.mean_share:.3f}",
+            own.mean_share >= options.mean_share,
+        ),
+    ]
+
+
+AIS = Study("tracks of reports without identities, against the identities", study, AisOptions)

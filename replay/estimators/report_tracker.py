@@ -1,0 +1,534 @@
+"""Tracks of vessels from reports that do not say whose they are.
+
+Every report goes to the track from which it is most likely, or begins a new one. Tracks are taken for
+independent point processes: what counts is how likely track i reports now (its rate) times how likely
+it reports this (its predictive density), against the rate and density of vessels not met before.
+Reports of one stamp are of different vessels; the surest pairs are made first.
+
+How a track moves is one of a few levels of noise, from a moored hull to a vessel that turns sharply or
+was silent long. The weights of the levels are learnt by Bayes' rule and forgotten a little with every
+report, and the state is the one Gaussian with the mixture's moments: the first-order generalised
+pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 11.6.2). Both axes have the same noise: three numbers are a track's covariance.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
+
+from recorders.log import Topic, make_stream, schemas
+from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.parameters import Parameters
+from replay.blocks import Block, Ragged
+from replay.compile import compile_over_runs
+from replay.engine import Bound, Estimator, Recursive
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+LEVELS = 4
+# How fast the usual interval of a track follows what it does.
+INTERVAL_GAIN = 0.2
+# Predictions this far out, in squared sigmas of the widest level, are not looked at more closely.
+GATE = 60.0
+NO_TRACK = -1
+FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=LEVELS)]
+
+
+class ReportTrackerParameters(Parameters):
+    """What is supposed of vessels, their receivers, and how many there are; the same for all.
+
+    The levels of noise, quiet ones first: density of the acceleration (m^2/s^3), sigmas of positions
+    and velocities. `forgetting` is how much of the levels' weights a report takes back to equal ones.
+    A vessel below `slow_mps` often repeats its last course, which then tells it from others within
+    `course_width_deg`. A track that is silent for `forget_s` is dropped.
+    """
+
+    acceleration_density: FOUR = (1e-6, 1e-4, 1e-2, 1.0)
+    sigma_position_m: FOUR = (1.5, 3.0, 5.0, 10.0)
+    sigma_velocity_mps: FOUR = (0.1, 0.2, 0.3, 1.0)
+    forgetting: Annotated[float, Field(gt=0, le=1)] = 0.02
+    births_per_km2_h: PositiveFloat = 3.0
+    top_speed_mps: PositiveFloat = 20.0
+    usual_interval_s: PositiveFloat = 30.0
+    slow_mps: PositiveFloat = 0.5
+    course_width_deg: Annotated[float, Field(gt=0, le=180)] = 1.0
+    forget_s: PositiveFloat = 7200.0
+
+
+class Settings(NamedTuple):
+    """The parameters as the kernel has them; the levels' (LEVELS,), all else (1,)."""
+
+    acceleration_density: Floats
+    position_variance: Floats
+    velocity_variance: Floats
+    forgetting: Floats
+    birth_density: Floats
+    usual_interval_s: Floats
+    slow_mps: Floats
+    course_width_rad: Floats
+    top_speed_mps: Floats
+    forget_s: Floats
+
+
+class Tracks(NamedTuple):
+    """The tracks of all runs: first axis run, second a place for each track, of which `used` are taken.
+
+    Attributes:
+        used: (runs,); met: (runs,) how many there ever were, which numbers them.
+        number, time_ns: (runs, places).
+        mean: (runs, places, 4) x, vx, y, vy.
+        spread: (runs, places, 3) variance of a position, covariance, variance of a velocity, per axis.
+        weight: (runs, places, LEVELS).
+        interval_s: (runs, places) the usual one.
+        course_rad, speed_mps: (runs, places) as last reported.
+        held: (runs, places, 2) how often a slow one held its course, and how often not, from 1.
+    """
+
+    used: Integers
+    met: Integers
+    number: Integers
+    time_ns: Integers
+    mean: Floats
+    spread: Floats
+    weight: Floats
+    interval_s: Floats
+    course_rad: Floats
+    speed_mps: Floats
+    held: Floats
+
+
+class Reports(NamedTuple):
+    """The reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
+
+    The variance is large where course or speed is not known.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    is_last: NDArray[np.bool_]
+    position: Floats
+    velocity: Floats
+    velocity_variance: Floats
+    course_rad: Floats
+    speed_mps: Floats
+
+
+class Told(NamedTuple):
+    """What is said of every report: its track's number, mean (n, 4) and spread (n, 3)."""
+
+    number: Integers
+    mean: Floats
+    spread: Floats
+
+
+class Candidates(NamedTuple):
+    """The best track of each report of one stamp, and how much better it is than a new one."""
+
+    place: Integers
+    score: Floats
+    is_open: NDArray[np.bool_]
+
+
+def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
+    """The spread of one axis after a while of constant velocity with white acceleration."""
+    return (
+        spread[0]
+        + duration_s * (2.0 * spread[1] + duration_s * (spread[2] + density * duration_s / 3.0)),
+        spread[1] + duration_s * (spread[2] + density * duration_s / 2.0),
+        spread[2] + density * duration_s,
+    )
+
+
+def density_at(difference: tuple[float, float, float, float], a: float, b: float, c: float) -> float:
+    """The density of differences (x, vx, y, vy) when each axis has the covariance (a, b; b, c)."""
+    x, vx, y, vy = difference
+    determinant = a * c - b * b
+    squared = c * (x * x + y * y) - 2.0 * b * (x * vx + y * vy) + a * (vx * vx + vy * vy)
+    return np.exp(-0.5 * squared / determinant) / (4.0 * np.pi**2 * determinant)
+
+
+def differences(
+    mean: Floats, position: Floats, velocity: Floats, duration_s: float
+) -> tuple[float, float, float, float]:
+    """What is reported (x, vx, y, vy) minus what a track predicts."""
+    return (
+        position[0] - mean[0] - duration_s * mean[1],
+        velocity[0] - mean[1],
+        position[1] - mean[2] - duration_s * mean[3],
+        velocity[1] - mean[3],
+    )
+
+
+def mixed(weight: float, settings: Settings) -> float:
+    """The weight of a level before the next report."""
+    forgetting = settings.forgetting[0]
+    return (1.0 - forgetting) * weight + forgetting / LEVELS
+
+
+def is_held(course_rad: float, before_rad: float, settings: Settings) -> bool:
+    """Whether a course is the one before, or both are not available."""
+    if np.isnan(course_rad) or np.isnan(before_rad):
+        return np.isnan(course_rad) and np.isnan(before_rad)
+    turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
+    return turned < settings.course_width_rad[0]
+
+
+def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: Settings) -> bool:
+    """Whether a track was, and a report is, so slow that the course says little of the motion."""
+    return speed_mps < settings.slow_mps[0] and tracks.speed_mps[run, place] < settings.slow_mps[0]
+
+
+def score_of(
+    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
+) -> float:
+    """The log of how much likelier a report is of a track than of a vessel not met before."""
+    duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
+    if duration_s <= 0.0:
+        return -np.inf
+    difference = differences(
+        tracks.mean[run, place], reports.position[event], reports.velocity[event], duration_s
+    )
+    spread = tracks.spread[run, place]
+    widest, _, _ = widened(spread, settings.acceleration_density[LEVELS - 1], duration_s)
+    widest += settings.position_variance[LEVELS - 1]
+    if difference[0] ** 2 + difference[2] ** 2 > GATE * widest:
+        return -np.inf
+    density = 0.0
+    for level in range(LEVELS):
+        a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
+        a += settings.position_variance[level]
+        c += settings.velocity_variance[level] + reports.velocity_variance[event]
+        weight = mixed(tracks.weight[run, place, level], settings)
+        density += weight * density_at(difference, a, b, c)
+    # the rate of a track that is silent for long falls: Lomax' distribution of the intervals
+    density /= tracks.interval_s[run, place] + duration_s
+    if are_slow(tracks, run, place, reports.speed_mps[event], settings):
+        course_rad, before_rad = reports.course_rad[event], tracks.course_rad[run, place]
+        held, turned = tracks.held[run, place, 0], tracks.held[run, place, 1]
+        factor = turned / (held + turned)
+        if is_held(course_rad, before_rad, settings):
+            factor += np.pi / settings.course_width_rad[0] * held / (held + turned)
+        density *= factor
+    return np.log(density / settings.birth_density[0]) if density > 0.0 else -np.inf
+
+
+def find_best(
+    run: int,
+    event: int,
+    slot: int,
+    reports: Reports,
+    tracks: Tracks,
+    settings: Settings,
+    candidates: Candidates,
+) -> None:
+    """Note the likeliest track of a report; none where a new one is likelier."""
+    candidates.place[slot], candidates.score[slot] = NO_TRACK, 0.0
+    for place in range(tracks.used[run]):
+        score = score_of(run, place, event, reports, tracks, settings)
+        if score > candidates.score[slot]:
+            candidates.place[slot], candidates.score[slot] = place, score
+
+
+def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Settings) -> int:
+    """Begin a track with a report; returns its place."""
+    place = tracks.used[run]
+    tracks.used[run] = place + 1
+    tracks.number[run, place] = tracks.met[run]
+    tracks.met[run] += 1
+    widest = LEVELS - 1
+    for axis in range(2):
+        tracks.mean[run, place, 2 * axis] = reports.position[event, axis]
+        tracks.mean[run, place, 2 * axis + 1] = reports.velocity[event, axis]
+        tracks.held[run, place, axis] = 1.0
+    tracks.spread[run, place, 0] = settings.position_variance[widest]
+    tracks.spread[run, place, 1] = 0.0
+    tracks.spread[run, place, 2] = settings.velocity_variance[widest] + reports.velocity_variance[event]
+    for level in range(LEVELS):
+        tracks.weight[run, place, level] = 1.0 / LEVELS
+    tracks.interval_s[run, place] = settings.usual_interval_s[0]
+    return place
+
+
+def update(
+    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
+) -> None:
+    """Take a report into a track."""
+    duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
+    mean, spread = tracks.mean[run, place], tracks.spread[run, place]
+    weight = tracks.weight[run, place]
+    x, vx, y, vy = differences(mean, reports.position[event], reports.velocity[event], duration_s)
+    total = 0.0
+    for level in range(LEVELS):
+        a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
+        a += settings.position_variance[level]
+        c += settings.velocity_variance[level] + reports.velocity_variance[event]
+        weight[level] = mixed(weight[level], settings) * density_at((x, vx, y, vy), a, b, c)
+        total += weight[level]
+    # means of the gains (4), of the posterior spreads (3) and of the squares of the moves (3)
+    g11, g12, g21, g22 = 0.0, 0.0, 0.0, 0.0
+    own_a, own_b, own_c = 0.0, 0.0, 0.0
+    moved_a, moved_b, moved_c = 0.0, 0.0, 0.0
+    for level in range(LEVELS):
+        weight[level] /= total
+        w = weight[level]
+        a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
+        seen_a = a + settings.position_variance[level]
+        seen_c = c + settings.velocity_variance[level] + reports.velocity_variance[event]
+        determinant = seen_a * seen_c - b * b
+        k11, k12 = (a * seen_c - b * b) / determinant, b * (seen_a - a) / determinant
+        k21, k22 = b * (seen_c - c) / determinant, (c * seen_a - b * b) / determinant
+        g11 += w * k11
+        g12 += w * k12
+        g21 += w * k21
+        g22 += w * k22
+        own_a += w * (a - k11 * a - k12 * b)
+        own_b += w * (b - k11 * b - k12 * c)
+        own_c += w * (c - k21 * b - k22 * c)
+        move_x, move_y = k11 * x + k12 * vx, k11 * y + k12 * vy
+        move_vx, move_vy = k21 * x + k22 * vx, k21 * y + k22 * vy
+        moved_a += 0.5 * w * (move_x**2 + move_y**2)
+        moved_b += 0.5 * w * (move_x * move_vx + move_y * move_vy)
+        moved_c += 0.5 * w * (move_vx**2 + move_vy**2)
+    move_x, move_y = g11 * x + g12 * vx, g11 * y + g12 * vy
+    move_vx, move_vy = g21 * x + g22 * vx, g21 * y + g22 * vy
+    spread[0] = own_a + moved_a - 0.5 * (move_x**2 + move_y**2)
+    spread[1] = own_b + moved_b - 0.5 * (move_x * move_vx + move_y * move_vy)
+    spread[2] = own_c + moved_c - 0.5 * (move_vx**2 + move_vy**2)
+    mean[0] += duration_s * mean[1] + move_x
+    mean[1] += move_vx
+    mean[2] += duration_s * mean[3] + move_y
+    mean[3] += move_vy
+    tracks.interval_s[run, place] += INTERVAL_GAIN * (duration_s - tracks.interval_s[run, place])
+    if are_slow(tracks, run, place, reports.speed_mps[event], settings):
+        held = is_held(reports.course_rad[event], tracks.course_rad[run, place], settings)
+        tracks.held[run, place, 0 if held else 1] += 1.0
+
+
+def take_in(
+    run: int,
+    event: int,
+    place: int,
+    reports: Reports,
+    tracks: Tracks,
+    settings: Settings,
+    told: Told,
+) -> None:
+    """Give a report to a track, or to a new one, and tell what that then says."""
+    if place == NO_TRACK:
+        place = begin(run, event, reports, tracks, settings)
+    else:
+        update(run, place, event, reports, tracks, settings)
+    tracks.time_ns[run, place] = reports.time_ns[event]
+    tracks.course_rad[run, place] = reports.course_rad[event]
+    tracks.speed_mps[run, place] = reports.speed_mps[event]
+    told.number[event] = tracks.number[run, place]
+    for component in range(4):
+        told.mean[event, component] = tracks.mean[run, place, component]
+    for component in range(3):
+        told.spread[event, component] = tracks.spread[run, place, component]
+
+
+def forget(run: int, now_ns: int, tracks: Tracks, settings: Settings) -> None:
+    """Drop the tracks that are silent for too long; the last takes the place of one that goes."""
+    place = 0
+    while place < tracks.used[run]:
+        if (now_ns - tracks.time_ns[run, place]) * 1e-9 <= settings.forget_s[0]:
+            place += 1
+            continue
+        last = tracks.used[run] - 1
+        tracks.used[run] = last
+        tracks.number[run, place] = tracks.number[run, last]
+        tracks.time_ns[run, place] = tracks.time_ns[run, last]
+        for component in range(4):
+            tracks.mean[run, place, component] = tracks.mean[run, last, component]
+        for component in range(3):
+            tracks.spread[run, place, component] = tracks.spread[run, last, component]
+        for level in range(LEVELS):
+            tracks.weight[run, place, level] = tracks.weight[run, last, level]
+        for kind in range(2):
+            tracks.held[run, place, kind] = tracks.held[run, last, kind]
+        tracks.interval_s[run, place] = tracks.interval_s[run, last]
+        tracks.course_rad[run, place] = tracks.course_rad[run, last]
+        tracks.speed_mps[run, place] = tracks.speed_mps[run, last]
+
+
+def track(
+    run: int,
+    reports: Reports,
+    tracks: Tracks,
+    settings: Settings,
+    told: Told,
+    candidates: Candidates,
+) -> None:
+    """Take one run's reports in, stamp by stamp, the surest pair of report and track first."""
+    first, end = reports.offsets[run], reports.offsets[run + 1]
+    while first < end:
+        count = 1
+        while not reports.is_last[first + count - 1]:
+            count += 1
+        forget(run, reports.time_ns[first], tracks, settings)
+        for slot in range(count):
+            candidates.is_open[slot] = True
+            find_best(run, first + slot, slot, reports, tracks, settings, candidates)
+        remaining = count
+        while remaining > 0:
+            surest = -1
+            for slot in range(count):
+                if candidates.is_open[slot] and (
+                    surest < 0 or candidates.score[slot] > candidates.score[surest]
+                ):
+                    surest = slot
+            event, place = first + surest, candidates.place[surest]
+            if place != NO_TRACK and tracks.time_ns[run, place] == reports.time_ns[event]:
+                # another report of this stamp has it by now
+                find_best(run, event, surest, reports, tracks, settings, candidates)
+            else:
+                take_in(run, event, place, reports, tracks, settings, told)
+                candidates.is_open[surest] = False
+                remaining -= 1
+        first += count
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> Callable[..., None]:
+    return compile_over_runs(track, allocates=False)
+
+
+def start(_: Mapping[str, Ragged]) -> None:
+    """Nothing is known before the first report, not even how many runs there are."""
+
+
+def run(
+    state: Tracks | None, block: Block, *, name: str, topic: str, settings: Settings
+) -> tuple[Tracks, list[Ragged]]:
+    """Track a block; see `replay.engine.Recursive`."""
+    reports = _reports(block, topic, settings)
+    most = int(np.diff(reports.offsets).max(initial=0))
+    runs = len(reports.offsets) - 1
+    tracks = _with_room(state or _no_tracks(runs), most)
+    rows = len(reports.time_ns)
+    told = Told(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
+    ends = np.flatnonzero(reports.is_last)
+    together = int(np.diff(ends, prepend=-1).max(initial=1))
+    _compiled()(runs, reports, tracks, settings, told, scratch=partial(_candidates, together))
+    stream = make_stream(
+        f"/estimates/{name}/track",
+        schemas.TRACK_ESTIMATE,
+        reports.time_ns,
+        metadata={**state_metadata(PLANE_MOTION), "reports": topic},
+        track_id=told.number,
+        mean=told.mean,
+        covariance=covariances(told.spread).reshape(rows, 16),
+    )
+    return _trimmed(tracks), [Ragged(stream, reports.offsets)]
+
+
+def covariances(spread: Floats) -> Floats:
+    """The covariances (n, 4, 4) of spreads (n, 3)."""
+    found = np.zeros((len(spread), 4, 4))
+    for axis in (0, 2):
+        found[:, axis, axis] = spread[:, 0]
+        found[:, axis, axis + 1] = found[:, axis + 1, axis] = spread[:, 1]
+        found[:, axis + 1, axis + 1] = spread[:, 2]
+    return found
+
+
+def _reports(block: Block, topic: str, settings: Settings) -> Reports:
+    offsets, time_ns, _, source, is_last = block.events
+    given = block.streams[topic]
+    course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
+    # nothing is known of the direction, or of the speed either: a wide velocity about zero
+    fastest = settings.top_speed_mps[0]
+    unknown = np.isnan(course_rad) | np.isnan(speed_mps)
+    variance = np.where(unknown, np.where(np.isnan(speed_mps), fastest, speed_mps) ** 2, 0.0)
+    velocity = np.stack([speed_mps * np.sin(course_rad), speed_mps * np.cos(course_rad)], axis=1)
+    velocity[unknown] = 0.0
+    position = np.ascontiguousarray(given["position_m"][source, :2])
+    return Reports(offsets, time_ns, is_last, position, velocity, variance, course_rad, speed_mps)
+
+
+def _no_tracks(runs: int) -> Tracks:
+    none = (runs, 0)
+    return Tracks(
+        used=np.zeros(runs, np.int64),
+        met=np.zeros(runs, np.int64),
+        number=np.empty(none, np.int64),
+        time_ns=np.empty(none, np.int64),
+        mean=np.empty((*none, 4)),
+        spread=np.empty((*none, 3)),
+        weight=np.empty((*none, LEVELS)),
+        interval_s=np.empty(none),
+        course_rad=np.empty(none),
+        speed_mps=np.empty(none),
+        held=np.empty((*none, 2)),
+    )
+
+
+def _with_room(tracks: Tracks, more: int) -> Tracks:
+    """A copy with places for so many more tracks."""
+
+    def with_room(each: NDArray) -> NDArray:
+        room = np.zeros((len(each), more, *each.shape[2:]), each.dtype)
+        return each.copy() if each.ndim == 1 else np.concatenate([each, room], axis=1)
+
+    columns: Any = tracks
+    return Tracks(*map(with_room, columns))
+
+
+def _trimmed(tracks: Tracks) -> Tracks:
+    """Without the places that no run uses."""
+    most = int(tracks.used.max(initial=0))
+    columns: Any = tracks
+    return Tracks(*(each if each.ndim == 1 else each[:, :most].copy() for each in columns))
+
+
+def _candidates(count: int) -> Candidates:
+    return Candidates(np.empty(count, np.int64), np.empty(count), np.empty(count, bool))
+
+
+def settings_of(parameters: ReportTrackerParameters) -> Settings:
+    """The parameters as the kernel has them.
+
+    New vessels come anywhere, with any velocity up to the greatest: so many per m^2, s and (m/s)^2.
+    """
+    births = parameters.births_per_km2_h / (1e6 * 3600.0 * np.pi * parameters.top_speed_mps**2)
+    single = (
+        parameters.forgetting,
+        births,
+        parameters.usual_interval_s,
+        parameters.slow_mps,
+        np.radians(parameters.course_width_deg),
+        parameters.top_speed_mps,
+        parameters.forget_s,
+    )
+    return Settings(
+        np.array(parameters.acceleration_density),
+        np.square(parameters.sigma_position_m),
+        np.square(parameters.sigma_velocity_mps),
+        *(np.array([each], float) for each in single),
+    )
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: ReportTrackerParameters) -> list[Bound]:
+    found = [each for each in topics.values() if each.schema_name == schemas.COURSE_FIX.full_name]
+    settings = settings_of(parameters)
+    bound: list[Bound] = []
+    for topic in found:
+        prefix = topic.name.rpartition("/")[0]
+        own = f"{name}{prefix}"
+        advance = partial(run, name=own, topic=topic.name, settings=settings)
+        bound.append(Recursive(own, (topic.name,), (), start, advance))
+    return bound
+
+
+REPORT_TRACKER = Estimator(
+    "tracks of vessels from reports of position, course and speed that do not say whose they are",
+    ".../reports (fuselog.CourseFix)",
+    ReportTrackerParameters,
+    _bind,
+)

@@ -1,0 +1,96 @@
+"""Distances between sets of points: OSPA and GOSPA with its parts.
+
+Sources: Schuhmacher, Vo, Vo, "A consistent metric for performance evaluation of multi-object filters",
+IEEE TSP 56(8), 2008 (OSPA); Rahmathullah, Garcia-Fernandez, Svensson, "Generalized optimal sub-pattern
+assignment metric", FUSION 2017 (GOSPA).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+
+
+class Gospa(NamedTuple):
+    """GOSPA and what it is made of: total**order = localisation + missed + false."""
+
+    total: float
+    localisation: float
+    missed: float
+    false: float
+
+
+def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 1.0) -> float:
+    """OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the unit of the points.
+
+    Raises BadInput as `gospa` does.
+    """
+    costs = _assigned_costs(estimates, truths, cutoff, order)
+    most = max(costs.estimates, costs.truths)
+    if most == 0:
+        return 0.0
+    alone = most - len(costs.pairs)
+    return float((np.sum(costs.pairs) + alone * cutoff**order) / most) ** (1.0 / order)
+
+
+def gospa(
+    estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0, alpha: float = 2.0
+) -> Gospa:
+    """GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
+
+    With alpha = 2 a pair as far apart as the cutoff is no pair: it counts as one missed and one false.
+    With another alpha only what exceeds the other set in number is missed or false.
+
+    Raises BadInput where the points are not finite or have different dimensions, the cutoff is not
+    positive, the order is below 1, or alpha is not in (0, 2].
+    """
+    if not 0.0 < alpha <= 2.0:
+        raise BadInput(f"alpha {alpha:g}: GOSPA wants one above 0 and up to 2")
+    costs = _assigned_costs(estimates, truths, cutoff, order)
+    pairs = costs.pairs
+    if alpha == 2.0:
+        pairs = pairs[pairs < cutoff**order]
+        unpaired = len(pairs), len(pairs)
+    else:
+        unpaired = costs.truths, costs.estimates
+    alone = cutoff**order / alpha
+    localisation = float(np.sum(pairs))
+    missed = alone * max(costs.truths - unpaired[1], 0)
+    false = alone * max(costs.estimates - unpaired[0], 0)
+    return Gospa((localisation + missed + false) ** (1.0 / order), localisation, missed, false)
+
+
+class _Costs(NamedTuple):
+    """Sizes of the sets, and the cut-off distances to the power of the order of the best pairs."""
+
+    estimates: int
+    truths: int
+    pairs: Floats
+
+
+def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
+    """Pair as many points as there are, at the least cost."""
+    if not (0.0 < cutoff < np.inf and 1.0 <= order < np.inf):
+        raise BadInput(f"cutoff {cutoff:g}, order {order:g}: a positive cutoff and an order from 1 on")
+    first, second = _points(estimates, "estimates"), _points(truths, "truths")
+    if len(first) == 0 or len(second) == 0:
+        return _Costs(len(first), len(second), np.empty(0))
+    if first.shape[1] != second.shape[1]:
+        raise BadInput(f"estimates have {first.shape[1]} components, truths {second.shape[1]}")
+    costs = np.minimum(cdist(first, second), cutoff) ** order
+    return _Costs(len(first), len(second), costs[linear_sum_assignment(costs)])
+
+
+def _points(points: ArrayLike, what: str) -> Floats:
+    found = np.asarray(points, float)
+    if found.size == 0:
+        return np.empty((0, 0))
+    if found.ndim != 2 or not np.isfinite(found).all():
+        raise BadInput(f"{what}: expected finite points (n, d), got shape {found.shape}; drop NaN")
+    return found
