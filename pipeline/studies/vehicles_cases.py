@@ -10,7 +10,8 @@ from pydantic import NonNegativeInt
 from recorders.parameters import Parameters
 from recorders.simulators.vehicles import VehiclesParameters
 from replay.blocks import Ragged
-from replay.estimators.vehicle_streams import split_method, vehicle_numbers
+from replay.estimators.vehicle_streams import vehicle_numbers
+from replay.estimators.vehicle_updates import split_method
 from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
 from replay.sources import Source
 
@@ -98,8 +99,11 @@ def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np
 
 def score(estimates: Floats, truths: Floats) -> Scores:
     """Total errors of estimated places (runs, steps, vehicles, 2)."""
-    fixed = fixed_squared_error(estimates, truths)
-    assigned = assigned_squared_error(estimates, truths)
+    return _scores(fixed_squared_error(estimates, truths), assigned_squared_error(estimates, truths))
+
+
+def _scores(fixed: Floats, assigned: Floats) -> Scores:
+    """Of squared errors by run and step."""
     failed = int(np.isnan(fixed).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, failed)
 

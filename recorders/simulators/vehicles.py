@@ -16,7 +16,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.states import PLANE_MOTION, state_metadata
-from recorders.models.vehicles import into_frame, noise_moments, turn
+from recorders.models.vehicles import into_frame, turn
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
 

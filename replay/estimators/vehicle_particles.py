@@ -32,14 +32,12 @@ from replay.estimators.vehicle_streams import (
     Carried,
     Frames,
     Results,
-    Setup,
     bind_vehicles,
-    blocks_of,
     frames_of,
-    innovations_of,
     outputs_of,
     start,
 )
+from replay.estimators.vehicle_updates import Setup, blocks_of, innovations_of
 from replay.estimators.vehicles import (
     STATES,
     Floats,

@@ -6,7 +6,7 @@ frame after frame is filtered in all runs at once.
 """
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -15,64 +15,29 @@ from numpy.typing import NDArray
 from pydantic import PositiveInt
 
 from recorders.errors import BadInput, choices
-from recorders.log import Schema, Topic, make_stream, schemas
+from recorders.log import Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.engine import Bound, Estimator, Recursive
-from replay.estimators.vehicle_association import (
-    MISSED,
-    Hypotheses,
-    Scanning,
-    all_maps,
-    best_maps,
-    log_likelihoods,
+from replay.estimators.vehicle_association import MISSED, Scanning
+from replay.estimators.vehicle_updates import (
+    FIXES,
+    Setup,
+    put,
+    split_method,
+    update_by_fixes,
+    update_by_pose,
+    update_by_set,
+    update_by_shape,
+    update_by_sums,
+    where,
 )
-from replay.estimators.vehicle_registration import fitted_pose, register
-from replay.estimators.vehicles import (
-    POSE,
-    STATES,
-    Floats,
-    Integers,
-    Joint,
-    Motion,
-    collapse,
-    forget_pose,
-    position_rows,
-    positions,
-    predict,
-    sight_of,
-    topology_measurement,
-    update,
-    update_by_scalar,
-)
-from replay.symmetric_sums import (
-    power_sums,
-    power_sums_at,
-    product_sums,
-    product_sums_at,
-    update_root,
-)
+from replay.estimators.vehicles import STATES, Floats, Integers, Joint, Motion, predict
 
 Booleans = NDArray[np.bool_]
 
-FIXES = {
-    "known": "every vehicle's fixes are known to be its own",
-    "hungarian": "unordered fixes, the most probable map",
-    "set": "unordered fixes, exact collapse over all maps",
-    "axes": "unordered x and unordered y, exact collapse of each: what separate sums of powers tell",
-    "powers": "sums of powers of x and of y, linearised",
-    "unscented-powers": "the same, sampled",
-    "products": "sums of products of x and of y, linearised",
-    "complex": "sums of powers of x + iy, linearised",
-}
-SENSOR = {
-    "": "not used",
-    "topology": "the sum of squared distances between all detections",
-    "registration": "detections from a pose that is another one in every scan",
-    "static": "detections from a pose that stays",
-}
 POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
 FAILED = "the estimate is no longer finite"
 
@@ -82,28 +47,6 @@ class VehiclesParameters(Parameters):
 
     method: str = "hungarian"
     registration_scan: PositiveInt = 13
-
-
-class Setup(NamedTuple):
-    """A bound method: what it is told."""
-
-    name: str
-    fixes: str
-    sensor: str
-    registration_scan: int
-    motion: Motion
-    network: Scanning
-    infrastructure: Scanning
-
-    @property
-    def has_pose(self) -> bool:
-        """Whether the state holds the sensor's pose."""
-        return self.sensor in ("registration", "static")
-
-    @property
-    def states(self) -> int:
-        """How many components the joint state has."""
-        return STATES * self.motion.vehicles + POSE * self.has_pose
 
 
 class Carried(NamedTuple):
@@ -179,12 +122,6 @@ def bind_vehicles(
         scanning_of(topics, "/infrastructure/scan"),
     )
     return setup, tuple(used), tuple(f"/vehicle{number}/prior" for number in numbers)
-
-
-def split_method(method: str) -> tuple[str, str]:
-    """What is done with the fixes, and with the infrastructure sensor: empty where that is not used."""
-    fixes, _, sensor = method.rpartition("-")
-    return (fixes, sensor) if fixes and sensor in SENSOR else (method, "")
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
@@ -304,222 +241,46 @@ def _advance(
     setup: Setup, carried: Carried, frames: Frames, number: int, rows: Integers, results: Results
 ) -> None:
     """Take some runs through one frame: changes their rows of what is carried, and fills the results."""
-    joint = Joint(carried.mean[rows], carried.covariance[rows])
     time_ns = frames.time_ns[rows, number]
-    duration_ns = time_ns - carried.time_ns[rows]
-    for span_ns in np.unique(duration_ns):
-        joint = _where(
-            duration_ns == span_ns, joint, lambda own: predict(setup.motion, own, span_ns * 1e-9)
-        )
+    joint = _predicted(
+        setup, Joint(carried.mean[rows], carried.covariance[rows]), time_ns - carried.time_ns[rows]
+    )
     if setup.fixes == "known":
-        joint = _update_by_fixes(setup, joint, frames.fixes[rows, number], frames.noise[rows, number])
-    elif setup.fixes not in ("hungarian", "set", "axes"):
-        scanned = np.flatnonzero(frames.has_network[rows, number])
-        seen = frames.network[rows[scanned], number]
-        joint = _put(joint, scanned, _update_by_sums(setup, joint.of(scanned), seen))
+        joint = update_by_fixes(setup, joint, frames.fixes[rows, number], frames.noise[rows, number])
     else:
         scanned = np.flatnonzero(frames.has_network[rows, number])
-        own, detection = _update_by_set(setup, joint.of(scanned), frames.network[rows[scanned], number])
-        joint = _put(joint, scanned, own)
-        results.detection[rows[scanned], number] = detection
+        own, seen = joint.of(scanned), frames.network[rows[scanned], number]
+        if setup.uses_sums:
+            joint = put(joint, scanned, update_by_sums(setup, own, seen))
+        else:
+            own, results.detection[rows[scanned], number] = update_by_set(setup, own, seen)
+            joint = put(joint, scanned, own)
     scanned = np.flatnonzero(frames.has_sensor[rows, number])
     if setup.sensor and len(scanned):
-        carried.scans[rows[scanned]] += 1
-        seen = frames.sensor[rows[scanned], number]
+        runs = rows[scanned]
+        own, seen = joint.of(scanned), frames.sensor[runs, number]
+        carried.scans[runs] += 1
         if setup.sensor == "topology":
-            own = _update_by_shape(setup, joint.of(scanned), seen)
+            own = update_by_shape(setup, own, seen)
         else:
-            ready = carried.scans[rows[scanned]] >= setup.registration_scan
-            own, found = _update_by_pose(
-                setup, joint.of(scanned), seen, carried.registered[rows[scanned]], ready
+            may_start = carried.scans[runs] >= setup.registration_scan
+            own, carried.registered[runs] = update_by_pose(
+                setup, own, seen, carried.registered[runs], may_start
             )
-            carried.registered[rows[scanned]] = found
-        joint = _put(joint, scanned, own)
+        joint = put(joint, scanned, own)
     carried.mean[rows], carried.covariance[rows], carried.time_ns[rows] = *joint, time_ns
-    carried.failed[rows] = ~np.isfinite(joint.mean.sum(axis=1) + joint.covariance.sum(axis=(1, 2)))
-    well = ~carried.failed[rows]
+    well = np.isfinite(joint.mean.sum(axis=1) + joint.covariance.sum(axis=(1, 2)))
+    carried.failed[rows] = ~well
     results.mean[rows[well], number] = joint.mean[well]
     results.covariance[rows[well], number] = joint.covariance[well]
 
 
-def _put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
-    """The joint states with those of some rows changed."""
-    if len(rows) == len(joint.mean):
-        return changed
-    mean, covariance = joint.mean.copy(), joint.covariance.copy()
-    mean[rows], covariance[rows] = changed
-    return Joint(mean, covariance)
-
-
-def _where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """The joint states, changed where chosen."""
-    rows = np.flatnonzero(chosen)
-    return _put(joint, rows, change(joint.of(rows))) if len(rows) else joint
-
-
-def _update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) -> Joint:
-    """Fixes (runs, vehicles, 2) of known vehicles; NaN where one is missing."""
-    vehicles = setup.motion.vehicles
-    innovation = (fixes - positions(setup.motion, joint.mean)).reshape(-1, 2 * vehicles)
-    spread = np.zeros((len(fixes), vehicles, 2, vehicles, 2))
-    spread[:, np.arange(vehicles), :, np.arange(vehicles), :] = np.moveaxis(noise, 0, 1)
-    matrices = spread.reshape(-1, 2 * vehicles, 2 * vehicles)
-    return update(joint, position_rows(vehicles, setup.states), innovation, matrices)
-
-
-def _update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Integers]:
-    """Unordered fixes (runs, detections, 2), and the best map of them where there is one for both axes."""
-    vehicles = setup.motion.vehicles
-    for axes in ((0,), (1,)) if setup.fixes == "axes" else ((0, 1),):
-        rows = position_rows(vehicles, setup.states, axes)
-        predicted = (joint.mean @ rows.T).reshape(-1, vehicles, len(axes))
-        noise = setup.network.variance_m2 * np.ones(vehicles * len(axes))
-        spread = rows @ joint.covariance @ rows.T + np.diag(noise)
-        places = detections[..., axes]
-        likelihood = log_likelihoods(predicted, blocks_of(spread, vehicles), places)
-        maps = (best_maps if setup.fixes == "hungarian" else all_maps)(likelihood, setup.network)
-        joint = collapse(joint, rows, innovations_of(maps, predicted, places), noise, maps)
-    detection = np.full((len(joint.mean), vehicles), MISSED)
-    if setup.fixes == "hungarian":
-        detection = maps.detection
-    return joint, detection
-
-
-def _update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
-    """Symmetric sums of full scans (runs, detections, 2); others have no such sums and tell nothing.
-
-    Sums of numbers less their expected mean are linear combinations of the sums themselves, with other
-    numbers of digits lost.
-    """
-    vehicles, states = setup.motion.vehicles, setup.states
-    full = np.flatnonzero(np.isfinite(detections[..., 0]).sum(axis=1) == vehicles)
-    own, places = joint.of(full), detections[full, :vehicles]
-    sigma = float(np.sqrt(setup.network.variance_m2))
-    if setup.fixes == "complex":
-        combinations = [
-            position_rows(vehicles, states, (0,)) + 1j * position_rows(vehicles, states, (1,))
-        ]
-        numbers = [places @ np.array([1.0, 1j])]
-    else:
-        combinations = [position_rows(vehicles, states, (axis,)) for axis in (0, 1)]
-        numbers = [places[..., axis] for axis in (0, 1)]
-    measure, expect = (
-        (lambda m: product_sums(m), product_sums_at)
-        if setup.fixes == "products"
-        else (lambda m: power_sums(m, sigma), power_sums_at)
-    )
-    for rows, m in zip(combinations, numbers, strict=True):
-        root = _root(own.covariance)
-        p = own.mean @ rows.T
-        middle = p.mean(axis=1, keepdims=True)
-        pseudo = expect(p - middle, sigma)
-        expected, measured = pseudo.expected, pseudo.jacobian @ (rows @ root)
-        if setup.fixes == "unscented-powers":
-            root = np.concatenate([root, -root], axis=2) * np.sqrt(0.5)
-            steps = np.sqrt(2.0 * states) * np.swapaxes(rows @ root, 1, 2)
-            samples = expect((p - middle)[:, None] + steps, sigma).expected
-            expected = samples.mean(axis=1)
-            measured = np.swapaxes(samples - expected[:, None], 1, 2) / np.sqrt(2.0 * states)
-        innovation = measure(m - middle) - expected
-        mean, root = update_root(own.mean, root, measured, innovation, pseudo.factor)
-        own = Joint(mean, root @ np.swapaxes(root, 1, 2))
-    return _put(joint, full, own)
-
-
-def _root(covariance: Floats) -> Floats:
-    """Factors X with X X' = covariances that rounding may have made a little indefinite."""
-    try:
-        return np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        values, axes = np.linalg.eigh(np.nan_to_num(covariance))
-        return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[:, None, :])
-
-
-def blocks_of(matrices: Floats, vehicles: int) -> Floats:
-    """The blocks (runs, vehicles, a, a) on the diagonals of matrices (runs, vehicles a, vehicles a)."""
-    size = matrices.shape[-1] // vehicles
-    split = matrices.reshape(-1, vehicles, size, vehicles, size)
-    index = np.arange(vehicles)
-    return np.moveaxis(split[:, index, :, index, :], 0, 1)
-
-
-def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
-    """Detections less predictions, (h, vehicles * axes), in the vehicles' order; NaN where missed."""
-    if places.shape[1] == 0:
-        return np.full((len(maps.run), predicted[0].size), np.nan)
-    chosen = places[maps.run[:, None], maps.detection]
-    innovation = np.where((maps.detection == MISSED)[..., None], np.nan, chosen - predicted[maps.run])
-    return innovation.reshape(len(maps.run), -1)
-
-
-def _update_by_shape(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Topology; scans with another number of detections than vehicles tell nothing."""
-    vehicles = setup.motion.vehicles
-    is_full = np.isfinite(seen[..., 0]).sum(axis=1) == vehicles
-    rows = np.flatnonzero(is_full)
-    if len(rows) == 0:
-        return joint
-    own = joint.of(rows)
-    variance_m2 = setup.infrastructure.variance_m2
-    measured = topology_measurement(setup.motion, own, seen[rows, :vehicles], variance_m2)
-    return _put(joint, rows, update_by_scalar(own, measured))
-
-
-def _update_by_pose(
-    setup: Setup, joint: Joint, seen: Floats, registered: Booleans, ready: Booleans
-) -> tuple[Joint, Booleans]:
-    """Detections (runs, detections, 2) seen from a pose that is found along; which runs have found it."""
-    vehicles = setup.motion.vehicles
-    ordered = np.full((len(seen), vehicles, 2), np.nan)
-    places = positions(setup.motion, joint.mean)
-    fresh = ~registered
-    known = np.flatnonzero(registered)
-    if len(known):
-        ordered[known] = _recognised(setup, joint.of(known), seen[known])
-    is_full = np.isfinite(seen[..., 0]).sum(axis=1) == vehicles
-    unknown = np.flatnonzero(~registered & ready & is_full)
-    if len(unknown):
-        spread = _position_blocks(setup, joint.of(unknown))
-        noise = setup.infrastructure.variance_m2 + 0.5 * np.trace(spread, axis1=2, axis2=3).mean()
-        found = register(places[unknown], seen[unknown, :vehicles], float(noise))
-        clear = unknown[found.is_clear]
-        order = found.detection[found.is_clear]
-        ordered[clear] = np.take_along_axis(seen[clear], order[..., None], 1)
-        registered = registered.copy()
-        registered[clear] = True
-    enough = registered & (np.isfinite(ordered[..., 0]).sum(axis=1) >= 2)
-    forgotten = enough & (fresh | (setup.sensor == "registration"))
-    joint = _where(
-        forgotten,
-        joint,
-        lambda own: forget_pose(own, fitted_pose(places[forgotten], ordered[forgotten])),
-    )
-    rows = np.flatnonzero(enough if setup.sensor == "registration" else registered)
-    if len(rows) == 0:
-        return joint, registered
-    sight = sight_of(setup.motion, joint.of(rows))
-    noise_matrix = setup.infrastructure.variance_m2 * np.eye(2 * vehicles)
-    innovation = ordered[rows].reshape(len(rows), -1) - sight.predicted
-    return _put(joint, rows, update(joint.of(rows), sight.rows, innovation, noise_matrix)), registered
-
-
-def _position_blocks(setup: Setup, joint: Joint) -> Floats:
-    rows = position_rows(setup.motion.vehicles, setup.states)
-    return blocks_of(rows @ joint.covariance @ rows.T, setup.motion.vehicles)
-
-
-def _recognised(setup: Setup, joint: Joint, seen: Floats) -> Floats:
-    """The detections (runs, vehicles, 2) in the vehicles' order, by the pose as it is thought to be."""
-    vehicles = setup.motion.vehicles
-    sight = sight_of(setup.motion, joint)
-    spread = sight.rows @ joint.covariance @ sight.rows.swapaxes(1, 2)
-    spread += setup.infrastructure.variance_m2 * np.eye(2 * vehicles)
-    predicted = sight.predicted.reshape(-1, vehicles, 2)
-    maps = best_maps(log_likelihoods(predicted, blocks_of(spread, vehicles), seen), setup.infrastructure)
-    if seen.shape[1] == 0:
-        return np.full((len(seen), vehicles, 2), np.nan)
-    chosen = np.take_along_axis(seen, np.maximum(maps.detection, 0)[..., None], 1)
-    return np.where((maps.detection == MISSED)[..., None], np.nan, chosen)
+def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
+    """The joint states after so long, (runs,); most often it is as long in all runs."""
+    for span_ns in np.unique(duration_ns):
+        move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
+        joint = where(duration_ns == span_ns, joint, move)
+    return joint
 
 
 def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans) -> Iterator[Ragged]:
