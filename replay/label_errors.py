@@ -28,10 +28,15 @@ def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
     return np.asarray(np.sum((estimates - truths) ** 2, axis=(-2, -1)))
 
 
-def assigned_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """The least summed squared errors (...,) that any labelling of the estimates gives; NaN stays NaN."""
+def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = np.inf) -> Floats:
+    """The least summed squared errors (...,) that any labelling of the estimates gives.
+
+    None counts for more than the squared cutoff: then it is GOSPA (alpha = 2, order 2) squared, since
+    there are as many estimates as truths.
+    """
     count = estimates.shape[-2]
     distance = np.sum((estimates[..., :, None, :] - truths[..., None, :, :]) ** 2, axis=-1)
+    distance = np.minimum(distance, cutoff_m**2)
     flat = distance.reshape(-1, count, count)
     if count > MOST_PERMUTED:
         found = [_least(each) if np.isfinite(each).all() else np.nan for each in flat]

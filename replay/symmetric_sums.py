@@ -51,9 +51,10 @@ def raw_power_sums(m: Numbers) -> Numbers:
 
 
 def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
-    """Expected power sums of numbers p (..., n): W[a, (i, j)] = s^j a! / ((a - j)! sqrt(j!)) p_i^(a - j).
+    """Expected power sums of numbers p (..., n).
 
-    s is sigma, for complex numbers sigma sqrt(2).
+    W[a, (i, j)] = s^j a! / ((a - j)! sqrt(j!)) p_i^(a - j) with s = sigma, for complex numbers
+    sigma sqrt(2).
     """
     n = p.shape[-1]
     s = sigma * np.sqrt(2.0) if np.iscomplexobj(p) else sigma
@@ -111,7 +112,8 @@ def update_root(
     and the new root. Rows are scaled to one first: sums of powers differ by many decades.
 
     Args:
-        mean, root: before.
+        mean: before.
+        root: X before.
         measured: Z (..., m, k), how the measurement changes along the columns of X: H X, or its
             deviations at samples. Complex rows stand for their real and imaginary parts.
         innovation: (..., m).

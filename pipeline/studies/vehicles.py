@@ -4,6 +4,9 @@ Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure 
 the symmetric measurement equation filter", 2016.
 """
 
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -15,6 +18,7 @@ from pipeline.studies.cases import replay_cases
 from pipeline.studies.vehicles_cases import (
     TRACK_BYTES,
     Case,
+    Floats,
     Scores,
     VehiclesOptions,
     bytes_per_step,
@@ -23,6 +27,7 @@ from pipeline.studies.vehicles_cases import (
 from pipeline.studies.vehicles_claims import claims
 from recorders.errors import BadInput
 from replay.estimators.vehicle_bounds import bounds, exact_total_error
+from replay.sources import MemorySource
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -32,7 +37,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         raise BadInput(f"experiment '{experiment.title}': estimator {options.reference} is missing")
     cases: list[Case] = []
     for name, replayed in replay_cases(experiment, setting, options.cases):
-        scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators)
+        scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators, replayed.sets)
         sent = bytes_per_step(replayed.sources, experiment.estimators)
         cases.append(Case(name, replayed.sources, scores, sent))
     few = _few(cases[0], options, setting)
@@ -51,7 +56,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         }
         outcome.figures[f"errors-{case.name}"] = _figure(case)
     outcome.metrics |= _metrics(f"{cases[0].name}-first-{options.few_runs}-runs", few)
-    outcome.input_sha256 = hash_streams([source for case in cases for source in case.sources])  # type: ignore[misc]
+    outcome.input_sha256 = hash_streams(
+        [cast(MemorySource, source) for case in cases for source in case.sources]
+    )
     return outcome
 
 
@@ -65,7 +72,7 @@ def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Sc
     return {options.reference: reference, **scores_of(sources, outputs, options.few)}
 
 
-def _table(case: str, scores: dict[str, Scores]) -> pd.DataFrame:
+def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:
     """Means and medians over the runs of the total error."""
     rows = [
         (
@@ -74,18 +81,25 @@ def _table(case: str, scores: dict[str, Scores]) -> pd.DataFrame:
             len(each.fixed),
             each.failed,
             *(
-                float(average(errors))
+                _known(average, errors)
                 for errors in (each.fixed, each.assigned)
-                for average in (np.nanmean, np.nanmedian)
+                for average in (np.mean, np.median)
             ),
+            _known(np.mean, each.gospa_by_step),
         )
         for label, each in scores.items()
     ]
-    names = ["mean_m", "median_m", "assigned_mean_m", "assigned_median_m"]
+    names = ["mean_m", "median_m", "assigned_mean_m", "assigned_median_m", "gospa_m"]
     return pd.DataFrame(rows, columns=["case", "estimator", "runs", "failed_runs", *names])
 
 
-def _metrics(case: str, scores: dict[str, Scores]) -> dict[str, MetricValue]:
+def _known(average: Callable[[Floats], Any], values: Floats) -> float:
+    """The average of what is known; NaN where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(average(known)) if len(known) else np.nan
+
+
+def _metrics(case: str, scores: Mapping[str, Scores]) -> dict[str, MetricValue]:
     table = _table(case, scores).to_dict("records")
     found: dict[str, MetricValue] = {}
     for row in table:
@@ -94,6 +108,7 @@ def _metrics(case: str, scores: dict[str, Scores]) -> dict[str, MetricValue]:
         found[f"{label}.median_total_error_m.{case}"] = row["median_m"]
         found[f"{label}.assigned_total_error_m.{case}"] = row["assigned_mean_m"]
         found[f"{label}.median_assigned_total_error_m.{case}"] = row["assigned_median_m"]
+        found[f"{label}.gospa_m.{case}"] = row["gospa_m"]
         found[f"{label}.failed_runs.{case}"] = float(row["failed_runs"])
     return found
 
@@ -126,21 +141,30 @@ def _vehicles(case: Case) -> int:
 
 
 def _steps(case: Case) -> pd.DataFrame:
-    """One row per estimator and step: root mean square over the runs of the sum of all vehicles' errors."""
-    parts = [
-        pd.DataFrame(
-            {
-                "case": case.name,
-                "estimator": label,
-                "step": np.arange(1, scores.fixed_by_step.shape[1] + 1),
-                "error_m": np.sqrt(np.nanmean(scores.fixed_by_step, axis=0)),
-                "assigned_error_m": np.sqrt(np.nanmean(scores.assigned_by_step, axis=0)),
-                "assigned_median_m": np.sqrt(np.nanmedian(scores.assigned_by_step, axis=0)),
-            }
+    """One row per estimator and step: all vehicles' error together, root mean square over the runs."""
+    columns = [
+        "case",
+        "estimator",
+        "step",
+        "error_m",
+        "assigned_error_m",
+        "assigned_median_m",
+        "gospa_m",
+    ]
+    rows = [
+        (
+            case.name,
+            label,
+            step + 1,
+            np.sqrt(_known(np.mean, scores.fixed_by_step[:, step])),
+            np.sqrt(_known(np.mean, scores.assigned_by_step[:, step])),
+            np.sqrt(_known(np.median, scores.assigned_by_step[:, step])),
+            _known(np.mean, scores.gospa_by_step[:, step]),
         )
         for label, scores in case.scores.items()
+        for step in range(scores.fixed_by_step.shape[1])
     ]
-    return pd.concat(parts)
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _figure(case: Case) -> Figure:

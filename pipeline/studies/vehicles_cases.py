@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from recorders.parameters import Parameters
 from recorders.simulators.vehicles import VehiclesParameters
@@ -13,6 +15,7 @@ from replay.blocks import Ragged
 from replay.estimators.vehicle_streams import vehicle_numbers
 from replay.estimators.vehicle_updates import split_method
 from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
+from replay.set_errors import CUTOFF_M, SetErrors
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
@@ -38,18 +41,21 @@ class VehiclesOptions(Parameters):
 class Scores(NamedTuple):
     """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
 
-    By step the squared errors (runs, steps); `failed` counts runs that did not reach the end.
+    By step the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps); `failed` counts runs that
+    did not reach the end. Sets have no labels: NaN.
     """
 
     fixed: Floats
     assigned: Floats
     fixed_by_step: Floats
     assigned_by_step: Floats
+    gospa_by_step: Floats
     failed: int
 
     def of_first(self, runs: int) -> "Scores":
         """The scores of the first runs."""
-        return Scores(*(part[:runs] for part in self[:4]), self.failed)
+        by_step = (self.fixed_by_step, self.assigned_by_step, self.gospa_by_step)
+        return _scores(*(part[:runs] for part in by_step))
 
 
 class Case(NamedTuple):
@@ -99,21 +105,51 @@ def estimates_of(outputs: Mapping[str, Ragged], label: str, times_ns: NDArray[np
 
 def score(estimates: Floats, truths: Floats) -> Scores:
     """Total errors of estimated places (runs, steps, vehicles, 2)."""
-    return _scores(fixed_squared_error(estimates, truths), assigned_squared_error(estimates, truths))
+    return _scores(
+        fixed_squared_error(estimates, truths),
+        assigned_squared_error(estimates, truths),
+        np.sqrt(assigned_squared_error(estimates, truths, CUTOFF_M)),
+    )
 
 
-def _scores(fixed: Floats, assigned: Floats) -> Scores:
-    """Of squared errors by run and step."""
-    failed = int(np.isnan(fixed).any(axis=1).sum())
-    return Scores(total_error(fixed), total_error(assigned), fixed, assigned, failed)
+def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
+    """Of squared errors and GOSPA by run and step."""
+    failed = int(np.isnan(assigned).any(axis=1).sum())
+    return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
+
+
+def score_set(outputs: Mapping[str, Ragged], found: SetErrors, truths: Floats) -> Scores:
+    """Total errors of a set estimate; a vehicle without an element of its own takes the nearest."""
+    topic = f"/estimates/{found.estimator}/{found.case}"
+    sizes, elements = outputs[f"{topic}/set"], outputs[f"{topic}/element"]
+    assigned = np.full(truths.shape[:2], np.nan)
+    for run in range(len(truths)):
+        ends = np.cumsum(sizes.of_run(run)["elements"].astype(np.int64))
+        places = elements.of_run(run)["mean"][:, 0::2]
+        for step, (begin, end) in enumerate(zip(np.append(0, ends[:-1]), ends, strict=True)):
+            if begin < end:
+                squared = cdist(truths[run, step], places[begin:end], "sqeuclidean")
+                often = -(-len(squared) // squared.shape[1])
+                pairs = linear_sum_assignment(np.tile(squared, often))
+                assigned[run, step] = np.tile(squared, often)[pairs].sum()
+    return _scores(np.full_like(assigned, np.nan), assigned, found.gospa.reshape(assigned.shape))
 
 
 def scores_of(
-    sources: Sequence[Source], outputs: Mapping[str, Ragged], labels: Iterable[str]
+    sources: Sequence[Source],
+    outputs: Mapping[str, Ragged],
+    labels: Iterable[str],
+    sets: Sequence[SetErrors] = (),
 ) -> dict[str, Scores]:
-    """The scores of all estimators of the runs."""
+    """The scores of all estimators of the runs; those of sets by the network's fixes."""
     times_ns, truths = truths_of(sources)
-    return {label: score(estimates_of(outputs, label, times_ns), truths) for label in labels}
+    of_sets = {each.estimator: each for each in sets if each.case == "network"}
+    return {
+        label: score_set(outputs, of_sets[label], truths)
+        if label in of_sets
+        else score(estimates_of(outputs, label, times_ns), truths)
+        for label in labels
+    }
 
 
 def bytes_per_step(

@@ -1,4 +1,4 @@
-"""Vehicles tell a network where they are, and an infrastructure sensor sees them, nobody knows from where.
+"""Vehicles tell a network where they are, and a sensor by the road sees them, nobody knows from where.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on
@@ -273,20 +273,22 @@ def _fix_streams(
     for index in range(fixes.shape[1]):
         rows = told[:, index]
         places = fixes[rows, index]
-        clocks = _clocks(parameters.fix, times_s[rows], rng)
+        published, logged = _clocks(parameters.fix, times_s[rows], rng)
         latitude, longitude, _ = out_of_tangent_plane(places.T, parameters.origin_deg)
         streams += [
             make_stream(
                 f"/vehicle{index + 1}/fix",
                 schemas.POSITION_FIX,
-                **clocks,
+                published,
+                log_time_ns=logged,
                 position_m=places,
                 covariance_m2=np.repeat(covariance, len(places), axis=0),
             ),
             make_stream(
                 f"/vehicle{index + 1}/geodetic_fix",
                 schemas.GEODETIC_FIX,
-                **clocks,
+                published,
+                log_time_ns=logged,
                 latitude_deg=latitude,
                 longitude_deg=longitude,
                 altitude_m=np.zeros(len(places)),
@@ -304,7 +306,7 @@ def _scan_streams(
     rng: np.random.Generator,
 ) -> list[Stream]:
     """Scans with their counts, and their detections; the channels state what a filter must know."""
-    clocks = _clocks(sensor, times_s, rng)
+    published, logged = _clocks(sensor, times_s, rng)
     scan = np.repeat(np.arange(len(times_s)), detections.counts)
     variance_m2 = (sensor if isinstance(sensor, Infrastructure) else parameters.fix).variance_m2
     stated = {
@@ -316,7 +318,8 @@ def _scan_streams(
         make_stream(
             f"{prefix}/scan",
             schemas.SCAN,
-            **clocks,
+            published,
+            log_time_ns=logged,
             metadata=stated,
             scan_id=np.arange(len(times_s)),
             detections=detections.counts,
@@ -324,7 +327,8 @@ def _scan_streams(
         make_stream(
             f"{prefix}/detection",
             schemas.DETECTION,
-            **{name: clock[scan] for name, clock in clocks.items()},
+            published[scan],
+            log_time_ns=logged[scan],
             metadata=stated,
             scan_id=scan,
             position_m=detections.places,
@@ -332,9 +336,10 @@ def _scan_streams(
     ]
 
 
-def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> dict[str, Integers]:
+def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple[Integers, Integers]:
+    """When messages are published, and when they reach the recorder."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
-    return {"publish_time_ns": _stamps(times_s), "log_time_ns": _stamps(times_s + delay_s)}
+    return _stamps(times_s), _stamps(times_s + delay_s)
 
 
 VEHICLES = Simulator(

@@ -140,7 +140,8 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
 def log_permanents(logs: Floats) -> Floats:
     """The logarithms of the permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
 
-    Row by row over the sets of columns that are taken, n 2^(n-1) products of positive numbers each.
+    Row by row over the sets of columns that are taken, n 2^(n-1) products of positive numbers each. A
+    permanent too small for a number is that of its greatest term.
     """
     n = logs.shape[-1]
     greatest = np.max(logs, axis=-1, keepdims=True)
@@ -157,4 +158,8 @@ def log_permanents(logs: Floats) -> Floats:
             )
         partial = extended
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(partial[..., -1]) + greatest[..., 0].sum(axis=-1))
+        found = np.asarray(np.log(partial[..., -1]) + greatest[..., 0].sum(axis=-1))
+    for index in np.argwhere(np.isneginf(found)):
+        rows = logs[tuple(index)]
+        found[tuple(index)] = rows[linear_sum_assignment(-rows)].sum()
+    return found

@@ -1,4 +1,4 @@
-"""What vehicles' total error comes to without simulation: exact for the Kalman filter, bounds for others.
+"""What vehicles' total error comes to: exact for the Kalman filter, bounds for what uses more.
 
 All axes of all vehicles are alike and uncoupled, so everything follows from one axis. The filter
 supposes accelerations; the truth has them (stochastic) or none (deterministic).
@@ -48,7 +48,7 @@ def follow_axis(
         covariance = keep @ covariance
         error = keep @ transition @ error @ transition.T @ keep.T + variance_m2 * np.outer(gain, gain)
         squared[:, step] = covariance[0, 0], error[0, 0]
-    return Axis(*squared, gain)
+    return Axis(squared[0], squared[1], gain)
 
 
 class Bounds(NamedTuple):
@@ -65,7 +65,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """The least total errors; topology is one combination, the shape seen from anywhere all but three."""
+    """The least total errors; topology is one combination, a shape seen from anywhere all but three."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

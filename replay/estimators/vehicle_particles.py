@@ -1,10 +1,10 @@
 """Particle filters of cooperative vehicles with unordered fixes.
 
-Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric measurement
-equation filter", 2016 (a bootstrap filter on sums of powers: their exact likelihood is a permanent for
-each axis); Doucet, de Freitas, Murphy, Russell, "Rao-Blackwellised particle filtering", UAI 2000 (here
-associations are drawn and vehicles filtered). A method is named `KIND-PARTICLES` or
-`KIND-PARTICLES-topology`, as in `vehicle-particles:axes-1000-topology`.
+Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric
+measurement equation filter", 2016 (a bootstrap filter on sums of powers: their exact likelihood is a
+permanent for each axis); Doucet, de Freitas, Murphy, Russell, "Rao-Blackwellised particle filtering for
+dynamic Bayesian networks", UAI 2000 (here associations are drawn and vehicles filtered). A method is
+named `KIND-PARTICLES` or `KIND-PARTICLES-topology`, as in `vehicle-particles:axes-1000-topology`.
 """
 
 import copy
@@ -178,7 +178,8 @@ def _generator(
     """A run's own random stream, the same whatever other runs there are; starts are drawn at first."""
     found = cloud.generators[run]
     if found is None:
-        words = np.ascontiguousarray(frames.network[run, number]).view(np.uint32)
+        seen = frames.network[run, number]
+        words = np.ascontiguousarray(seen[np.isfinite(seen)]).view(np.uint32)
         found = np.random.default_rng([method.seed, *words.ravel().tolist()])
         cloud.generators[run] = found
         if method.kind != "associations":

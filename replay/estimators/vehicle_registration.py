@@ -38,9 +38,9 @@ class Registration(NamedTuple):
 def register(places: Floats, detections: Floats, variance_m2: float) -> Registration:
     """The pose that lays full scans (runs, vehicles, 2) best on places (runs, vehicles, 2), any order.
 
-    It is not clear where even the best fits badly (something else was taken for a vehicle), another order
-    fits nearly as well, or the vehicles are too close together. `variance_m2` is that of a place and a
-    detection together. Raises BadInput for too many vehicles.
+    It is not clear where even the best fits badly (something else was taken for a vehicle), another
+    order fits nearly as well, or the vehicles are too close together. `variance_m2` is that of a place
+    and a detection together. Raises BadInput for too many vehicles.
     """
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
@@ -49,12 +49,13 @@ def register(places: Floats, detections: Floats, variance_m2: float) -> Registra
         )
     order = _permutations(vehicles)
     there, seen = _centred(places), _centred(detections)
-    fit = 2.0 * np.abs(np.einsum("rv,rpv->rp", there, seen[:, order].conj())) / variance_m2
+    products = np.einsum("rv,rpv->rp", there, seen[:, order].conj())
+    fit: Floats = np.asarray(2.0 * np.abs(products) / variance_m2)
     detection = order[fit.argmax(axis=1)]
     pose = fitted_pose(places, np.take_along_axis(detections, detection[..., None], 1))
     if vehicles < 2:
         return Registration(pose, detection, np.zeros(len(fit), bool))
-    squared = np.sum(np.abs(there) ** 2, axis=1) / variance_m2
+    squared: Floats = np.asarray(np.sum(np.abs(there) ** 2, axis=1) / variance_m2)
     residual = squared + np.sum(np.abs(seen) ** 2, axis=1) / variance_m2 - fit.max(axis=1)
     second, first = np.partition(fit, -2, axis=1)[:, -2:].T
     is_clear = (
@@ -70,7 +71,7 @@ def fitted_pose(places: Floats, detections: Floats) -> Floats:
 
     Pairs where either is NaN are left out.
     """
-    missing = np.isnan(places + detections).any(axis=2)[..., None]
+    missing = np.any(np.isnan(places + detections), axis=2, keepdims=True)
     places, detections = np.where(missing, np.nan, places), np.where(missing, np.nan, detections)
     product = np.nansum(_centred(places) * _centred(detections).conj(), axis=1)
     heading = np.angle(product)

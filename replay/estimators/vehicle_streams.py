@@ -103,7 +103,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
 def bind_vehicles(
     name: str, topics: Mapping[str, Topic], fixes: str, sensor: str, registration_scan: int
 ) -> tuple[Setup, tuple[str, ...], tuple[str, ...]] | None:
-    """What a method is told by a log, the topics it follows, and the priors; None where one is missing."""
+    """What a method is told, the topics it follows and the priors; None where one is missing."""
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -170,8 +170,8 @@ def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
         if np.any(np.linalg.eigvalsh(covariance[:, own, own])[:, 0] <= 0):
             raise BadInput(f"topic {topic}: the prior's covariance is not positive definite")
     time_ns = prior.stream.publish_time_ns[first]
-    no = np.zeros(runs, bool)
-    return Carried(mean, covariance, time_ns, np.zeros(runs, np.int64), no, no)
+    registered, failed = np.zeros((2, runs), bool)
+    return Carried(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
 
 
 def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Ragged]]:

@@ -121,7 +121,7 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
 
 
 def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Integers]:
-    """Unordered fixes (runs, detections, 2), and the best map of them where there is one for both axes."""
+    """Unordered fixes (runs, detections, 2), and the map of them where a single one is used."""
     vehicles = setup.motion.vehicles
     for axes in ((0,), (1,)) if setup.fixes == "axes" else ((0, 1),):
         rows = position_rows(vehicles, setup.states, axes)
@@ -177,7 +177,7 @@ def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
 def _root(covariance: Floats) -> Floats:
     """Factors X with X X' = covariances that rounding may have made a little indefinite."""
     try:
-        return np.linalg.cholesky(covariance)
+        return np.asarray(np.linalg.cholesky(covariance), np.float64)
     except np.linalg.LinAlgError:
         values, axes = np.linalg.eigh(np.nan_to_num(covariance))
         return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[:, None, :])
@@ -201,11 +201,10 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
 
 
 def update_by_shape(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Topology; scans with another number of detections than vehicles tell nothing."""
+    """Topology; scans with another number of detections than vehicles tell nothing, nor does a point."""
     vehicles = setup.motion.vehicles
-    is_full = np.isfinite(seen[..., 0]).sum(axis=1) == vehicles
-    rows = np.flatnonzero(is_full)
-    if len(rows) == 0:
+    rows = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=1) == vehicles)
+    if vehicles < 2 or len(rows) == 0:
         return joint
     own = joint.of(rows)
     variance_m2 = setup.infrastructure.variance_m2

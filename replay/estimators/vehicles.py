@@ -94,10 +94,11 @@ def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
     """Kalman's gain for measurement matrices (m, n) or (runs, m, n) and noises (runs, m, m)."""
     cross = covariance @ rows.swapaxes(-1, -2)
     innovation = rows @ cross + noise
-    inverse = np.linalg.inv(innovation)
+    inverse: Floats = np.asarray(np.linalg.inv(innovation), np.float64)
     gain = cross @ inverse
     after = covariance - gain @ cross.swapaxes(1, 2)
-    return Gain(inverse, np.linalg.slogdet(innovation)[1], gain, 0.5 * (after + after.swapaxes(1, 2)))
+    log_determinant = np.asarray(np.linalg.slogdet(innovation)[1], np.float64)
+    return Gain(inverse, log_determinant, gain, 0.5 * (after + after.swapaxes(1, 2)))
 
 
 def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joint:

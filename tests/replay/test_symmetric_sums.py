@@ -110,7 +110,7 @@ def test_root_update_equals_kalman_s() -> None:
 
 
 def test_sums_of_equal_multisets_are_equal() -> None:
-    """Symmetric functions do not see the order; complex sums tell pairings apart, separate ones do not."""
+    """Symmetric functions do not see the order; complex sums tell pairings apart, others do not."""
     rng = np.random.default_rng(5)
     x, y = rng.normal(size=(2, 5))
     other = y[[1, 0, 2, 3, 4]]
