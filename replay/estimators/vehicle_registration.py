@@ -35,12 +35,12 @@ class Registration(NamedTuple):
     is_clear: NDArray[np.bool_]
 
 
-def register(places: Floats, detections: Floats, variance_m2: float) -> Registration:
+def register(places: Floats, detections: Floats, variance_m2: Floats | float) -> Registration:
     """The pose that lays full scans (runs, vehicles, 2) best on places (runs, vehicles, 2), any order.
 
     It is not clear where even the best fits badly (something else was taken for a vehicle), another
-    order fits nearly as well, or the vehicles are too close together. `variance_m2` is that of a place
-    and a detection together. Raises BadInput for too many vehicles.
+    order fits nearly as well, or the vehicles are too close together. `variance_m2` (runs,) is that of a
+    place and a detection together. Raises BadInput for too many vehicles.
     """
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
@@ -50,20 +50,35 @@ def register(places: Floats, detections: Floats, variance_m2: float) -> Registra
     order = _permutations(vehicles)
     there, seen = _centred(places), _centred(detections)
     products = np.einsum("rv,rpv->rp", there, seen[:, order].conj())
-    fit: Floats = np.asarray(2.0 * np.abs(products) / variance_m2)
+    variance = np.broadcast_to(variance_m2, len(places))
+    fit: Floats = np.asarray(2.0 * np.abs(products) / variance[:, None])
     detection = order[fit.argmax(axis=1)]
     pose = fitted_pose(places, np.take_along_axis(detections, detection[..., None], 1))
     if vehicles < 2:
         return Registration(pose, detection, np.zeros(len(fit), bool))
-    squared: Floats = np.asarray(np.sum(np.abs(there) ** 2, axis=1) / variance_m2)
-    residual = squared + np.sum(np.abs(seen) ** 2, axis=1) / variance_m2 - fit.max(axis=1)
+    squared: Floats = np.asarray(np.sum(np.abs(there) ** 2, axis=1) / variance)
+    residual = squared + np.sum(np.abs(seen) ** 2, axis=1) / variance - fit.max(axis=1)
     second, first = np.partition(fit, -2, axis=1)[:, -2:].T
     is_clear = (
         (residual < chi2.isf(IMPROBABLE, 2 * vehicles - 3))
         & (first - second > LEAST_LEAD)
-        & (squared > vehicles * LEAST_SPREAD**2)
+        & is_spread(detections, variance)
     )
     return Registration(pose, detection, is_clear)
+
+
+def is_spread(detections: Floats, variance_m2: Floats | float) -> NDArray[np.bool_]:
+    """Whether detections (runs, vehicles, 2), NaN for none, are far enough apart to tell a heading."""
+    count = np.isfinite(detections[..., 0]).sum(axis=1)
+    squared = np.nansum((detections - _middle(detections)) ** 2, axis=(1, 2))
+    return np.asarray((count > 1) & (squared > count * LEAST_SPREAD**2 * variance_m2))
+
+
+def _middle(places: Floats) -> Floats:
+    """The means (runs, 1, 2) of what is there of places (runs, vehicles, 2); zero for nothing."""
+    there = np.isfinite(places)
+    count = np.maximum(there.sum(axis=1, keepdims=True), 1)
+    return np.asarray(np.where(there, places, 0.0).sum(axis=1, keepdims=True) / count)
 
 
 def fitted_pose(places: Floats, detections: Floats) -> Floats:
@@ -73,17 +88,15 @@ def fitted_pose(places: Floats, detections: Floats) -> Floats:
     """
     missing = np.any(np.isnan(places + detections), axis=2, keepdims=True)
     places, detections = np.where(missing, np.nan, places), np.where(missing, np.nan, detections)
-    product = np.nansum(_centred(places) * _centred(detections).conj(), axis=1)
-    heading = np.angle(product)
-    middle = np.nanmean(detections @ [1.0, 1j], axis=1)
-    place = np.nanmean(places @ [1.0, 1j], axis=1) - np.exp(1j * heading) * middle
+    heading = np.angle(np.nansum(_centred(places) * _centred(detections).conj(), axis=1))
+    middle = np.stack([_middle(places)[:, 0], _middle(detections)[:, 0]]) @ np.array([1.0, 1j])
+    place = middle[0] - np.exp(1j * heading) * middle[1]
     return np.stack([place.real, place.imag, heading], axis=1)
 
 
 def _centred(places: Floats) -> NDArray[np.complex128]:
     """Places (runs, vehicles, 2) about their mean, as complex numbers."""
-    numbers = places @ np.array([1.0, 1j])
-    return np.asarray(numbers - np.nanmean(numbers, axis=1, keepdims=True))
+    return np.asarray((places - _middle(places)) @ np.array([1.0, 1j]))
 
 
 @lru_cache(maxsize=MOST_VEHICLES)

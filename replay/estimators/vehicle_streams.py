@@ -30,8 +30,8 @@ from replay.estimators.vehicle_updates import (
     update_by_fixes,
     update_by_pose,
     update_by_set,
-    update_by_shape,
     update_by_sums,
+    update_by_topology,
     where,
 )
 from replay.estimators.vehicles import STATES, Floats, Integers, Joint, Motion, predict
@@ -261,7 +261,7 @@ def _advance(
         own, seen = joint.of(scanned), frames.sensor[runs, number]
         carried.scans[runs] += 1
         if setup.sensor == "topology":
-            own = update_by_shape(setup, own, seen)
+            own = update_by_topology(setup, own, seen)
         else:
             may_start = carried.scans[runs] >= setup.registration_scan
             own, carried.registered[runs] = update_by_pose(

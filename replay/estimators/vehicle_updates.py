@@ -17,7 +17,7 @@ from replay.estimators.vehicle_association import (
     best_maps,
     log_likelihoods,
 )
-from replay.estimators.vehicle_registration import fitted_pose, register
+from replay.estimators.vehicle_registration import fitted_pose, is_spread, register
 from replay.estimators.vehicles import (
     POSE,
     STATES,
@@ -26,13 +26,13 @@ from replay.estimators.vehicles import (
     Joint,
     Motion,
     collapse,
-    forget_pose,
     position_rows,
     positions,
     sight_of,
     topology_measurement,
     update,
     update_by_scalar,
+    update_by_shape,
 )
 from replay.symmetric_sums import (
     power_sums,
@@ -200,7 +200,7 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
     return innovation.reshape(len(maps.run), -1)
 
 
-def update_by_shape(setup: Setup, joint: Joint, seen: Floats) -> Joint:
+def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
     """Topology; scans with another number of detections than vehicles tell nothing, nor does a point."""
     vehicles = setup.motion.vehicles
     rows = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=1) == vehicles)
@@ -230,25 +230,26 @@ def update_by_pose(
     unknown = np.flatnonzero(~registered & may_start & is_full)
     if len(unknown):
         spread = _position_blocks(setup, joint.of(unknown))
-        noise = setup.infrastructure.variance_m2 + 0.5 * np.trace(spread, axis1=2, axis2=3).mean()
-        found = register(places[unknown], seen[unknown, :vehicles], float(noise))
+        noise = setup.infrastructure.variance_m2 + 0.5 * np.trace(spread, axis1=2, axis2=3).mean(axis=1)
+        found = register(places[unknown], seen[unknown, :vehicles], noise)
         clear = unknown[found.is_clear]
         order = found.detection[found.is_clear]
         ordered[clear] = np.take_along_axis(seen[clear], order[..., None], 1)
     fresh = ~registered & np.isfinite(ordered).any(axis=(1, 2))
     changes = setup.sensor == "registration"
-    enough = np.isfinite(ordered[..., 0]).sum(axis=1) >= 2
-    anew = np.flatnonzero(fresh | (registered & enough & changes))
+    variance_m2 = setup.infrastructure.variance_m2
+    anew = np.flatnonzero(fresh | (registered & changes & is_spread(ordered, variance_m2)))
     if len(anew):
         pose = fitted_pose(places[anew], ordered[anew])
-        joint = put(joint, anew, forget_pose(joint.of(anew), pose))
-    used = anew if changes else np.flatnonzero(registered | fresh)
-    if len(used):
-        own = joint.of(used)
+        own = update_by_shape(setup.motion, joint.of(anew), pose, ordered[anew], variance_m2)
+        joint = put(joint, anew, own)
+    stays = np.flatnonzero(registered & (not changes))
+    if len(stays):
+        own = joint.of(stays)
         sight = sight_of(setup.motion, own)
-        noises = setup.infrastructure.variance_m2 * np.eye(2 * vehicles)
-        innovation = ordered[used].reshape(len(used), -1) - sight.predicted
-        joint = put(joint, used, update(own, sight.rows, innovation, noises))
+        innovation = ordered[stays].reshape(len(stays), -1) - sight.predicted
+        own = update(own, sight.rows, innovation, variance_m2 * np.eye(2 * vehicles))
+        joint = put(joint, stays, own)
     return joint, registered | fresh
 
 

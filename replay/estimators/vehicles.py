@@ -22,8 +22,6 @@ STATES = 4  # of a vehicle
 POSE = 3  # components of the sensor's pose
 # A topology so improbable, chi-square with one degree of freedom, is of other things than the vehicles.
 TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
-# How little is known of a sensor's pose before it is estimated.
-UNKNOWN_POSE_VARIANCE = np.array([1e6, 1e6, 10.0])
 
 
 class Joint(NamedTuple):
@@ -276,11 +274,39 @@ def sight_of(motion: Motion, joint: Joint) -> Sight:
     return Sight(seen.reshape(len(seen), -1), rows.reshape(len(seen), 2 * count, states))
 
 
-def forget_pose(joint: Joint, pose: Floats) -> Joint:
-    """The joint state with a pose (runs, 3) about which nothing is known but where to linearise."""
-    mean, covariance = joint.mean.copy(), joint.covariance.copy()
+def update_by_shape(
+    motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
+) -> Joint:
+    """What a sensor sees (runs, vehicles, 2) from a pose of which nothing is known before.
+
+    `pose` (runs, 3) is only where to linearise; NaN was not seen. What any change of the pose would
+    change is left out of the update of the vehicles; then the pose follows from them.
+    """
+    own = slice(0, STATES * motion.vehicles)
+    mean = joint.mean.copy()
     mean[:, -POSE:] = pose
-    covariance[:, -POSE:, :] = 0.0
-    covariance[:, :, -POSE:] = 0.0
-    covariance[:, -POSE:, -POSE:] = np.diag(UNKNOWN_POSE_VARIANCE)
-    return Joint(mean, covariance)
+    sight = sight_of(motion, Joint(mean, joint.covariance))
+    innovation = seen.reshape(len(seen), -1) - sight.predicted
+    there = np.isfinite(innovation)
+    innovation = np.where(there, innovation, 0.0)
+    rows = np.where(there[..., None], sight.rows, 0.0)
+    by_place, by_pose = rows[..., own], rows[..., -POSE:]
+    turned, triangle = np.linalg.qr(by_pose, mode="complete")
+    shape = np.swapaxes(turned[..., POSE:], 1, 2)
+    solve = np.linalg.solve(triangle[:, :POSE], np.swapaxes(turned[..., :POSE], 1, 2))
+    vehicles = update(
+        Joint(mean[:, own], joint.covariance[:, own, own]),
+        shape @ by_place,
+        (shape @ innovation[..., None])[..., 0],
+        variance_m2 * np.eye(shape.shape[1]),
+    )
+    shift = (vehicles.mean - mean[:, own])[..., None]
+    follows = -solve @ by_place
+    cross = vehicles.covariance @ np.swapaxes(follows, 1, 2)
+    covariance = np.empty_like(joint.covariance)
+    covariance[:, own, own] = vehicles.covariance
+    covariance[:, own, -POSE:] = cross
+    covariance[:, -POSE:, own] = np.swapaxes(cross, 1, 2)
+    covariance[:, -POSE:, -POSE:] = follows @ cross + variance_m2 * solve @ np.swapaxes(solve, 1, 2)
+    moved = (solve @ innovation[..., None] + follows @ shift)[..., 0]
+    return Joint(np.concatenate([vehicles.mean, pose + moved], axis=1), covariance)

@@ -36,7 +36,7 @@ def test_a_turn_is_the_paper_s_matrix_and_goes_over_into_a_straight_line() -> No
 
 
 def test_frames_are_inverse_and_the_nominal_vehicles_meet() -> None:
-    """A point into the sensor's frame and back; vehicles 1 and 2, and 4 and 5, are one point at t = 50."""
+    """A point into the sensor's frame and back; vehicles 1 and 2 are one point at t = 50, as 4 and 5."""
     pose, point = (60.0, -40.0, 2.0), np.array([3.0, 7.0])
     assert_allclose(out_of_frame(pose, into_frame(pose, point)), point, atol=1e-12)
     streams = recorded(duration_s=60.0)
