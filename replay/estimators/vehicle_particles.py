@@ -23,7 +23,6 @@ from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import (
-    MISSED,
     all_maps,
     log_likelihoods,
     log_permanents,
@@ -31,9 +30,9 @@ from replay.estimators.vehicle_association import (
 from replay.estimators.vehicle_streams import (
     Carried,
     Frames,
-    Results,
     bind_vehicles,
     frames_of,
+    no_results,
     outputs_of,
     start,
 )
@@ -124,11 +123,7 @@ def _run(setup: Setup, method: Method, before: Cloud, block: Block) -> tuple[Clo
     cloud = copy.deepcopy(before)
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
-    results = Results(
-        np.full((runs, count, setup.states), np.nan),
-        np.full((runs, count, setup.states, setup.states), np.nan),
-        np.full((runs, count, setup.motion.vehicles), MISSED),
-    )
+    results = no_results(setup, runs, count)
     for number in range(count):
         for run in np.flatnonzero(number < frames.counts).tolist():
             _advance(setup, method, cloud, frames, run, number)

@@ -24,6 +24,7 @@ from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import MISSED, Scanning
 from replay.estimators.vehicle_updates import (
     FIXES,
+    Associated,
     Setup,
     put,
     split_method,
@@ -34,11 +35,12 @@ from replay.estimators.vehicle_updates import (
     update_by_topology,
     where,
 )
-from replay.estimators.vehicles import STATES, Floats, Integers, Joint, Motion, predict
+from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
 
 Booleans = NDArray[np.bool_]
 
-POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
+PLACE = ("x_m", "y_m")
+POSE_COMPONENTS = (*PLACE, "heading_rad")
 FAILED = "the estimate is no longer finite"
 
 
@@ -82,11 +84,28 @@ class Frames(NamedTuple):
 
 
 class Results(NamedTuple):
-    """Means (runs, frames, n) and covariances after every frame, the maps (runs, frames, vehicles)."""
+    """Means (runs, frames, n) and covariances after every frame, and maps where single ones are used.
+
+    `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
+    """
 
     mean: Floats
     covariance: Floats
-    detection: Integers
+    associated: Associated
+
+
+def no_results(setup: Setup, runs: int, frames: int) -> Results:
+    """Results that say nothing."""
+    states, vehicles = setup.states, setup.motion.vehicles
+    return Results(
+        np.full((runs, frames, states), np.nan),
+        np.full((runs, frames, states, states), np.nan),
+        Associated(
+            np.full((runs, frames, vehicles), MISSED),
+            np.full((runs, frames, vehicles, 2), np.nan),
+            np.full((runs, frames, vehicles, 2, 2), np.nan),
+        ),
+    )
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> list[Bound]:
@@ -180,11 +199,7 @@ def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Rag
     runs, count = frames.time_ns.shape
     before = carried.failed
     carried = copy.deepcopy(carried)
-    results = Results(
-        np.full((runs, count, setup.states), np.nan),
-        np.full((runs, count, setup.states, setup.states), np.nan),
-        np.full((runs, count, setup.motion.vehicles), MISSED),
-    )
+    results = no_results(setup, runs, count)
     for number in range(count):
         rows = np.flatnonzero((number < frames.counts) & ~carried.failed)
         if len(rows):
@@ -253,8 +268,10 @@ def _advance(
         if setup.uses_sums:
             joint = put(joint, scanned, update_by_sums(setup, own, seen))
         else:
-            own, results.detection[rows[scanned], number] = update_by_set(setup, own, seen)
+            own, associated = update_by_set(setup, own, seen)
             joint = put(joint, scanned, own)
+            for column, found in zip(results.associated, associated or (), strict=False):
+                column[rows[scanned], number] = found
     scanned = np.flatnonzero(frames.has_sensor[rows, number])
     if setup.sensor and len(scanned):
         runs = rows[scanned]
@@ -287,29 +304,50 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     """Every vehicle's estimates, the pose's where it is estimated, and who failed."""
     runs, count = frames.time_ns.shape
     said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
-    offsets = np.concatenate([[0], np.cumsum(said.sum(axis=1))])
-    time_ns, mean, covariance = frames.time_ns[said], results.mean[said], results.covariance[said]
 
-    def gaussians(case: str, names: Sequence[str], own: slice) -> Ragged:
-        values = mean[:, own].copy()
+    def gaussians(case: str, names: Sequence[str], own: slice, told: Booleans) -> Ragged:
+        mean = results.mean[told][:, own]
         angular = [index for index, name in enumerate(names) if name.endswith("_rad")]
-        values[:, angular] = wrap_angle(values[:, angular])
+        mean[:, angular] = wrap_angle(mean[:, angular])
         stream = make_stream(
             f"/estimates/{setup.name}/{case}/state",
             schemas.GAUSSIAN_ESTIMATE,
-            time_ns,
+            frames.time_ns[told],
             metadata=state_metadata(names) | {"truth": f"/{case}/truth"},
-            mean=values,
-            covariance=covariance[:, own, own].reshape(len(values), -1),
+            mean=mean,
+            covariance=results.covariance[told][:, own, own].reshape(len(mean), -1),
         )
-        return Ragged(stream, offsets)
+        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
+
+    def innovations(vehicle: int) -> Ragged:
+        """What was associated with a vehicle; the target is the detection's number in its scan."""
+        detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
+        told = detection != MISSED
+        squared = np.einsum(
+            "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
+        )
+        stream = make_stream(
+            f"/estimates/{setup.name}/vehicle{vehicle + 1}/innovation",
+            schemas.INNOVATION,
+            frames.time_ns[told],
+            metadata=state_metadata(PLACE) | {"truth": ""},
+            target_id=detection[told] + 1,
+            accepted=np.ones(told.sum(), np.int64),
+            innovation=innovation[told],
+            covariance=spread[told].reshape(-1, 4),
+            normalised_innovation_squared=squared,
+        )
+        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
 
     vehicles = setup.motion.vehicles
     for vehicle in range(vehicles):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        yield gaussians(f"vehicle{vehicle + 1}", PLANE_MOTION, own)
+        yield gaussians(f"vehicle{vehicle + 1}", PLANE_MOTION, own, said)
+        if setup.fixes == "hungarian":
+            yield innovations(vehicle)
     if setup.has_pose:
-        yield gaussians("infrastructure", POSE_COMPONENTS, slice(STATES * vehicles, None))
+        is_found = results.covariance[:, :, -1, -1] > 0.0
+        yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
     failed = np.flatnonzero(failing)
     last = np.maximum(said.sum(axis=1), 1) - 1
     stream = make_stream(

@@ -120,22 +120,31 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
     return update(joint, position_rows(vehicles, setup.states), innovation, matrices)
 
 
-def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Integers]:
-    """Unordered fixes (runs, detections, 2), and the map of them where a single one is used."""
+class Associated(NamedTuple):
+    """A single map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
+
+    detection: Integers
+    innovation: Floats
+    covariance: Floats
+
+
+def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Associated | None]:
+    """Unordered fixes (runs, detections, 2), and their map where a single one is used."""
     vehicles = setup.motion.vehicles
+    associated = None
     for axes in ((0,), (1,)) if setup.fixes == "axes" else ((0, 1),):
         rows = position_rows(vehicles, setup.states, axes)
         predicted = (joint.mean @ rows.T).reshape(-1, vehicles, len(axes))
         noise = setup.network.variance_m2 * np.ones(vehicles * len(axes))
-        spread = rows @ joint.covariance @ rows.T + np.diag(noise)
+        spread = blocks_of(rows @ joint.covariance @ rows.T + np.diag(noise), vehicles)
         places = detections[..., axes]
-        likelihood = log_likelihoods(predicted, blocks_of(spread, vehicles), places)
+        likelihood = log_likelihoods(predicted, spread, places)
         maps = (best_maps if setup.fixes == "hungarian" else all_maps)(likelihood, setup.network)
-        joint = collapse(joint, rows, innovations_of(maps, predicted, places), noise, maps)
-    detection = np.full((len(joint.mean), vehicles), MISSED)
-    if setup.fixes == "hungarian":
-        detection = maps.detection
-    return joint, detection
+        innovations = innovations_of(maps, predicted, places)
+        if setup.fixes == "hungarian":
+            associated = Associated(maps.detection, innovations.reshape(predicted.shape), spread)
+        joint = collapse(joint, rows, innovations, noise, maps)
+    return joint, associated
 
 
 def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:

@@ -136,7 +136,7 @@ def _draw_squares(
         canvas.send(f"{plot}/bounds", np.array(ends), band)
         canvas.fix(f"{plot}/bounds", look)
         for _, estimator, time_ns, values in alike:
-            _draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
+            draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
         views.append(plot_view(plot, f"{name} of {degrees} components", (-0.3 * high, 2.5 * high)))
     return views
 
@@ -152,14 +152,15 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSer
             quantity, unit, scale = shown_unit(component)
             plot = entity_path("plots", case, component)
             shown = scale * values[:, column]
-            _draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
+            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
             views[component] = plot_view(plot, f"{quantity.capitalize()} ({unit})")
     return list(views.values())
 
 
-def _draw_curve(
+def draw_curve(
     canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, values: Floats, style: Style
 ) -> None:
+    """One curve of a plot."""
     rows = thin(time_ns)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
     canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
