@@ -55,7 +55,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             for label, value in case.bytes_per_step.items()
         }
         outcome.figures[f"errors-{case.name}"] = _figure(case)
-    outcome.metrics |= _metrics(f"{cases[0].name}-first-{options.few_runs}-runs", few)
+    shown = {label: few[label] for label in (options.reference, *options.few) if label in few}
+    outcome.metrics |= _metrics(f"{cases[0].name}-first-{options.few_runs}-runs", shown)
     outcome.input_sha256 = hash_streams(
         [cast(MemorySource, source) for case in cases for source in case.sources]
     )
@@ -63,13 +64,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _few(case: Case, options: VehiclesOptions, setting: Setting) -> dict[str, Scores]:
-    """The slow estimators' scores in the first runs of a case, and the reference's in the same."""
+    """The slow estimators' scores in the first runs of a case, and the others' in the same."""
     if not options.few or not options.few_runs:
         return {}
     sources = case.sources[: options.few_runs]
     outputs = replay_in_memory(sources, options.few, progress=setting.progress)
-    reference = case.scores[options.reference].of_first(len(sources))
-    return {options.reference: reference, **scores_of(sources, outputs, options.few)}
+    beside = {label: scores.of_first(len(sources)) for label, scores in case.scores.items()}
+    return beside | scores_of(sources, outputs, options.few)
 
 
 def _table(case: str, scores: Mapping[str, Scores]) -> pd.DataFrame:

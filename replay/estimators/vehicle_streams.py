@@ -260,10 +260,10 @@ def _advance(
     joint = _predicted(
         setup, Joint(carried.mean[rows], carried.covariance[rows]), time_ns - carried.time_ns[rows]
     )
+    scanned = np.flatnonzero(frames.has_network[rows, number])
     if setup.fixes == "known":
         joint = update_by_fixes(setup, joint, frames.fixes[rows, number], frames.noise[rows, number])
-    else:
-        scanned = np.flatnonzero(frames.has_network[rows, number])
+    elif len(scanned):
         own, seen = joint.of(scanned), frames.network[rows[scanned], number]
         if setup.uses_sums:
             joint = put(joint, scanned, update_by_sums(setup, own, seen))
@@ -315,7 +315,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
             frames.time_ns[told],
             metadata=state_metadata(names) | {"truth": f"/{case}/truth"},
             mean=mean,
-            covariance=results.covariance[told][:, own, own].reshape(len(mean), -1),
+            covariance=results.covariance[told][:, own, own].reshape(len(mean), len(names) ** 2),
         )
         return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
 

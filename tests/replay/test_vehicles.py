@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.ensemble import record_ensemble, replay_in_memory
 from pipeline.studies.vehicles_cases import Scores, scores_of
 from recorders.errors import BadInput
+from recorders.log import Clock
 from recorders.models.vehicles import into_frame
 from replay.estimators.vehicle_association import (
     Scanning,
@@ -22,6 +23,7 @@ from replay.estimators.vehicle_association import (
 from replay.estimators.vehicle_bounds import bounds, exact_total_error, follow_axis
 from replay.estimators.vehicle_registration import register
 from replay.estimators.vehicles import Joint, collapse, position_rows
+from replay.evaluation import errors_of
 from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
 from replay.set_distances import gospa
 from replay.sources import MemorySource
@@ -234,6 +236,27 @@ def test_difficult_input_is_filtered_to_the_end(values: dict[str, object], metho
     """No failure and no NaN, whatever scans lack or have too much."""
     sources = record_ensemble("vehicles", {"duration_s": 25.0, **values}, 2, 2)
     assert np.isfinite(_last(sources, method)).all()
+
+
+@pytest.mark.parametrize("order", ["publish_time", "arrival_order"])
+def test_rates_delays_and_losses_mixed(order: str) -> None:
+    """Sensors of different rates, late and lossy: every stamp has an estimate near the truth."""
+    late = {"latency_jitter_s": 0.3}
+    values = {
+        "duration_s": 40.0,
+        "fix": {"dropout_probability": 0.2, **late},
+        "network": {"detection_probability": 0.8, **late},
+        "infrastructure": {"rate_hz": 3.0, "latency_s": 0.1},
+    }
+    sources = record_ensemble("vehicles", values, 2, 3)
+    clock: Clock = "publish_time" if order == "publish_time" else "log_time"
+    for method in ("known-static", "set-topology", "hungarian-static"):
+        outputs = replay_in_memory(sources, {"m": {"kind": f"vehicles:{method}"}}, order=clock)
+        errors = errors_of(outputs["/estimates/m/vehicle3/state"], sources, gap_limit_s=2.0)
+        assert errors is not None
+        assert len(errors.error) >= 3 * 120
+        rmse = np.sqrt(np.mean(np.sum(errors.error[:, errors.position] ** 2, axis=1)))
+        assert rmse < (1.5 if order == "publish_time" else 4.0), method
 
 
 def test_methods_that_do_not_exist_are_refused_with_choices() -> None:
