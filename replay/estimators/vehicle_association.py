@@ -140,26 +140,20 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
 def log_permanents(logs: Floats) -> Floats:
     """The logarithms of the permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
 
-    Row by row over the sets of columns that are taken, n 2^(n-1) products of positive numbers each. A
+    The first rows share out every set of so many columns, n 2^(n-1) products of positive numbers. A
     permanent too small for a number is that of its greatest term.
     """
     n = logs.shape[-1]
-    greatest = np.max(logs, axis=-1, keepdims=True)
-    entries = np.exp(logs - greatest)
-    sets = np.arange(1 << n)
-    partial = np.zeros((*logs.shape[:-2], 1 << n))
-    partial[..., 0] = 1.0
-    for row in range(n):
-        extended = np.zeros_like(partial)
-        for column in range(n):
-            without = sets[(sets >> column) & 1 == 0]
-            extended[..., without | (1 << column)] += (
-                partial[..., without] * entries[..., row, column, None]
-            )
-        partial = extended
+    flat = logs.reshape(-1, n, n)
+    greatest = flat.max(axis=2, keepdims=True)
+    entries = np.moveaxis(np.exp(flat - greatest), 0, -1)
+    shared = np.ones((1 << n, len(flat)))  # by set of columns, a bit each
+    for columns in range(1, 1 << n):
+        row = columns.bit_count() - 1
+        taken = (column for column in range(n) if columns >> column & 1)
+        shared[columns] = sum(shared[columns ^ (1 << last)] * entries[row, last] for last in taken)
     with np.errstate(divide="ignore"):
-        found = np.asarray(np.log(partial[..., -1]) + greatest[..., 0].sum(axis=-1))
-    for index in np.argwhere(np.isneginf(found)):
-        rows = logs[tuple(index)]
-        found[tuple(index)] = rows[linear_sum_assignment(-rows)].sum()
-    return found
+        found: Floats = np.log(shared[-1]) + greatest[..., 0].sum(axis=1)
+    for index in np.flatnonzero(np.isneginf(found)):
+        found[index] = flat[index][linear_sum_assignment(-flat[index])].sum()
+    return found.reshape(logs.shape[:-2])

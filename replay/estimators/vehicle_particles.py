@@ -71,8 +71,8 @@ class ParticlesParameters(Parameters):
 class Cloud(NamedTuple):
     """The particles of all runs.
 
-    Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone. Log
-    weights are (runs, particles). Generators are made when a run's first fixes are there.
+    Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone, the
+    covariances are empty. Log weights are (runs, particles). Generators are made when a run's first fixes are there.
     """
 
     carried: Carried
@@ -111,9 +111,10 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameter
 def _start(setup: Setup, method: Method, whole: Mapping[str, Ragged]) -> Cloud:
     carried = start(setup, whole)
     runs = len(carried.mean)
+    covariance = carried.covariance if method.kind == "associations" else np.empty((runs, 0, 0))
     joint = Joint(
         np.repeat(carried.mean, method.particles, axis=0),
-        np.repeat(carried.covariance, method.particles, axis=0),
+        np.repeat(covariance, method.particles, axis=0),
     )
     return Cloud(carried, joint, np.zeros((runs, method.particles)), [None] * runs)
 
