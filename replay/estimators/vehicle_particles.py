@@ -72,7 +72,8 @@ class Cloud(NamedTuple):
     """The particles of all runs.
 
     Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone, the
-    covariances are empty. Log weights are (runs, particles). Generators are made when a run's first fixes are there.
+    covariances are empty. Log weights are (runs, particles). Generators are made when a run's first
+    fixes are there.
     """
 
     carried: Carried
