@@ -133,6 +133,7 @@ def bind_vehicles(
         return None
     setup = Setup(
         name,
+        tuple(numbers),
         fixes,
         sensor,
         registration_scan,
@@ -327,7 +328,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
             "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
         )
         stream = make_stream(
-            f"/estimates/{setup.name}/vehicle{vehicle + 1}/innovation",
+            f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
             schemas.INNOVATION,
             frames.time_ns[told],
             metadata=state_metadata(PLACE) | {"truth": ""},
@@ -342,7 +343,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     vehicles = setup.motion.vehicles
     for vehicle in range(vehicles):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        yield gaussians(f"vehicle{vehicle + 1}", PLANE_MOTION, own, said)
+        yield gaussians(f"vehicle{setup.numbers[vehicle]}", PLANE_MOTION, own, said)
         if setup.fixes == "hungarian":
             yield innovations(vehicle)
     if setup.has_pose:

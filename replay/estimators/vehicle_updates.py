@@ -63,9 +63,10 @@ SENSOR = {
 
 
 class Setup(NamedTuple):
-    """A bound method: what it is told."""
+    """A bound method: what it is told. `numbers` are the vehicles', as in the names of their topics."""
 
     name: str
+    numbers: tuple[int, ...]
     fixes: str
     sensor: str
     registration_scan: int
