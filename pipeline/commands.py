@@ -20,7 +20,7 @@ from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
 from replay.engine import configure, find_estimator
-from replay.metrics import find_metrics, measure
+from replay.metrics import Output, find_metrics, measure
 from replay.sources import LogSource, log_span_ns
 
 
@@ -146,7 +146,10 @@ def evaluate_logs(
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
     replayed = judge(sources, _read_outputs(opened), gap_limit_s)
-    if not replayed.errors and not replayed.innovations:
+    telling = [
+        each for each in replayed.judged if not isinstance(each, Output) or each.leaf != "failure"
+    ]
+    if not measure(telling, find_metrics(metrics)):
         raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
     _state_losses([*opened, *(source.log for source in sources)])
     if out is not None:

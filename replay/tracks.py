@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from recorders.errors import BadInput
 from recorders.log import schemas
 from replay.metrics import Metric, Output
 
@@ -92,7 +93,7 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
 def track_tables(output: Output) -> list[pd.DataFrame]:
     """A table per run of a stream of tracks; none where the log does not say whose the reports are.
 
-    A row of the stream is of the row of the same number of the reports, and so of the identities.
+    The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
     """
     stream = output.rows.stream
     if stream.schema.full_name != schemas.TRACK_ESTIMATE.full_name:
@@ -100,13 +101,18 @@ def track_tables(output: Output) -> list[pd.DataFrame]:
     topic = f"{stream.metadata.get('reports', '').rpartition('/')[0]}/{IDENTITY}"
     tables = []
     for run, source in enumerate(output.sources):
-        if topic not in source.topics:
+        if topic not in source.topics or output.rows.offsets[run] == output.rows.offsets[run + 1]:
             return []
-        things = source.read([topic])[topic]["thing_id"].astype(np.int64)
-        tracks = output.rows.of_run(run)["track_id"].astype(np.int64)
-        if len(things) != len(tracks) or len(things) == 0:
-            return []  # a span of the log: which rows are meant is not known
-        tables.append(track_table(things, tracks))
+        tracks = output.rows.of_run(run)
+        identity = source.read([topic])[topic]
+        times, [first_ns, last_ns] = identity.publish_time_ns, tracks.publish_time_ns[[0, -1]]
+        things = identity["thing_id"][(times >= first_ns) & (times <= last_ns)]
+        if len(things) != len(tracks):
+            raise BadInput(
+                f"{source.name}: {len(things)} identities for {len(tracks)} reports on {stream.topic}; "
+                "give the log that these are estimates of"
+            )
+        tables.append(track_table(things.astype(np.int64), tracks["track_id"].astype(np.int64)))
     return tables
 
 

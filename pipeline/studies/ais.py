@@ -89,7 +89,8 @@ def tracks_figure(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions
             curves[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
     for label, (time_ns, numbers) in curves.items():
         at_ns, live = live_counts(time_ns, numbers, options.live_s)
-        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1)
+        colour = {"color": "0.4"} if label == "vessels" else {}
+        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1, **colour)
     below.set(xlabel="time (s)", ylabel=f"heard within {options.live_s:g} s", ylim=(0, None))
     below.legend(loc="lower right")
     return figure
@@ -99,16 +100,16 @@ def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:
     own = kept(vessels[vessels["estimator"] == options.estimator], reports=options.more_reports_than)
     if own.things == 0:
         return []
-    what = f"of {own.things} vessels with more than {options.more_reports_than} reports"
+    who = f"{own.things} vessels with more than {options.more_reports_than} reports"
     return [
         judged(
-            f"{what}, at least {options.kept_share:.0%} keep one track for {KEPT_SHARE:.0%} of them",
+            f"{options.kept_share:.0%} of {who} keep one track for {KEPT_SHARE:.0%} of their reports",
             "own target; plain nearest neighbour on position and velocity: 62 %",
             f"{100 * own.kept_share:.1f} %",
             own.kept_share >= options.kept_share,
         ),
         judged(
-            f"mean share of reports in the own track {what} at least {options.mean_share:g}",
+            f"mean share of reports in the own track of {who}: {options.mean_share:g}",
             "own target; plain nearest neighbour on position and velocity: .84",
             f"{own.mean_share:.3f}",
             own.mean_share >= options.mean_share,

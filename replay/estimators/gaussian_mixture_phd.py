@@ -39,10 +39,12 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 class PhdParameters(Parameters):
     """The scene; None takes what the scans' channel states.
 
+    `sensor` is the one to listen to, such as `network`; where it is empty all are, each on its own.
     Births are per m^2 and scan, clutter per m^2 and scan. Components within `merge_squared` of another
     by their own covariance become one. `gate_probability` is that of a detection of a component.
     """
 
+    sensor: str = ""
     variance_m2: PositiveFloat | None = None
     detection_probability: Probability | None = None
     clutter_per_m2: NonNegativeFloat | None = None
@@ -627,6 +629,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> 
     for topic in topics:
         sensor, _, leaf = topic.rpartition("/")
         detection = f"{sensor}/detection"
+        if parameters.sensor and sensor.strip("/") != parameters.sensor.strip("/"):
+            continue
         if leaf == "scan" and has(topic, schemas.SCAN) and has(detection, schemas.DETECTION):
             settings = settings_of(parameters, topics[topic].metadata, topic)
             outputs = Outputs(f"{name}{sensor}")

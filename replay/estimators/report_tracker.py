@@ -2,7 +2,8 @@
 
 Every report goes to the track from which it is most likely, or begins a new one. Tracks are taken for
 independent point processes: what counts is how likely track i reports now (its rate) times how likely
-it reports this (its predictive density), against the rate and density of vessels not met before.
+it reports this (its predictive density), against the rate and density of vessels not met before. Those
+are anywhere; some rest, in harbours close to each other, the others have any velocity.
 Reports of one stamp are of different vessels; the surest pairs are made first.
 
 How a track moves is one of a few levels of noise, from a moored hull to a vessel that turns sharply or
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
+from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
@@ -44,18 +46,20 @@ class ReportTrackerParameters(Parameters):
 
     The levels of noise, quiet ones first: density of the acceleration (m^2/s^3), sigmas of positions
     and velocities. `forgetting` is how much of the levels' weights a report takes back to equal ones.
-    A vessel below `slow_mps` often repeats its last course, which then tells it from others within
-    `course_width_deg`. A track that is silent for `forget_s` is dropped.
+    Of the vessels not met before `resting_share` rest. A vessel below `slow_mps` may be at rest, and
+    often repeats its last course, which then tells it from others within `course_width_deg`. A track
+    that is silent for `forget_s` is dropped.
     """
 
     acceleration_density: FOUR = (1e-6, 1e-4, 1e-2, 1.0)
     sigma_position_m: FOUR = (1.5, 3.0, 5.0, 10.0)
     sigma_velocity_mps: FOUR = (0.1, 0.2, 0.3, 1.0)
     forgetting: Annotated[float, Field(gt=0, le=1)] = 0.02
-    births_per_km2_h: PositiveFloat = 3.0
+    births_per_km2_h: PositiveFloat = 1.0
+    resting_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     top_speed_mps: PositiveFloat = 20.0
     usual_interval_s: PositiveFloat = 30.0
-    slow_mps: PositiveFloat = 0.5
+    slow_mps: PositiveFloat = 0.3
     course_width_deg: Annotated[float, Field(gt=0, le=180)] = 1.0
     forget_s: PositiveFloat = 7200.0
 
@@ -67,7 +71,8 @@ class Settings(NamedTuple):
     position_variance: Floats
     velocity_variance: Floats
     forgetting: Floats
-    birth_density: Floats
+    births: Floats
+    resting_share: Floats
     usual_interval_s: Floats
     slow_mps: Floats
     course_width_rad: Floats
@@ -183,6 +188,16 @@ def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: S
     return speed_mps < settings.slow_mps[0] and tracks.speed_mps[run, place] < settings.slow_mps[0]
 
 
+def birth_density(velocity: Floats, own_variance: float, settings: Settings) -> float:
+    """How densely vessels not met before report this, per m^2, s and (m/s)^2."""
+    moving = 1.0 / (np.pi * settings.top_speed_mps[0] ** 2)
+    variance = settings.slow_mps[0] ** 2 + own_variance
+    squared = (velocity[0] ** 2 + velocity[1] ** 2) / variance
+    resting = np.exp(-0.5 * squared) / (2.0 * np.pi * variance)
+    share = settings.resting_share[0]
+    return settings.births[0] * ((1.0 - share) * moving + share * resting)
+
+
 def score_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
 ) -> float:
@@ -205,8 +220,9 @@ def score_of(
         c += settings.velocity_variance[level] + reports.velocity_variance[event]
         weight = mixed(tracks.weight[run, place, level], settings)
         density += weight * density_at(difference, a, b, c)
-    # the rate of a track that is silent for long falls: Lomax' distribution of the intervals
-    density /= tracks.interval_s[run, place] + duration_s
+    # the rate of reports rises until half the usual interval is over, and falls with a long silence
+    usual_s = tracks.interval_s[run, place]
+    density *= min(1.0, 2.0 * duration_s / usual_s) / (usual_s + duration_s)
     if are_slow(tracks, run, place, reports.speed_mps[event], settings):
         course_rad, before_rad = reports.course_rad[event], tracks.course_rad[run, place]
         held, turned = tracks.held[run, place, 0], tracks.held[run, place, 1]
@@ -214,7 +230,8 @@ def score_of(
         if is_held(course_rad, before_rad, settings):
             factor += np.pi / settings.course_width_rad[0] * held / (held + turned)
         density *= factor
-    return np.log(density / settings.birth_density[0]) if density > 0.0 else -np.inf
+    born = birth_density(reports.velocity[event], reports.velocity_variance[event], settings)
+    return np.log(density / born) if density > 0.0 else -np.inf
 
 
 def find_best(
@@ -492,14 +509,19 @@ def _candidates(count: int) -> Candidates:
 
 
 def settings_of(parameters: ReportTrackerParameters) -> Settings:
-    """The parameters as the kernel has them.
+    """The parameters as the kernel has them; births per m^2 and s.
 
-    New vessels come anywhere, with any velocity up to the greatest: so many per m^2, s and (m/s)^2.
+    Raises BadInput where the last level is not the widest: gates are made with that.
     """
-    births = parameters.births_per_km2_h / (1e6 * 3600.0 * np.pi * parameters.top_speed_mps**2)
+    for name in ("acceleration_density", "sigma_position_m", "sigma_velocity_mps"):
+        levels = getattr(parameters, name)
+        if max(levels) > levels[-1]:
+            raise BadInput(f"{name} {levels}: give the quiet levels first, the greatest last")
+    births = parameters.births_per_km2_h / (1e6 * 3600.0)
     single = (
         parameters.forgetting,
         births,
+        parameters.resting_share,
         parameters.usual_interval_s,
         parameters.slow_mps,
         np.radians(parameters.course_width_deg),

@@ -22,11 +22,15 @@ from replay.tracks import live_counts, track_tables
 REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
 TRAIL_S = 300.0
 LIVE_S = 600.0
+LISTED_VESSELS = 200
 # What is drawn of each estimator at most.
 DRAWN_REPORTS = 50_000
 # Hues this far apart, in turns, never meet again soon.
 GOLDEN = 0.618034
-SHOWN_SHARE = 0.96
+SHOWN_SHARE = 0.9
+# So many times the shown extent beyond it is far off.
+FAR = 10.0
+# How wide the map is drawn, about, and its tiles.
 MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
 
 
@@ -57,13 +61,15 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
     canvas.send(plane_entity, times, points)
     canvas.fix(plane_entity, rr.Points2D.from_fields(radii=radii))
     degrees = np.stack([geodetic["latitude_deg"], geodetic["longitude_deg"]], axis=1)[rows]
-    canvas.send(map_entity, times, rr.GeoPoints.columns(positions=degrees, colors=colours))
+    near = _is_near(degrees)
+    on_map = rr.GeoPoints.columns(positions=degrees[near], colors=colours[near])
+    canvas.send(map_entity, times[near], on_map)
     canvas.fix(map_entity, rr.GeoPoints.from_fields(radii=radii))
     trail = trail_of(canvas, TRAIL_S)
     map_view = rrb.MapView(
         origin=escaped(f"geodetic/{name}"),
-        name="Map",
-        zoom=_zoom(degrees),
+        name="OpenStreetMap" if near.all() else f"OpenStreetMap, {(~near).sum()} far off left out",
+        zoom=_zoom(degrees[near]),
         overrides={escaped(map_entity): [trail]},
     )
     shown = _usual(place)
@@ -85,9 +91,16 @@ def _usual(places: Floats) -> Floats:
     return np.quantile(places, [tail, 1.0 - tail], axis=0)
 
 
+def _is_near(places: Floats) -> NDArray[np.bool_]:
+    """Which places are not far off: the map's view centres on all that it has."""
+    low, high = _usual(places)
+    margin = FAR * (high - low).max()
+    return ((places >= low - margin) & (places <= high + margin)).all(axis=1)
+
+
 def _zoom(degrees: Floats) -> float:
-    """The zoom at which most places fill the map: at zoom z the world is 2^z tiles wide."""
-    low, high = _usual(degrees)
+    """The zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
+    low, high = degrees.min(axis=0), degrees.max(axis=0)
     latitude = np.radians(0.5 * (low[0] + high[0]))
     width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)
     return float(np.clip(np.log2(360.0 / width * MAP_PIXELS / TILE_PIXELS), 1.0, 19.0))
@@ -116,9 +129,11 @@ def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(output):
-        columns = ("thing", "reports", "share", "tracks", "switches")
-        for thing, reports, share, count, switches in table[list(columns)].itertuples(index=False):
+        shown = table[["thing", "reports", "share", "tracks", "switches"]][:LISTED_VESSELS]
+        for thing, reports, share, count, switches in shown.itertuples(index=False):
             lines.append(f"|{thing}|{reports}|{share:.3f}|{count}|{switches}|")
+        if len(table) > LISTED_VESSELS:
+            lines.append(f"\n{len(table) - LISTED_VESSELS} more are in the study's tables")
     canvas.fix("vessels", rr.TextDocument("\n".join(lines), media_type="text/markdown"))
     return rrb.TextDocumentView(origin="vessels", name=f"Vessels in tracks of {name}")
 

@@ -1,5 +1,7 @@
 """The GM-PHD filter: one update by hand, how many there are, its outputs, blocks, and bad input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -166,6 +168,20 @@ def test_empty_scans_are_scans():
     expected = outputs["/estimates/gm-phd/sensor/cardinality"]["mean"][:, 0]
     assert_allclose(expected[0], 5 * 0.1 * 0.99, rtol=1e-12)
     assert expected[-1] < 1e-4
+
+
+def test_one_sensor_of_several_can_be_chosen():
+    """A sensor in a frame of its own, say, is left out by naming the other."""
+    one = source(simulate(0, scans=3))
+    other = {
+        f"/radar{topic}": replace(stream, topic=f"/radar{topic}")
+        for topic, stream in one.streams.items()
+        if topic.startswith("/sensor")
+    }
+    both = type(one)({**one.streams, **other}, one.run, one.name)
+    names = [each.name for each in bind("gm-phd", [both], {})]
+    assert names == ["gm-phd/sensor", "gm-phd/radar/sensor"]
+    assert [each.name for each in bind("gm-phd", [both], {"sensor": "sensor"})] == names[:1]
 
 
 def test_bad_input_is_named():
