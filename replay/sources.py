@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -105,7 +106,7 @@ class MemorySource:
         """The run's time zero."""
         return self.run.epoch_ns
 
-    @property
+    @cached_property
     def topics(self) -> Mapping[str, Topic]:
         """The recording's topics."""
         return {

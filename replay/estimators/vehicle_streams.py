@@ -1,0 +1,370 @@
+"""Cooperative vehicles from the streams of a log: which method uses what, and what it says.
+
+A method is named `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how the fixes are
+associated, and what is made of the infrastructure sensor. What came at one time in all runs is a frame;
+frame after frame is filtered in all runs at once.
+"""
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PositiveInt
+
+from recorders.errors import BadInput, choices
+from recorders.log import Topic, make_stream, schemas
+from recorders.models.planar import wrap_angle
+from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.parameters import Parameters
+from replay.blocks import Block, Ragged
+from replay.engine import Bound, Estimator, Recursive
+from replay.estimators.vehicle_association import MISSED, Scanning
+from replay.estimators.vehicle_updates import (
+    FIXES,
+    Associated,
+    Setup,
+    put,
+    split_method,
+    update_by_fixes,
+    update_by_pose,
+    update_by_set,
+    update_by_sums,
+    update_by_topology,
+    where,
+)
+from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
+
+Booleans = NDArray[np.bool_]
+
+PLACE = ("x_m", "y_m")
+POSE_COMPONENTS = (*PLACE, "heading_rad")
+FAILED = "the estimate is no longer finite"
+
+
+class VehiclesParameters(Parameters):
+    """The method, and from which scan on the sensor's pose may be found."""
+
+    method: str = "hungarian"
+    registration_scan: PositiveInt = 13
+
+
+class Carried(NamedTuple):
+    """What is carried from block to block; first axis = run.
+
+    `scans` counts the infrastructure sensor's; `registered` says that its pose was found.
+    """
+
+    mean: Floats
+    covariance: Floats
+    time_ns: Integers
+    scans: Integers
+    registered: Booleans
+    failed: Booleans
+
+
+class Frames(NamedTuple):
+    """All that came, by run and frame: times (runs, frames), counts of frames (runs,), measurements.
+
+    `fixes` (runs, frames, vehicles, 2) with `noise` (runs, frames, vehicles, 2, 2), and scans of the
+    network and the infrastructure sensor (runs, frames, detections, 2), are NaN where there are none;
+    `has_network`, `has_sensor` (runs, frames) say where there is a scan.
+    """
+
+    counts: Integers
+    time_ns: Integers
+    fixes: Floats
+    noise: Floats
+    network: Floats
+    has_network: Booleans
+    sensor: Floats
+    has_sensor: Booleans
+
+
+class Results(NamedTuple):
+    """Means (runs, frames, n) and covariances after every frame, and maps where single ones are used.
+
+    `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
+    """
+
+    mean: Floats
+    covariance: Floats
+    associated: Associated
+
+
+def no_results(setup: Setup, runs: int, frames: int) -> Results:
+    """Results that say nothing."""
+    states, vehicles = setup.states, setup.motion.vehicles
+    return Results(
+        np.full((runs, frames, states), np.nan),
+        np.full((runs, frames, states, states), np.nan),
+        Associated(
+            np.full((runs, frames, vehicles), MISSED),
+            np.full((runs, frames, vehicles, 2), np.nan),
+            np.full((runs, frames, vehicles, 2, 2), np.nan),
+        ),
+    )
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> list[Bound]:
+    fixes, sensor = split_method(parameters.method)
+    if fixes not in FIXES:
+        raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
+    bound = bind_vehicles(name, topics, fixes, sensor, parameters.registration_scan)
+    if bound is None:
+        return []
+    setup, used, priors = bound
+    return [Recursive(name, used, priors, partial(start, setup), partial(run, setup))]
+
+
+def bind_vehicles(
+    name: str, topics: Mapping[str, Topic], fixes: str, sensor: str, registration_scan: int
+) -> tuple[Setup, tuple[str, ...], tuple[str, ...]] | None:
+    """What a method is told, the topics it follows and the priors; None where one is missing."""
+    numbers = vehicle_numbers(topics)
+    used = ["/network/scan", "/network/detection"]
+    if fixes == "known":
+        used = [f"/vehicle{number}/fix" for number in numbers]
+    if sensor:
+        used += ["/infrastructure/scan", "/infrastructure/detection"]
+    if not numbers or not set(used) <= set(topics):
+        return None
+    setup = Setup(
+        name,
+        tuple(numbers),
+        fixes,
+        sensor,
+        registration_scan,
+        motion_of(topics, numbers),
+        scanning_of(topics, "/network/scan"),
+        scanning_of(topics, "/infrastructure/scan"),
+    )
+    return setup, tuple(used), tuple(f"/vehicle{number}/prior" for number in numbers)
+
+
+def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
+    """The numbers of the vehicles of a log."""
+    names = [name.removeprefix("/vehicle").partition("/") for name in topics]
+    return sorted(int(number) for number, _, leaf in names if leaf == "prior" and number.isdigit())
+
+
+def motion_of(topics: Mapping[str, Topic], numbers: Sequence[int]) -> Motion:
+    """How the vehicles move, as their priors' channels state it."""
+    stated = [topics[f"/vehicle{number}/prior"] for number in numbers]
+    return Motion(
+        np.array([_stated(topic, "turn_rate_radps") for topic in stated]),
+        np.array([_stated(topic, "acceleration_sigma_mps2") for topic in stated]),
+    )
+
+
+def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
+    """What a scan's channel states of its sensor; a log without it has no such sensor."""
+    if topic not in topics:
+        return Scanning(1.0, 1.0, 0.0)
+    names = ("variance_m2", "detection_probability", "clutter_per_m2")
+    return Scanning(*(_stated(topics[topic], name) for name in names))
+
+
+def _stated(topic: Topic, name: str) -> float:
+    try:
+        return float(topic.metadata[name])
+    except (KeyError, ValueError):
+        raise BadInput(f"topic {topic.name} does not state {name}; record the vehicles again") from None
+
+
+def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
+    """Every run's priors; raises BadInput where a run lacks one, or one is no vehicle's state."""
+    runs = next(iter(whole.values())).runs
+    mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
+    for vehicle, (topic, prior) in enumerate(whole.items()):
+        if np.any(np.diff(prior.offsets) == 0):
+            raise BadInput(f"topic {topic}: a run has no prior message; the filter cannot start")
+        if prior["mean"].shape[1] != STATES or prior["covariance"].shape[1] != STATES**2:
+            raise BadInput(f"topic {topic}: a prior of ({', '.join(PLANE_MOTION)}) is needed")
+        own = slice(STATES * vehicle, STATES * (vehicle + 1))
+        first = prior.offsets[:-1]
+        mean[:, own] = prior["mean"][first]
+        covariance[:, own, own] = prior["covariance"][first].reshape(-1, STATES, STATES)
+        if np.any(np.linalg.eigvalsh(covariance[:, own, own])[:, 0] <= 0):
+            raise BadInput(f"topic {topic}: the prior's covariance is not positive definite")
+    time_ns = prior.stream.publish_time_ns[first]
+    registered, failed = np.zeros((2, runs), bool)
+    return Carried(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
+
+
+def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Ragged]]:
+    """Filter a block; see `replay.engine.Recursive`."""
+    frames = frames_of(setup, block)
+    runs, count = frames.time_ns.shape
+    before = carried.failed
+    carried = copy.deepcopy(carried)
+    results = no_results(setup, runs, count)
+    for number in range(count):
+        rows = np.flatnonzero((number < frames.counts) & ~carried.failed)
+        if len(rows):
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges fails, no more
+                _advance(setup, carried, frames, number, rows, results)
+    return carried, list(outputs_of(setup, frames, results, carried.failed & ~before))
+
+
+def frames_of(setup: Setup, block: Block) -> Frames:
+    """A block's messages by run and frame."""
+    events = block.events
+    runs = len(events.offsets) - 1
+    run_of = np.repeat(np.arange(runs), np.diff(events.offsets))
+    ends = np.concatenate([[0], np.cumsum(events.is_last)])
+    frame_of = ends[:-1] - ends[events.offsets[:-1]][run_of]
+    counts = np.diff(ends[events.offsets])
+    shape = (runs, int(counts.max(initial=0)))
+    time_ns = np.zeros(shape, np.int64)
+    time_ns[run_of, frame_of] = events.time_ns
+    names = {name: index for index, name in enumerate(block.streams)}
+    vehicles = setup.motion.vehicles
+    fixes, noise = np.full((*shape, vehicles, 2), np.nan), np.full((*shape, vehicles, 4), np.nan)
+
+    def place(topic: str) -> tuple[Integers, Integers, Integers]:
+        """Runs, frames and rows of a topic's messages."""
+        chosen = np.flatnonzero(events.topic == names.get(topic, -1))
+        first = sum(len(ragged) for ragged in list(block.streams.values())[: names.get(topic, 0)])
+        return run_of[chosen], frame_of[chosen], events.source[chosen] - first
+
+    for topic, ragged in block.streams.items():
+        if topic.endswith("/fix") and len(ragged):
+            vehicle = names[topic]
+            at_run, at_frame, row = place(topic)
+            fixes[at_run, at_frame, vehicle] = ragged["position_m"][row]
+            noise[at_run, at_frame, vehicle] = ragged["covariance_m2"][row]
+
+    def scans(prefix: str) -> tuple[Floats, Booleans]:
+        there = np.zeros(shape, bool)
+        at_run, at_frame, _ = place(f"{prefix}/scan")
+        there[at_run, at_frame] = True
+        at_run, at_frame, row = place(f"{prefix}/detection")
+        key = at_run * shape[1] + at_frame
+        rank = np.arange(len(key)) - np.searchsorted(key, key)
+        padded = np.full((*shape, int(rank.max(initial=-1)) + 1, 2), np.nan)
+        if len(row):
+            padded[at_run, at_frame, rank] = block.streams[f"{prefix}/detection"]["position_m"][row]
+        return padded, there
+
+    matrices = noise.reshape(*shape, vehicles, 2, 2)
+    return Frames(counts, time_ns, fixes, matrices, *scans("/network"), *scans("/infrastructure"))
+
+
+def _advance(
+    setup: Setup, carried: Carried, frames: Frames, number: int, rows: Integers, results: Results
+) -> None:
+    """Take some runs through one frame: changes their rows of what is carried, and fills the results."""
+    time_ns = frames.time_ns[rows, number]
+    joint = _predicted(
+        setup, Joint(carried.mean[rows], carried.covariance[rows]), time_ns - carried.time_ns[rows]
+    )
+    scanned = np.flatnonzero(frames.has_network[rows, number])
+    if setup.fixes == "known":
+        joint = update_by_fixes(setup, joint, frames.fixes[rows, number], frames.noise[rows, number])
+    elif len(scanned):
+        own, seen = joint.of(scanned), frames.network[rows[scanned], number]
+        if setup.uses_sums:
+            joint = put(joint, scanned, update_by_sums(setup, own, seen))
+        else:
+            own, associated = update_by_set(setup, own, seen)
+            joint = put(joint, scanned, own)
+            for column, found in zip(results.associated, associated or (), strict=False):
+                column[rows[scanned], number] = found
+    scanned = np.flatnonzero(frames.has_sensor[rows, number])
+    if setup.sensor and len(scanned):
+        runs = rows[scanned]
+        own, seen = joint.of(scanned), frames.sensor[runs, number]
+        carried.scans[runs] += 1
+        if setup.sensor == "topology":
+            own = update_by_topology(setup, own, seen)
+        else:
+            may_start = carried.scans[runs] >= setup.registration_scan
+            own, carried.registered[runs] = update_by_pose(
+                setup, own, seen, carried.registered[runs], may_start
+            )
+        joint = put(joint, scanned, own)
+    carried.mean[rows], carried.covariance[rows], carried.time_ns[rows] = *joint, time_ns
+    well = np.isfinite(joint.mean.sum(axis=1) + joint.covariance.sum(axis=(1, 2)))
+    carried.failed[rows] = ~well
+    results.mean[rows[well], number] = joint.mean[well]
+    results.covariance[rows[well], number] = joint.covariance[well]
+
+
+def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
+    """The joint states after so long, (runs,); most often it is as long in all runs."""
+    for span_ns in np.unique(duration_ns):
+        move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
+        joint = where(duration_ns == span_ns, joint, move)
+    return joint
+
+
+def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans) -> Iterator[Ragged]:
+    """Every vehicle's estimates, the pose's where it is estimated, and who failed."""
+    runs, count = frames.time_ns.shape
+    said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
+
+    def gaussians(case: str, names: Sequence[str], own: slice, told: Booleans) -> Ragged:
+        mean = results.mean[told][:, own]
+        angular = [index for index, name in enumerate(names) if name.endswith("_rad")]
+        mean[:, angular] = wrap_angle(mean[:, angular])
+        stream = make_stream(
+            f"/estimates/{setup.name}/{case}/state",
+            schemas.GAUSSIAN_ESTIMATE,
+            frames.time_ns[told],
+            metadata=state_metadata(names) | {"truth": f"/{case}/truth"},
+            mean=mean,
+            covariance=results.covariance[told][:, own, own].reshape(len(mean), len(names) ** 2),
+        )
+        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
+
+    def innovations(vehicle: int) -> Ragged:
+        """What was associated with a vehicle; the target is the detection's number in its scan."""
+        detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
+        told = detection != MISSED
+        squared = np.einsum(
+            "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
+        )
+        stream = make_stream(
+            f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
+            schemas.INNOVATION,
+            frames.time_ns[told],
+            metadata=state_metadata(PLACE) | {"truth": ""},
+            target_id=detection[told] + 1,
+            accepted=np.ones(told.sum(), np.int64),
+            innovation=innovation[told],
+            covariance=spread[told].reshape(-1, 4),
+            normalised_innovation_squared=squared,
+        )
+        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
+
+    vehicles = setup.motion.vehicles
+    for vehicle in range(vehicles):
+        own = slice(STATES * vehicle, STATES * (vehicle + 1))
+        yield gaussians(f"vehicle{setup.numbers[vehicle]}", PLANE_MOTION, own, said)
+        if setup.fixes == "hungarian":
+            yield innovations(vehicle)
+    if setup.has_pose:
+        is_found = results.covariance[:, :, -1, -1] > 0.0
+        yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
+    failed = np.flatnonzero(failing)
+    last = np.maximum(said.sum(axis=1), 1) - 1
+    stream = make_stream(
+        f"/estimates/{setup.name}/failure",
+        schemas.FAILURE,
+        frames.time_ns[failed, last[failed]],
+        metadata={"reasons": FAILED},
+        reason=np.zeros(len(failed), np.int64),
+    )
+    yield Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))
+
+
+VEHICLES = Estimator(
+    "cooperative vehicles; the method follows the name, as in vehicles:hungarian-topology",
+    "/vehicleN/prior and, by method, /vehicleN/fix, /network and /infrastructure",
+    VehiclesParameters,
+    _bind,
+    variant="method",
+)
