@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 COMPONENTS = ("x_m", "y_m", "vx_mps", "vy_mps")
 STATE = {"components": ",".join(COMPONENTS), "kinds": ",".join(["linear"] * 4)}
@@ -85,12 +85,14 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
         make_stream(
             "/prior",
             schemas.GAUSSIAN_ESTIMATE,
-            _stamps(times_s[:1]),
+            simulation_stamps_ns(times_s[:1]),
             metadata=STATE,
             mean=[parameters.start],
             covariance=np.diag(np.square(parameters.start_sigma)).reshape(1, 16),
         ),
-        make_stream("/truth", schemas.TRUTH_STATE, _stamps(times_s), metadata=STATE, state=truth),
+        make_stream(
+            "/truth", schemas.TRUTH_STATE, simulation_stamps_ns(times_s), metadata=STATE, state=truth
+        ),
         _link_events(parameters, links, times_s[1:], link_rng),
     ]
     for number, node in enumerate(nodes, start=1):
@@ -103,7 +105,7 @@ def simulate(parameters: IspaceParameters, rng: np.random.Generator) -> Recordin
             make_stream(
                 f"/node{number}/sensor",
                 schemas.VECTOR_MEASUREMENT,
-                _stamps(times_s[steps]),
+                simulation_stamps_ns(times_s[steps]),
                 metadata={
                     "components": ",".join(node.components),
                     "sigmas": ",".join(map(repr, node.sigmas)),
@@ -175,10 +177,10 @@ def _link_events(
     return make_stream(
         "/links",
         schemas.LINK_EVENT,
-        _stamps(sent_s[kept]),
+        simulation_stamps_ns(sent_s[kept]),
         sender_id=sender[kept],
         receiver_id=receiver[kept],
-        arrival_time_ns=_stamps((sent_s + delay_s)[kept]),
+        arrival_time_ns=simulation_stamps_ns((sent_s + delay_s)[kept]),
         lost=lost[kept],
     )
 
@@ -200,15 +202,11 @@ def _outage_streams(parameters: IspaceParameters) -> list[Stream]:
         make_stream(
             f"/node{node}/outages",
             schemas.OUTAGE,
-            _stamps(np.array([span.start_s for span in found])),
-            end_time_ns=_stamps(np.array([span.end_s for span in found])),
+            simulation_stamps_ns(np.array([span.start_s for span in found])),
+            end_time_ns=simulation_stamps_ns(np.array([span.end_s for span in found])),
         )
         for node, found in spans.items()
     ]
-
-
-def _stamps(seconds: NDArray[np.float64]) -> NDArray[np.int64]:
-    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
 
 
 ISPACE = Simulator(

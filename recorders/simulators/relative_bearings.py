@@ -14,7 +14,7 @@ from recorders.log import make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.models.relative_bearing import relative_bearing
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
 
 PAPER_LANDMARKS_M = np.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.0]])
 PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
@@ -65,9 +65,7 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
     other = np.tile(second, parameters.looks)
     error = rng.uniform(-1, 1, len(looks)) * error_rad
     angle = wrap_angle(relative_bearing(robot, places[seen].T, places[other].T) + error)
-    stamps = SIMULATION_EPOCH_NS + np.rint(
-        1e9 * (parameters.start_s + np.arange(parameters.looks) / parameters.rate_hz)
-    ).astype(np.int64)
+    stamps = simulation_stamps_ns(parameters.start_s + np.arange(parameters.looks) / parameters.rate_hz)
     return Recording(
         [
             make_stream(

@@ -18,7 +18,7 @@ from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.models.vehicles import into_frame, turn
 from recorders.parameters import Parameters
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -165,7 +165,7 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
         make_stream(
             "/infrastructure/truth",
             schemas.TRUTH_STATE,
-            _stamps(truth_s),
+            simulation_stamps_ns(truth_s),
             metadata=state_metadata(POSE),
             state=np.tile(parameters.infrastructure.pose, (len(truth_s), 1)),
         ),
@@ -176,10 +176,6 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
 def _times(parameters: VehiclesParameters, rate_hz: float) -> Floats:
     """A sensor's times: none where it never reports."""
     return np.arange(1, int(parameters.duration_s * rate_hz + 1e-9) + 1) / (rate_hz or 1.0)
-
-
-def _stamps(seconds: Floats) -> Integers:
-    return SIMULATION_EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
 
 
 def _drive(parameters: VehiclesParameters, rng: np.random.Generator) -> Drive:
@@ -244,7 +240,7 @@ def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floa
             make_stream(
                 f"/vehicle{index + 1}/prior",
                 schemas.GAUSSIAN_ESTIMATE,
-                _stamps(truth_s[:1]),
+                simulation_stamps_ns(truth_s[:1]),
                 metadata=state_metadata(PLANE_MOTION) | motion,
                 mean=drive.nominal[None, index],
                 covariance=covariance,
@@ -252,7 +248,7 @@ def _vehicle_streams(parameters: VehiclesParameters, drive: Drive, truth_s: Floa
             make_stream(
                 f"/vehicle{index + 1}/truth",
                 schemas.TRUTH_STATE,
-                _stamps(truth_s),
+                simulation_stamps_ns(truth_s),
                 metadata=state_metadata(PLANE_MOTION),
                 state=states[:, index],
             ),
@@ -339,7 +335,7 @@ def _scan_streams(
 def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple[Integers, Integers]:
     """When messages are published, and when they reach the recorder."""
     delay_s = sensor.latency_s + sensor.latency_jitter_s * rng.exponential(size=len(times_s))
-    return _stamps(times_s), _stamps(times_s + delay_s)
+    return simulation_stamps_ns(times_s), simulation_stamps_ns(times_s + delay_s)
 
 
 VEHICLES = Simulator(
