@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from pydantic import PositiveFloat, PositiveInt
 
 from pipeline.ensemble import hash_streams, judge, record_ensemble, replay_in_memory
@@ -24,6 +25,7 @@ from replay.sources import MemorySource
 
 # Of powers of N, no estimator here needs more than this one.
 HIGHEST_POWER = 5.0
+TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
@@ -189,8 +191,11 @@ def _figure(table: pd.DataFrame) -> Figure:
     left.set(xlabel="vehicles", ylabel="CPU time of a step (ms)")
     right.set(xlabel="vehicles", ylabel="error of a vehicle (m)", ylim=(0, 3))
     left.legend(fontsize=7)
+    counts = [count for count in TICKS if count <= table["vehicles"].max()]
     for axes in (left, right):
         axes.grid(alpha=0.3, which="both")
+        axes.set_xticks(counts, map(str, counts))
+        axes.xaxis.set_minor_formatter(NullFormatter())
     return figure
 
 
