@@ -7,10 +7,11 @@ import fcntl
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -179,11 +180,19 @@ def write_outcome(
         settings=dict(settings),
         input_sha256=outcome.input_sha256,
         metrics=plain(outcome.metrics),
-        claims=outcome.claims,
+        claims=[_decided(claim) for claim in outcome.claims],
     )
     text = json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False)
     (folder / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
     return result
+
+
+def _decided(claim: Claim) -> Claim:
+    """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
+    if not re.search(r"\bnan\b", claim.ours):
+        return claim
+    why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
+    return replace(claim, verdict="not reproducible", why=why)
 
 
 def read_result(folder: Path) -> Result:

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from pipeline.ensemble import hash_streams, record_ensemble
-from pipeline.experiment import Experiment, Setting, Study, run_experiment
+from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
 from pipeline.results import Claim, Outcome, result_folder, write_outcome
 from recorders.errors import BadInput
 from recorders.log import open_log
@@ -218,3 +218,11 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
     with pytest.raises(BadInput, match="study mine raised ZeroDivisionError: no runs"):
         run_experiment("x", Experiment(title="x", study="mine"), tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_refuted_by_estimates_that_are_missing(tmp_path: Path) -> None:
+    """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
+    label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})
+    result = run_experiment(label, experiment, tmp_path / "out", logs=1)
+    assert {claim.verdict for claim in result.claims} == {"not reproducible"}
+    assert all(claim.why.endswith("estimates are missing") for claim in result.claims)
