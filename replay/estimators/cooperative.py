@@ -27,7 +27,6 @@ from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
 from replay.estimators.gaussian import (
     ALL_WELL,
-    FAILURES,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     Floats,
@@ -35,6 +34,7 @@ from replay.estimators.gaussian import (
     Innovation,
     add_control_noise,
     correct,
+    failures_of,
     wrap,
 )
 from replay.estimators.landmarks import (
@@ -352,7 +352,9 @@ def run(
     loop = _compiled(mode, criterion)
     loop(len(carried.mean), events, landmarks.positions, settings, carried, results)
     poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
-    return (carried, landmarks), [*poses, _failures(name, before, carried)]
+    failed_ns = carried.time_ns.max(axis=1)
+    failures = failures_of(f"/estimates/{name}", before.failure, carried.failure, failed_ns)
+    return (carried, landmarks), [*poses, failures]
 
 
 def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, results: Results) -> Ragged:
@@ -374,19 +376,6 @@ def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, res
         covariance=covariance.reshape(-1, 9),
     )
     return Ragged(stream, np.searchsorted(rows, events.offsets))
-
-
-def _failures(name: str, before: Carried, after: Carried) -> Ragged:
-    """The runs that failed in this block."""
-    failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
-    stream = make_stream(
-        f"/estimates/{name}/failure",
-        schemas.FAILURE,
-        after.time_ns[failed].max(axis=1),
-        metadata={"reasons": "; ".join(FAILURES)},
-        reason=after.failure[failed],
-    )
-    return Ragged(stream, np.searchsorted(failed, np.arange(len(after.failure) + 1)))
 
 
 def _events(

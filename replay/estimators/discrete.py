@@ -19,7 +19,6 @@ from replay.compile import compile_over_runs
 from replay.engine import Bound, Recursive
 from replay.estimators.gaussian import (
     ALL_WELL,
-    FAILURES,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     Floats,
@@ -27,6 +26,7 @@ from replay.estimators.gaussian import (
     Innovation,
     SampleMemory,
     correct,
+    failures_of,
     is_finite,
     no_innovation,
 )
@@ -68,7 +68,7 @@ class System(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What a filter carries from block to block; first axis = run. see `FAILURES`."""
+    """What a filter carries from block to block; first axis = run; see `gaussian.FAILURES`."""
 
     mean: Floats
     covariance: Floats
@@ -293,16 +293,8 @@ def _outputs(
         covariance=results.innovation_covariance[done].reshape(-1, len(system.measured) ** 2),
         normalised_innovation_squared=results.squared[done],
     )
-    failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
-    failures = make_stream(
-        f"{topic}/failure",
-        schemas.FAILURE,
-        after.time_ns[failed],
-        metadata={"reasons": "; ".join(FAILURES)},
-        reason=after.failure[failed],
-    )
     return [
         Ragged(estimates, offsets),
         Ragged(innovations, offsets),
-        Ragged(failures, np.searchsorted(failed, np.arange(len(after.failure) + 1))),
+        failures_of(topic, before.failure, after.failure, after.time_ns),
     ]

@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.log import make_stream, schemas
 from recorders.models.planar import wrap_angle
+from replay.blocks import Ragged
 from replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
@@ -20,6 +22,28 @@ Function = Callable[..., Any]
 
 FAILURES = ("the covariance is no longer positive definite", "the estimate is no longer finite")
 ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices of FAILURES
+
+
+def failures_of(
+    topic: str, before: NDArray[np.int64], after: NDArray[np.int64], time_ns: NDArray[np.int64]
+) -> Ragged:
+    """The runs that failed in a block, on `topic`/failure; one message each, at its own time.
+
+    Args:
+        topic: the estimator's, /estimates/NAME and its case.
+        before: ALL_WELL or an index of FAILURES for every run up to the block, (runs,).
+        after: the same with the block.
+        time_ns: when, (runs,).
+    """
+    failed = np.flatnonzero((after != ALL_WELL) & (before == ALL_WELL))
+    stream = make_stream(
+        f"{topic}/failure",
+        schemas.FAILURE,
+        time_ns[failed],
+        metadata={"reasons": "; ".join(FAILURES)},
+        reason=after[failed],
+    )
+    return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))
 
 
 class Models(NamedTuple):

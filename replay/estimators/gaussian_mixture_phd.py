@@ -23,7 +23,7 @@ from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
-from replay.estimators.gaussian import ALL_WELL, FAILURES, NOT_POSITIVE_DEFINITE, cholesky
+from replay.estimators.gaussian import ALL_WELL, NOT_POSITIVE_DEFINITE, cholesky, failures_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -528,7 +528,6 @@ class Outputs(NamedTuple):
         rows = np.repeat(sets.room[told] - counts[:-1], elements) + np.arange(counts[-1])
         expected = sets.expected[told]
         state = state_metadata(PLANE_MOTION)
-        failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
         return [
             self._ragged("set", schemas.ESTIMATE_SIZE, offsets, time_ns, state, elements=elements),
             self._ragged(
@@ -551,14 +550,7 @@ class Outputs(NamedTuple):
                 mean=expected[:, None],
                 covariance=expected[:, None],
             ),
-            self._ragged(
-                "failure",
-                schemas.FAILURE,
-                np.searchsorted(failed, np.arange(len(after.failure) + 1)),
-                after.time_ns[failed],
-                {"reasons": "; ".join(FAILURES)},
-                reason=after.failure[failed],
-            ),
+            failures_of(f"/estimates/{self.name}", before.failure, after.failure, after.time_ns),
         ]
 
     def _ragged(

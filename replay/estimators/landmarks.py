@@ -31,7 +31,6 @@ from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.gaussian import (
     ALL_WELL,
-    FAILURES,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     Filter,
@@ -40,6 +39,7 @@ from replay.estimators.gaussian import (
     Innovation,
     Models,
     correct,
+    failures_of,
     is_finite,
     linearised,
     no_innovation,
@@ -351,7 +351,7 @@ def run(
     return (carried, landmarks, generators), [
         outputs.poses(poses, events),
         outputs.innovations(looks, events),
-        outputs.failures(before, carried),
+        failures_of(f"/estimates/{outputs.name}", before.failure, carried.failure, carried.time_ns),
     ]
 
 
@@ -441,18 +441,6 @@ class Outputs(NamedTuple):
             innovation=looks.difference[rows],
             covariance=looks.covariance[rows].reshape(-1, 4),
             normalised_innovation_squared=looks.squared[rows],
-        )
-
-    def failures(self, before: Carried, after: Carried) -> Ragged:
-        """The runs that failed in this block."""
-        failed = np.flatnonzero((after.failure != ALL_WELL) & (before.failure == ALL_WELL))
-        return self._ragged(
-            "failure",
-            schemas.FAILURE,
-            np.searchsorted(failed, np.arange(len(after.failure) + 1)),
-            after.time_ns[failed],
-            {"reasons": "; ".join(FAILURES)},
-            reason=after.failure[failed],
         )
 
     def _ragged(
