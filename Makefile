@@ -19,7 +19,7 @@ test: .venv/with-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
