@@ -19,7 +19,7 @@ test: .venv/with-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest --numprocesses 2 --dist loadfile
+	$(BIN)/pytest
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
