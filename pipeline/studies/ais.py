@@ -9,14 +9,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from pydantic import NonNegativeInt, PositiveFloat
 
-from pipeline.ensemble import Replayed, hash_streams, replay_ensemble
+from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
-from pipeline.studies.localization import obtain, summary_table, write_logs
+from pipeline.studies.localization import replay_runs, summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.metrics import Output, find_metrics, measure
-from replay.timeline.show import show
 from replay.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, track_tables
 
 
@@ -33,12 +32,7 @@ class AisOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: AisOptions = setting.options
-    sources = obtain(experiment, setting)
-    replayed = replay_ensemble(
-        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-    )
-    write_logs(experiment, setting, sources, replayed)
-    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    sources, replayed = replay_runs(experiment, setting)
     vessels = vessel_table(replayed)
     if options.estimator not in set(vessels["estimator"]):
         raise BadInput(f"no tracks of '{options.estimator}' with identities to judge them by")

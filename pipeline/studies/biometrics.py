@@ -23,7 +23,7 @@ from pipeline.studies.biometrics_claims import (
     claims_of_bssr1,
     claims_of_simulation,
 )
-from pipeline.studies.localization import obtain, summary_table, write_logs
+from pipeline.studies.localization import replay_runs, summary_table
 from recorders.models.scores import TOPIC, comparisons_of, matchers_of
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
@@ -32,7 +32,6 @@ from replay.estimators.biometrics import LearnerParameters, subsets_of
 from replay.evaluation import split_topic
 from replay.metrics import find_metrics, measure
 from replay.sources import MemorySource
-from replay.timeline.show import show
 from replay.verification import (
     FALSE_ACCEPT_RATES,
     Fused,
@@ -55,12 +54,7 @@ class BiometricsOptions(Parameters):
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    sources = obtain(experiment, setting)
-    replayed = replay_ensemble(
-        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-    )
-    write_logs(experiment, setting, sources, replayed)
-    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    sources, replayed = replay_runs(experiment, setting)
     metrics = find_metrics(experiment.metrics)
     values = measure(replayed.judged, metrics)
     values |= _repeated(experiment, setting, sources, values)

@@ -11,16 +11,15 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.ensemble import hash_streams, replay_ensemble
+from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
-from pipeline.studies.localization import obtain, write_logs
+from pipeline.studies.localization import replay_runs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.evaluation import Errors
 from replay.metrics import find_metrics, measure
 from replay.sources import Source
-from replay.timeline.show import show
 
 
 class InertialOptions(Parameters):
@@ -33,15 +32,7 @@ class InertialOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: InertialOptions = setting.options
-    sources = obtain(experiment, setting)
-    replayed = replay_ensemble(
-        sources,
-        experiment.estimators,
-        gap_limit_s=experiment.gap_limit_s,
-        progress=setting.progress,
-    )
-    write_logs(experiment, setting, sources, replayed)
-    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    sources, replayed = replay_runs(experiment, setting)
     trials = movement_table(replayed.errors, sources)
     means = {
         str(name): float(rows["movement_rmse_deg"].mean())

@@ -33,20 +33,26 @@ if TYPE_CHECKING:
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    sources = obtain(experiment, setting)
-    replayed = replay_ensemble(
-        sources,
-        experiment.estimators,
-        gap_limit_s=experiment.gap_limit_s,
-        progress=setting.progress,
-    )
-    write_logs(experiment, setting, sources, replayed)
-    from replay.timeline.show import show
-
-    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    sources, replayed = replay_runs(experiment, setting)
     outcome = summarise(replayed, experiment.metrics)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
+
+
+def replay_runs(experiment: Experiment, setting: Setting) -> tuple[list[MemorySource], Replayed]:
+    """The experiment's runs, and what its estimators make of them.
+
+    Writes logs and estimates of the first runs, and the first run's timeline.
+    """
+    from replay.timeline.show import show
+
+    sources = obtain(experiment, setting)
+    replayed = replay_ensemble(
+        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
+    )
+    write_logs(experiment, setting, sources, replayed)
+    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    return sources, replayed
 
 
 def obtain(experiment: Experiment, setting: Setting) -> list[MemorySource]:

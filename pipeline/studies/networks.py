@@ -17,7 +17,7 @@ from pydantic import NonNegativeFloat
 from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
-from pipeline.studies.localization import obtain, summarise, write_logs
+from pipeline.studies.localization import replay_runs, summarise
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, merge
 from replay.blocks import gather
@@ -25,7 +25,6 @@ from replay.estimators.covariance_intersection import fuse
 from replay.estimators.networks import ALONE, CENTRALISED, NetworkParameters, message_bytes
 from replay.evaluation import Errors
 from replay.sources import MemorySource
-from replay.timeline.show import show
 
 CI = "ci-trace"
 
@@ -41,10 +40,7 @@ class NetworkOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: NetworkOptions = setting.options
-    sources = obtain(experiment, setting)
-    replayed = _replay(sources, experiment.estimators, experiment, setting)
-    write_logs(experiment, setting, sources, replayed)
-    show(sources[0], replayed.outputs, replayed.errors, save=setting.folder / "timeline.rrd")
+    sources, replayed = replay_runs(experiment, setting)
     settled = replace(replayed, errors=[_after(each, options.settle_s) for each in replayed.errors])
     outcome = summarise(settled)
     outcome.metrics |= _loads(experiment, sources)
@@ -62,17 +58,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.claims = _claims(table, by_loss, options.settle_s)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
-
-
-def _replay(
-    sources: Sequence[MemorySource],
-    estimators: Mapping[str, Mapping[str, Any]],
-    experiment: Experiment,
-    setting: Setting,
-) -> Replayed:
-    return replay_ensemble(
-        sources, estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-    )
 
 
 def _after(errors: Errors, settle_s: float) -> Errors:
@@ -147,7 +132,9 @@ def _by_loss(
         sources = record_ensemble(
             experiment.record.scenario, parameters, experiment.seed, experiment.runs, setting.progress
         )
-        errors = _replay(sources, chosen, experiment, setting).errors
+        errors = replay_ensemble(
+            sources, chosen, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
+        ).errors
         found[loss] = network_table([_after(each, options.settle_s) for each in errors])
     parts = [found[loss].assign(loss=loss) for loss in sorted(found)]
     table = pd.concat(parts, ignore_index=True)

@@ -25,22 +25,27 @@ ALL_WELL, NOT_POSITIVE_DEFINITE, NOT_FINITE = -1, 0, 1  # the others are indices
 
 
 def failures_of(
-    topic: str, before: NDArray[np.int64], after: NDArray[np.int64], time_ns: NDArray[np.int64]
+    topic: str,
+    before: NDArray[np.int64],
+    after: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    reasons: tuple[str, ...] = FAILURES,
 ) -> Ragged:
     """The runs that failed in a block, on `topic`/failure; one message each, at its own time.
 
     Args:
         topic: the estimator's, /estimates/NAME and its case.
-        before: ALL_WELL or an index of FAILURES for every run up to the block, (runs,).
+        before: ALL_WELL or an index of `reasons` for every run up to the block, (runs,).
         after: the same with the block.
         time_ns: when, (runs,).
+        reasons: a sentence for each index.
     """
     failed = np.flatnonzero((after != ALL_WELL) & (before == ALL_WELL))
     stream = make_stream(
         f"{topic}/failure",
         schemas.FAILURE,
         time_ns[failed],
-        metadata={"reasons": "; ".join(FAILURES)},
+        metadata={"reasons": "; ".join(reasons)},
         reason=after[failed],
     )
     return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))

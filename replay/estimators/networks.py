@@ -22,7 +22,7 @@ from replay.blocks import Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Batch, Bound, Estimator
 from replay.estimators.covariance_intersection import rule
-from replay.estimators.gaussian import Floats, Function
+from replay.estimators.gaussian import ALL_WELL, Floats, Function, failures_of
 
 Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
@@ -296,7 +296,10 @@ def solve(
         failed_ns,
     )
     metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * size)}
-    outputs = [_failures(f"/estimates/{name}/failure", failed_ns)]
+    well = np.full_like(failed_ns, ALL_WELL)
+    outputs = [
+        failures_of(f"/estimates/{name}", well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)
+    ]
     places = [f"node{number}" for number in sensors] if parameters.rule != CENTRALISED else ["centre"]
     done = np.isfinite(results.mean[:, 0])
     for node, place in enumerate(places):
@@ -450,18 +453,6 @@ def _estimates(
         covariance=covariance[rows].reshape(len(rows), covariance.shape[1] ** 2),
     )
     return Ragged(stream, np.searchsorted(rows, activities.offsets))
-
-
-def _failures(topic: str, failed_ns: Integers) -> Ragged:
-    failed = np.flatnonzero(failed_ns >= 0)
-    stream = make_stream(
-        topic,
-        schemas.FAILURE,
-        failed_ns[failed],
-        metadata={"reasons": "; ".join(FAILURES)},
-        reason=np.zeros(len(failed), int),
-    )
-    return Ragged(stream, np.searchsorted(failed, np.arange(len(failed_ns) + 1)))
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:

@@ -6,20 +6,18 @@ not installed, its times are those that we measured once, on a machine of ours (
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from statistics import median
-from time import perf_counter
 
 import numpy as np
 
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.estimators.bingham import BinghamNoise, Steps, make_steps, run_bingham_filter
+from tests.bench.timing import median_seconds, seconds
 
 REVERSE = np.eye(4)[::-1]
 Z_SYSTEM, Z_MEASUREMENT, Z_START = [-200.0, -200, -2, 0], [-500.0, -500, -500, 0], [-1.0, -1, -1, 0]
 STEPS = 100
 PYRECEST_STEPS = 10
-REPEATS = 5
 STORED_US = {"step": 63_700.0, "fit": 22_000.0, "normaliser": 1_070.0}
 
 Row = tuple[str, float, float, float]
@@ -68,16 +66,8 @@ def filter_us(measured: np.ndarray, runs: int) -> float:
 
 
 def us(work: Callable[[], object]) -> float:
-    """The median time of a call, after one to warm up."""
-    work()
-    return median(seconds(work) for _ in range(REPEATS)) * 1e6
-
-
-def seconds(work: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    start = perf_counter()
-    work()
-    return perf_counter() - start
+    """The median time of a call."""
+    return 1e6 * median_seconds(work)
 
 
 def pyrecest_us(measured: np.ndarray) -> dict[str, float]:

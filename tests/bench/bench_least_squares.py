@@ -6,10 +6,8 @@ and must find the same estimates to 1e-8. Ours also gives covariance and rank; t
 """
 
 import tomllib
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,7 @@ from scipy.optimize import least_squares
 from recorders.models.optical import line_of_sight
 from replay.estimators import optical
 from replay.estimators.optical import Scene
+from tests.bench.timing import seconds
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"
 SIGMA_RAD = 0.300e-3
@@ -38,13 +37,6 @@ def ensemble(scenario: int) -> tuple[Scene, np.ndarray]:
     clean = optical.predict(scene, truth[None])
     noise = np.random.default_rng(scenario).normal(size=(RUNS, *clean.shape[1:]))
     return scene, clean + SIGMA_RAD * noise
-
-
-def seconds(work: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    start = perf_counter()
-    work()
-    return perf_counter() - start
 
 
 def residual(parameters: np.ndarray, scene: Scene, measured: np.ndarray) -> np.ndarray:

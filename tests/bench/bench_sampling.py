@@ -8,6 +8,7 @@ import numpy as np
 
 from replay.sampling import SetName, cached_set, lcd_samples
 from replay.sampling.cache import read_set, write_sets
+from tests.bench.timing import median_seconds
 
 # (N, L): CPU seconds per start in the sheet's table; "<.01" is written as .01.
 SECONDS_PER_START = {
@@ -41,21 +42,14 @@ def main() -> list[tuple[str, float, float, float]]:
     timings.append(("LCD (20, 100), wall s in all", perf_counter() - begin, 60.0))
 
     shipped = SetName(8, 50)
-    timings.append(("load a shipped set, s", _median_seconds(lambda: cached_set(shipped)), 0.005))
+    timings.append(("load a shipped set, s", median_seconds(lambda: cached_set(shipped), 51), 0.005))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "set.bin"
         write_sets(path, {shipped: cached_set(shipped)}, "a benchmark")
-        timings.append(("load a cached set, s", _median_seconds(lambda: read_set(path, shipped)), 0.005))
+        timings.append(
+            ("load a cached set, s", median_seconds(lambda: read_set(path, shipped), 51), 0.005)
+        )
     return [(name, ours, reference, ours / reference) for name, ours, reference in timings]
-
-
-def _median_seconds(action, repetitions=51):
-    times = []
-    for _ in range(repetitions):
-        begin = perf_counter()
-        action()
-        times.append(perf_counter() - begin)
-    return float(np.median(times))
 
 
 if __name__ == "__main__":

@@ -1,16 +1,13 @@
 """Score fusion of all pairs of 517 users and four matchers, against scikit-learn's ROC."""
 
-from collections.abc import Callable
-from statistics import median
-from time import perf_counter
-
 import numpy as np
 from sklearn.metrics import roc_curve
 
 from replay.estimators.biometrics import RULES, normalise
 from replay.verification import Floats, genuine_accept_at, roc
+from tests.bench.timing import median_seconds
 
-USERS, MATCHERS, REPEATS = 517, 4, 5
+USERS, MATCHERS = 517, 4
 FALSE_ACCEPT = 1e-3
 
 Row = tuple[str, float, float, float]
@@ -36,7 +33,7 @@ def main() -> list[Row]:
         return float(accepted[np.searchsorted(false_accept, FALSE_ACCEPT, side="right") - 1])
 
     assert ours() == theirs()
-    fusion, curve, peer = ms(fused), ms(ours), ms(theirs)
+    fusion, curve, peer = (1000.0 * median_seconds(work) for work in (fused, ours, theirs))
     return [
         (f"ROC of {USERS}^2 pairs, ms; scikit-learn", curve, peer, peer / curve),
         (
@@ -46,14 +43,3 @@ def main() -> list[Row]:
             1000.0 / (fusion + curve),
         ),
     ]
-
-
-def ms(work: Callable[[], object]) -> float:
-    """The median time of a call, after one to warm up."""
-    work()
-    times = []
-    for _ in range(REPEATS):
-        start = perf_counter()
-        work()
-        times.append(perf_counter() - start)
-    return 1000.0 * median(times)

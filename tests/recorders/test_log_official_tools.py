@@ -15,9 +15,9 @@ from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap_protobuf.decoder import DecoderFactory
-from rerun.chunk import McapReader
 
 from recorders.log import LogWriter, RunMetadata, write_log
+from tests.bench.bench_log import read_with_rerun
 from tests.recorders.log_samples import rows_in_file, some_streams
 
 
@@ -183,16 +183,7 @@ def test_rerun_checks_converts_and_reads_the_log(written, tmp_path):
     run("mcap", "convert", path, "-o", tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").stat().st_size > 1000
 
-    found: dict[tuple[str, str], list[np.ndarray]] = {}
-    for chunk in McapReader(str(path), decoders=["protobuf"]).stream():
-        if not chunk.is_static:
-            batch = chunk.to_record_batch()
-            (name,) = [name for name in batch.schema.names if name.endswith(":message")]
-            messages = batch.column(name).flatten()
-            for field in messages.type:
-                values = messages.field(field.name)
-                values = values.flatten() if "list" in str(field.type) else values
-                found.setdefault((chunk.entity_path, field.name), []).append(values.to_numpy())
+    found = read_with_rerun(path)
     for topic, stream in streams.items():
         for name, column in stream.columns.items():
             expected = column[rows_in_file(stream)].tobytes()
