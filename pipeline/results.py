@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
+from recorders.parsing import parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -199,7 +200,7 @@ def read_result(folder: Path) -> Result:
     """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
     path = folder / RESULT_FILE
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:

@@ -43,7 +43,6 @@ _UNREADABLE = (
     RuntimeError,
     struct.error,
     zstandard.ZstdError,
-    MemoryError,
     OverflowError,
 )
 _RECORDS: dict[int, Any] = {
@@ -108,6 +107,10 @@ def open_region(raw: bytes, offset: int) -> Contents:
         if found.end != len(data):
             raise ValueError("a record inside it is not whole")
         declarations = [next(read_records(data.data, place)) for place in found.declarations.tolist()]
+    except MemoryError:
+        raise Damaged(
+            f"the chunk at byte {offset} does not fit into memory: it states {_stated_size(raw)} bytes"
+        ) from None
     except _UNREADABLE as error:
         raise Damaged(f"the chunk at byte {offset} is damaged ({error})") from error
     channel_ids = np.flatnonzero(found.counts)
@@ -135,7 +138,10 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
             raise ValueError("its size is wrong")
         data = zstandard.decompress(packed, size)
     elif compression == "lz4":
-        data = lz4.frame.decompress(packed)
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(packed, size + 1)
+        if not decompressor.eof:
+            raise ValueError("its size is wrong")
     elif compression == "":
         data = packed
     else:
@@ -145,6 +151,13 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
     if checksum not in (0, zlib.crc32(data)):
         raise ValueError("its checksum is wrong")
     return data
+
+
+def _stated_size(region: bytes) -> int:
+    """How many bytes a region has when it is open, as it says itself."""
+    if region[0] != Opcode.CHUNK:
+        return len(region)
+    return int(_CHUNK_HEAD.unpack_from(region, HEAD_BYTES)[2])
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:

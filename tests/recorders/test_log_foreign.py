@@ -561,6 +561,16 @@ LIES = [
     forget_a_schema,
 ]
 
+# What is read right without them: no chunk is stepped over that the walk through the file has not seen.
+HARMLESS = [
+    leave_out_a_chunk,
+    state_a_wrong_length,
+    step_over_the_next_chunk,
+    step_out_of_the_file,
+    count_no_messages,
+    forget_a_schema,
+]
+
 
 def assert_reads_as(log, honest, clock: str) -> None:
     """Whole, alone, block by block and second by second, a log gives what the honest one gave."""
@@ -587,7 +597,7 @@ def test_an_index_that_lies_is_found_out(tmp_path, lie, clock):
     assert_reads_as(open_log(path), honest, clock)
     path.write_bytes(with_summary(path.read_bytes(), lie))
     assert_reads_as(open_log(path, recover=True), honest, clock)
-    if lie in (leave_out_a_chunk, state_a_wrong_length, count_no_messages, forget_a_schema):
+    if lie in HARMLESS:
         assert_reads_as(open_log(path), honest, clock)
     else:
         with pytest.raises(BadInput, match="--recover"):
