@@ -174,6 +174,7 @@ def write_outcome(
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+            _show_names_as_they_are(figure)
             figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
     result = Result(
         experiment=experiment,
@@ -186,6 +187,16 @@ def write_outcome(
     text = json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False)
     (folder / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
     return result
+
+
+def _show_names_as_they_are(figure: "Figure") -> None:
+    """Titles and labels hold names from logs: a dollar sign in them begins no formula."""
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
+    texts = [text for legend in legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
+    for text in texts:
+        text.set_parse_math(False)
 
 
 def _decided(claim: Claim) -> Claim:
