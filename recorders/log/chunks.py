@@ -36,6 +36,9 @@ _COMPRESS: Mapping[str, Callable[[memoryview], bytes]] = {
     "none": bytes,
 }
 COMPRESSIONS = tuple(_COMPRESS)
+# A byte of lz4 stands for 255 at most, and four of zstd for a block of 128 KiB: a chunk that states more
+# is not given the memory.
+_MOST_FROM_A_BYTE = {"zstd": 1 << 15, "lz4": 255, "": 1}
 
 _UNREADABLE = (
     McapError,
@@ -132,7 +135,11 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
     packed = memoryview(chunk)[place + _LENGTH.size :]
     if len(packed) != packed_length:
         raise ValueError("its length is wrong")
-    data: bytes | memoryview
+    if compression not in _MOST_FROM_A_BYTE:
+        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
+    if size > _MOST_FROM_A_BYTE[compression] * len(packed):
+        raise ValueError("its size is wrong")
+    data: bytes | memoryview = packed
     if compression == "zstd":
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise ValueError("its size is wrong")
@@ -142,10 +149,6 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
         data = decompressor.decompress(packed, size + 1)
         if not decompressor.eof:
             raise ValueError("its size is wrong")
-    elif compression == "":
-        data = packed
-    else:
-        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
     if len(data) != size:
         raise ValueError("its size is wrong")
     if checksum not in (0, zlib.crc32(data)):

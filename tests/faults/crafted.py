@@ -79,7 +79,7 @@ def _complaint(command: str, log: Path) -> str:
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main(command.split())
-    except Exception as error:  # noqa: BLE001 - a traceback, whatever it is of
+    except Exception as error:  # a traceback, whatever it is of
         return f"{command}: {type(error).__name__}: {str(error)[:200]}"
     said = err.getvalue()
     if code == 0 or (code == 2 and said.startswith("fuselog: ") and said.count("\n") == 1):

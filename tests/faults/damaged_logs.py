@@ -1,4 +1,4 @@
-"""What reading a damaged log may give: exactly what was written, a part of it that is stated, a sentence.
+"""What reading a damaged log may give: all that was written, a part of it that is stated, a sentence.
 
 A wrong number, a traceback, and memory without bound are what may not be. Flips and cuts share this.
 """
@@ -6,7 +6,7 @@ A wrong number, a traceback, and memory without bound are what may not be. Flips
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,7 +72,9 @@ def _sample(path: Path, compression: str, seed: int) -> Sample:
 def _messages(stream: Stream) -> list[bytes]:
     """Both clocks and all fields of each message; no two are equal, for their numbers are random."""
     columns = (stream.log_time_ns, stream.publish_time_ns, *stream.columns.values())
-    return [b"".join(row) for row in zip(*([each.tobytes() for each in c] for c in columns), strict=True)]
+    return [
+        b"".join(row) for row in zip(*([each.tobytes() for each in c] for c in columns), strict=True)
+    ]
 
 
 def _complaint(path: Path, whole: Sample, *, recover: bool) -> str:
@@ -83,7 +85,7 @@ def _complaint(path: Path, whole: Sample, *, recover: bool) -> str:
     except BadInput as error:
         sentence = str(error)
         wrong = "" if str(path) in sentence and len(sentence.splitlines()) == 1 else f"says {sentence!r}"
-    except Exception as error:  # noqa: BLE001 - a traceback, whatever it is of
+    except Exception as error:  # a traceback, whatever it is of
         wrong = f"{type(error).__name__}: {error}"
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -264,10 +264,32 @@ def test_a_chunk_gets_no_more_memory_than_it_states(tmp_path, compression):
         tracemalloc.stop()
 
 
-def test_a_chunk_that_does_not_fit_into_memory_is_told_as_such(tmp_path):
-    path = tmp_path / "giant.mcap"
-    with_chunk(path, 1 << 62, lz4.frame.compress(b"abc"))
-    assert f"does not fit into memory: it states {1 << 62} bytes" in refusal(path)
+@pytest.mark.parametrize("compression", [b"lz4", b"zstd", b""])
+def test_a_chunk_that_states_more_than_its_bytes_can_be_is_not_given_the_memory(tmp_path, compression):
+    pack = {
+        b"lz4": lz4.frame.compress,
+        b"zstd": zstandard.ZstdCompressor(write_content_size=False).compress,
+    }
+    for size in (1 << 30, 1 << 62):
+        with_chunk(tmp_path / "giant.mcap", size, pack.get(compression, bytes)(b"abc"), compression)
+        tracemalloc.start()
+        try:
+            assert "its size is wrong" in refusal(tmp_path / "giant.mcap")
+            assert tracemalloc.get_traced_memory()[1] < 4 << 20
+        finally:
+            tracemalloc.stop()
+
+
+def test_a_chunk_that_does_not_fit_into_memory_is_told_as_such(tmp_path, monkeypatch):
+    """A lack of memory is no damage of the file, and its exception says nothing of itself."""
+    path = tmp_path / "run.mcap"
+    with_chunk(path, 3, lz4.frame.compress(b"abc"))
+
+    def lack(_):
+        raise MemoryError
+
+    monkeypatch.setattr("recorders.log.chunks.scan", lack)
+    assert "the chunk at byte 8 does not fit into memory: it states 3 bytes" in refusal(path)
     assert "does not fit into memory" in open_log(path, recover=True).loss_statement
 
 
