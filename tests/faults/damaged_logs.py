@@ -44,7 +44,7 @@ def tally(
     tried, notes = 0, []
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder:
         path = Path(folder, "run.mcap")
-        samples = {each: _sample(path, each, int(rng.integers(1 << 32))) for each in COMPRESSIONS}
+        samples = {each: sample(path, each, int(rng.integers(1 << 32))) for each in COMPRESSIONS}
         while time.monotonic() < end and tried != most:
             compression = COMPRESSIONS[tried % len(COMPRESSIONS)]
             whole = samples[compression]
@@ -59,7 +59,7 @@ def tally(
     return Tally(tried, tried - len(notes), notes)
 
 
-def _sample(path: Path, compression: str, seed: int) -> Sample:
+def sample(path: Path, compression: str, seed: int) -> Sample:
     """A log of four topics in two blocks and a dozen chunks, with late messages and equal stamps."""
     with LogWriter(path, RUN, compression=compression, chunk_bytes=900) as log:
         log.write(some_streams(seed, count=20))

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -55,9 +56,14 @@ def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
 
     def start(*arguments: str, **options: Any) -> subprocess.Popen[str]:
         command = [str(Path(sys.executable).with_name("fuselog")), *arguments]
-        return subprocess.Popen(
-            command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-        )
+        # a child inherits that Ctrl-C is ignored, as of `nohup` or a script's background job
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            return subprocess.Popen(
+                command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+            )
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     return start
 

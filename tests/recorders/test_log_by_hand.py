@@ -25,6 +25,8 @@ from recorders.log import (
 )
 from recorders.log.ahead import ahead
 from recorders.log.chunks import Damaged, Span, open_region
+from recorders.log.layout import layout_of
+from recorders.log.loops import agree
 from recorders.log.sealed import seal, unseal
 
 # Two blocks of five scans; the second block reaches back, and stamps are equal within and across them.
@@ -152,6 +154,23 @@ def test_the_bytes_of_messages_are_those_of_mcap_and_protobuf(tmp_path):
     for number, state in enumerate(states):
         head = struct.pack("<HIQQBq", 2, number, 20 + number, 10 + number, 0x09, 30 + number)
         assert messages[1 + number] == head + b"\x12\x80\x01" + state.tobytes()
+
+
+def test_no_byte_behind_the_data_is_compared():
+    """A chunk is a piece of memory, and what follows it there may look like the rest of a message."""
+    stream = scans([1, 2, 3], [1, 2, 3], [1, 2, 3])
+    layout = layout_of(stream.schema, {})
+    raw = layout.build(stream, 1, 0).view(np.uint8)
+    offsets = np.arange(3) * layout.pattern.size
+    assert agree(raw, offsets, layout.pattern)
+    for missing in (1, 8, layout.pattern.size - 1):
+        assert not agree(raw[:-missing], offsets, layout.pattern)
+    for place in range(len(raw)):
+        changed = raw.copy()
+        changed[place] ^= 1
+        field = place % layout.pattern.size
+        is_fixed = field < 9 or field in (31, 40, 45)  # opcode, length, and the tags of three fields
+        assert agree(changed, offsets, layout.pattern) != is_fixed
 
 
 def test_the_checksum_of_the_data_is_there_and_right(tmp_path):
