@@ -196,6 +196,8 @@ def _write_experiments() -> None:
         "misfit": 'title = "t"\n[record]\nscenario = "landmarks"\n[record.parameters]\n'
         "range_bearing = { rate_hz = 0.0 }\n[estimators.ekf]",
         "scenario": "[parameters]\nduration_s = 1",
+        "deep": "title = " + "[" * 100_000,
+        "digits": "title = " + "1" * 5000,
     }.items():
         Path(f"{name}.toml").write_text(text)
 
