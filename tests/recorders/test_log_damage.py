@@ -218,6 +218,17 @@ def test_what_does_not_fit_together_is_told_without_a_checksum(tmp_path):
         assert sum(map(len, found.values())) == 0
 
 
+def test_a_chunk_that_states_less_than_it_holds_is_told(tmp_path):
+    """Bytes behind its data would be read, or left out, in silence."""
+    path = tmp_path / "run.mcap"
+    raw = without_checksums(path)
+    place = raw.index(b"\x06", 40) + 41  # the length of the chunk's data
+    (length,) = struct.unpack_from("<Q", raw, place)
+    struct.pack_into("<Q", raw, place, length - 1)
+    path.write_bytes(raw)
+    assert "its length is wrong" in refusal(path, everything)
+
+
 def test_a_number_that_means_two_channels_is_told(tmp_path):
     """Two logs in one file, say; without a summary nothing else would tell."""
     path = tmp_path / "run.mcap"
