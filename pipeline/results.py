@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
+from recorders.parsing import parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -173,6 +174,7 @@ def write_outcome(
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+            _show_names_as_they_are(figure)
             figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
     result = Result(
         experiment=experiment,
@@ -187,6 +189,16 @@ def write_outcome(
     return result
 
 
+def _show_names_as_they_are(figure: "Figure") -> None:
+    """Titles and labels hold names from logs: a dollar sign in them begins no formula."""
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
+    texts = [text for legend in legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
+    for text in texts:
+        text.set_parse_math(False)
+
+
 def _decided(claim: Claim) -> Claim:
     """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
     if not re.search(r"\bnan\b", claim.ours):
@@ -199,7 +211,7 @@ def read_result(folder: Path) -> Result:
     """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
     path = folder / RESULT_FILE
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:

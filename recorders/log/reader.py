@@ -160,6 +160,12 @@ def _contents(log: Log, region: Region, raw: bytes) -> Contents:
                 f"{log.path}: the chunk at byte {region.offset} has messages at times outside those "
                 "that its index states; read it without the index, with --recover"
             )
+    stated = log.container.channels.keys() if region.channel_ids is None else region.channel_ids
+    for channel_id in contents.messages.keys() - stated:
+        raise BadInput(
+            f"{log.path}: the chunk at byte {region.offset} has messages of channel {channel_id}, of "
+            "which its index does not tell; read it without the index, with --recover"
+        )
     return contents
 
 

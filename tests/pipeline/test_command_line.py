@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +249,15 @@ def _stop_when(part: Path, process: Any, number: int) -> str:
     return str(process.communicate()[1])
 
 
+@pytest.fixture
+def parent_that_ignores_interrupts() -> Iterator[None]:
+    """What runs the tests may do so."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("parent_that_ignores_interrupts")
 def test_a_stopped_run_leaves_nothing_and_a_killed_one_a_part(
     here: Path, start_fuselog: Callable[..., Any], fuselog: Fuselog
 ) -> None:
