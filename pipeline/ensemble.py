@@ -32,6 +32,7 @@ from replay.evaluation import (
 from replay.metrics import Output
 from replay.set_errors import SetErrors, set_errors
 from replay.sources import MemorySource, Source, memory_source
+from replay.starting import Origin, start_from
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
@@ -150,20 +151,27 @@ def replay_to_logs(
     paths: Sequence[Path],
     *,
     order: Clock = "publish_time",
+    origins: Sequence[Origin] = (),
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
 ) -> None:
-    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand."""
+    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
+
+    `origins` are what the runs start from where their spans begin after their priors, one per run.
+    """
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
 
     def write_some(first: int) -> Iterator[int]:
         now = slice(first, first + RUNS_AT_ONCE)
+        begun = [
+            start_from(each, sources[now], origins[now], order) if origins else each for each in bound
+        ]
         with ExitStack() as stack:
             writers = [
                 stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
                 for path, source in zip(paths[now], sources[now], strict=True)
             ]
-            for block in replay(sources[now], bound, order=order, block_messages=block_messages):
+            for block in replay(sources[now], begun, order=order, block_messages=block_messages):
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block])
                 yield first
@@ -180,7 +188,7 @@ def estimates_metadata(
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
-    run = source.run or RunMetadata("unknown")
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath((log or Path(source.name)).resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()})
     return replace(run, notes={"log": place, "estimators": settings})
