@@ -267,6 +267,7 @@ def _print_outcome(
 ) -> None:
     values = plain(measure(replayed.judged, find_metrics(metrics)))
     failures = replayed.failures
+    _state_unjudged(replayed)
     for sentence in failures[:5]:
         warn(sentence)
     if len(failures) > 5:
@@ -277,6 +278,12 @@ def _print_outcome(
     print_metrics(values)
     for path in written:
         say(str(path))
+
+
+def _state_unjudged(replayed: Replayed) -> None:
+    """What of the estimates has no truth, in one sentence for each."""
+    for sentence in replayed.unjudged:
+        warn(sentence)
 
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
@@ -327,6 +334,7 @@ def _draw_log(
         source = LogSource(open_log(_source_path(log), recover=recover))
     replayed = judge([source], outputs, gap_limit_s)
     show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
+    _state_unjudged(replayed)
     _state_losses([log, source.log])
 
 

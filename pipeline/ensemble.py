@@ -28,6 +28,7 @@ from replay.evaluation import (
     gaussian_estimates,
     innovations_of,
     split_topic,
+    unjudged,
 )
 from replay.metrics import Output
 from replay.set_errors import SetErrors, set_errors
@@ -64,6 +65,22 @@ class Replayed:
             for topic, rows in self.outputs.items()
         ]
         return [*self.errors, *self.innovations, *self.sets, *outputs]
+
+    @property
+    def unjudged(self) -> list[str]:
+        """A sentence for every estimate of which the truth lacks components."""
+        sentences = []
+        for estimates in gaussian_estimates(self.outputs):
+            names = unjudged(estimates, self.sources)
+            if names:
+                stream = estimates.stream
+                what = " ".join(filter(None, split_topic(stream.topic)))
+                verb = "is" if len(names) == 1 else "are"
+                sentences.append(
+                    f"{what}: {', '.join(names)} {verb} not judged: {stream.metadata['truth']} lacks "
+                    + ("it" if len(names) == 1 else "them")
+                )
+        return sentences
 
     @property
     def failures(self) -> list[str]:

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.blocks import Ragged
+from replay.components import Components
 from replay.estimators.feasible_sets import excess_rad, signed_area
 from replay.estimators.set_membership import frames, map_and_arena
-from replay.evaluation import split_topic, truth_at
+from replay.evaluation import reference, split_topic
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
+
+PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,7 @@ def _judge(
     run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
     topic = sizes.stream.metadata["truth"]
     truth = [
-        truth_at(
-            source.read([topic])[topic],
-            sizes.of_run(number).publish_time_ns,
-            source.topics[topic].metadata.get("kinds", "linear,linear").split(","),
-            gap_limit_s,
-        )[:, :2]
+        reference(source, topic, PLACE, sizes.of_run(number), gap_limit_s)
         for number, source in enumerate(sources)
     ]
     places = np.concatenate(truth)
