@@ -146,14 +146,16 @@ def _origins(
         raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
     if stated and tuple(origins) != ("truth",):
         raise BadInput(f"--start-sigma {sigmas[0]}: is for --start-from truth")
+    if not origins:
+        return []
     if tuple(origins) == ("truth",):
         return [from_truth(source, order, gap_limit_s, stated) for source in sources]
-    if origins and len(origins) != len(sources):
+    if len(origins) != len(sources):
         raise BadInput(
             f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
         )
     opened = [open_log(origin) for origin in origins]
-    for estimates, source in zip(opened, sources, strict=bool(origins)):
+    for estimates, source in zip(opened, sources, strict=True):
         _check_same_run(estimates, source.log)
     return [from_estimates(LogSource(estimates)) for estimates in opened]
 

@@ -1,6 +1,6 @@
 """Sets against truth: area, whether the true position is inside, and how often there is no set."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,8 +93,8 @@ def _judge(
     places = np.concatenate(truth)
     in_arena, bound_holds = np.concatenate(
         [
-            _premises_hold(sizes.stream.metadata, source, there)
-            for source, there in zip(sources, truth, strict=True)
+            _premises_hold(sizes.of_run(number), source, truth[number])
+            for number, source in enumerate(sources)
         ],
         axis=1,
     )
@@ -118,12 +118,15 @@ def _judge(
     )
 
 
-def _premises_hold(stated: Mapping[str, str], source: Source, places: Floats) -> NDArray[np.bool_]:
+def _premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
     """Whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
-    landmarks, seen = source.read(["/landmarks", stated["measured"]]).values()
+    measured = sizes.metadata["measured"]
+    streams = source.read(["/landmarks", measured])
     hold = np.zeros((2, len(places)), bool)
-    for number, frame in enumerate(frames(seen, landmarks, Known.of(stated))):
-        place = places[number]
-        hold[0, number] = np.all((frame.arena.low <= place) & (place <= frame.arena.high))
-        hold[1, number] = np.all(excess_rad(frame.pairs, place) <= 0)
+    row_of = {time_ns: row for row, time_ns in enumerate(sizes.publish_time_ns.tolist())}
+    for frame in frames(streams[measured], streams["/landmarks"], Known.of(sizes.metadata)):
+        row = row_of.get(frame.time_ns)  # none outside the span that was replayed
+        if row is not None:
+            hold[0, row] = np.all((frame.arena.low <= places[row]) & (places[row] <= frame.arena.high))
+            hold[1, row] = np.all(excess_rad(frame.pairs, places[row]) <= 0)
     return hold

@@ -8,7 +8,7 @@ from matplotlib.path import Path
 
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, make_stream, schemas
+from recorders.log import RunMetadata, make_stream, open_log, schemas, write_log
 from recorders.recording import Recording, import_run
 from replay.engine import bind
 from replay.estimators.feasible_sets import arena_around, box, exact_set, excess_rad, rings
@@ -16,7 +16,7 @@ from replay.estimators.pseudo_ellipsoids import fit, room
 from replay.estimators.set_membership import Known, frames
 from replay.evaluation import truth_at
 from replay.set_evaluation import judge_sets
-from replay.sources import memory_source
+from replay.sources import LogSource, memory_source
 
 SHAPES = ("exact", "box", "l4", "l8")
 
@@ -188,6 +188,18 @@ def test_bearings_alone_need_an_arena_or_a_range():
         judged([beyond(None)], ("exact",), bound_deg=4.0)
     with pytest.raises(BadInput, match="low x, low y, high x, high y"):
         judged([beyond(0.1)], ("exact",), bound_deg=4.0, arena_m=(1, 1, 0, 2))
+
+
+def test_the_sets_of_a_span_are_judged_by_their_own_frames(tmp_path):
+    parameters = {"scene": "random", "looks": 9, "landmarks": 4, "bound_deg": 3.0}
+    (whole,) = record_ensemble("relative-bearings", parameters, 5, 1)
+    write_log(tmp_path / "log.mcap", list(whole.streams.values()), whole.run)
+    stamps_ns = whole.streams["/robot1/truth"].publish_time_ns
+    part = LogSource(open_log(tmp_path / "log.mcap"), start_ns=int(stamps_ns[4]))
+    _, sets = judged([part], ("exact",))
+    assert len(sets["exact"].inside) == 5
+    assert sets["exact"].bound_holds.all()
+    assert sets["exact"].violations == sets["exact"].outside_arena == 0
 
 
 def test_neither_the_order_of_the_map_nor_a_landmark_seen_twice_changes_a_set():
