@@ -29,8 +29,6 @@ SENSORS = {
     "bearing": schemas.BEARING,
     "relative_bearing": schemas.RELATIVE_BEARING,
 }
-# What a sensor's channel says of it.
-STATED = ("sigma_range_m", "sigma_bearing_rad", "maximum_range_m")
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
 
@@ -202,7 +200,7 @@ def _robot_streams(
             continue
         seen = _look(sensor, robot, targets, sensor_rng)
         look, columns = _measure(schema, sensor, seen, sensor_rng)
-        stated = {key: repr(getattr(sensor, key)) for key in STATED}
+        stated = {key: repr(getattr(sensor, key)) for key in ("sigma_range_m", "sigma_bearing_rad")}
         streams.append(
             make_stream(
                 f"{prefix}/{name}",
