@@ -154,6 +154,21 @@ def _say_written(path: Path, messages: int) -> None:
 )
 @click.option("--arrival-order", is_flag=True, help="Go by log time, as the messages arrived.")
 @click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option(
+    "--start-from",
+    "origins",
+    multiple=True,
+    metavar="truth|ESTIMATES",
+    help="What filters begin with at --start: the log's truth, or the estimates log of an earlier "
+    "replay (one per log).",
+)
+@click.option(
+    "--start-sigma",
+    "sigmas",
+    multiple=True,
+    metavar="COMPONENT=SIGMA",
+    help="How well --start-from truth knows a component (repeatable) [default: as the log's prior].",
+)
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")

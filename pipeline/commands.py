@@ -4,6 +4,7 @@ Rerun and matplotlib take long to import: only what draws imports them.
 """
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +17,13 @@ from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Log, open_log
+from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
 from replay.engine import configure, find_estimator
 from replay.metrics import Output, find_metrics, measure
-from replay.sources import LogSource, log_span_ns
+from replay.sources import LogSource
+from replay.starting import Origin, from_estimates, from_truth
 
 
 def replay_logs(
@@ -32,6 +34,8 @@ def replay_logs(
     arrival_order: bool,
     start_s: float | None,
     end_s: float | None,
+    origins: Sequence[str],
+    sigmas: Sequence[str],
     save: Path | None,
     connect: str | None,
     recover: bool,
@@ -42,9 +46,17 @@ def replay_logs(
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     estimators = _settings_of_estimators(names, parse_settings(settings))
-    sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
     order: Clock = "log_time" if arrival_order else "publish_time"
-    replay_to_logs(sources, estimators, paths, order=order, progress=progress)
+    opened = [LogSource(open_log(path, recover=recover)) for path in logs]
+    sources = [_span(source, start_s, end_s, order) for source in opened]
+    replay_to_logs(
+        sources,
+        estimators,
+        paths,
+        order=order,
+        origins=_origins(sources, origins, sigmas, order, gap_limit_s),
+        progress=progress,
+    )
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
     _print_outcome(replayed, (), as_json=as_json, written=paths)
@@ -102,20 +114,64 @@ def _settings_of_estimators(
     return chosen
 
 
-def _span(source: LogSource, start_s: float | None, end_s: float | None) -> LogSource:
-    """The part of a log between two times in seconds from its epoch."""
+def _span(source: LogSource, start_s: float | None, end_s: float | None, order: Clock) -> LogSource:
+    """The part of a log between two times in seconds, by the clock that orders the replay."""
     if start_s is not None and end_s is not None and start_s >= end_s:
         raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
+    if start_s is None and end_s is None:
+        return source
+    zero_ns = source.zero_ns(order)
     start_ns, end_ns = (
-        None if time_s is None else source.epoch_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
+        None if time_s is None else zero_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
     )
-    first_ns, last_ns = log_span_ns(source.log)
+    first_ns, last_ns = read_span(source.log, order)
     if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
-        first_s, last_s = ((time_ns - source.epoch_ns) * 1e-9 for time_ns in (first_ns, last_ns))
+        first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
         raise BadInput(
             f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
         )
     return LogSource(source.log, start_ns, end_ns)
+
+
+def _origins(
+    sources: Sequence[LogSource],
+    origins: Sequence[str],
+    sigmas: Sequence[str],
+    order: Clock,
+    gap_limit_s: float,
+) -> list[Origin]:
+    """What each run starts from; none where that is not stated."""
+    stated = _sigmas(sigmas)
+    if origins and sources[0].start_ns is None:
+        raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
+    if stated and tuple(origins) != ("truth",):
+        raise BadInput(f"--start-sigma {sigmas[0]}: is for --start-from truth")
+    if not origins:
+        return []
+    if tuple(origins) == ("truth",):
+        return [from_truth(source, order, gap_limit_s, stated) for source in sources]
+    if len(origins) != len(sources):
+        raise BadInput(
+            f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
+        )
+    opened = [open_log(origin) for origin in origins]
+    for estimates, source in zip(opened, sources, strict=True):
+        _check_same_run(estimates, source.log)
+    return [from_estimates(LogSource(estimates)) for estimates in opened]
+
+
+def _sigmas(texts: Sequence[str]) -> dict[str, float]:
+    """Standard deviations by component, from COMPONENT=SIGMA."""
+    sigmas: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            sigmas[name] = float(value)
+        except ValueError:
+            sigmas[name] = math.nan
+        if not 0 < sigmas[name] < math.inf:
+            raise BadInput(f"--start-sigma {text}: expected COMPONENT=SIGMA with a positive number")
+    return sigmas
 
 
 def _state_losses(logs: Iterable[Log]) -> None:
@@ -213,6 +269,7 @@ def _print_outcome(
 ) -> None:
     values = plain(measure(replayed.judged, find_metrics(metrics)))
     failures = replayed.failures
+    _state_unjudged(replayed)
     for sentence in failures[:5]:
         warn(sentence)
     if len(failures) > 5:
@@ -223,6 +280,12 @@ def _print_outcome(
     print_metrics(values)
     for path in written:
         say(str(path))
+
+
+def _state_unjudged(replayed: Replayed) -> None:
+    """What of the estimates has no truth, in one sentence for each."""
+    for sentence in replayed.unjudged:
+        warn(sentence)
 
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
@@ -273,6 +336,7 @@ def _draw_log(
         source = LogSource(open_log(_source_path(log), recover=recover))
     replayed = judge([source], outputs, gap_limit_s)
     show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
+    _state_unjudged(replayed)
     _state_losses([log, source.log])
 
 

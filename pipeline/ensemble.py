@@ -28,10 +28,12 @@ from replay.evaluation import (
     gaussian_estimates,
     innovations_of,
     split_topic,
+    unjudged,
 )
 from replay.metrics import Output
 from replay.set_errors import SetErrors, set_errors
 from replay.sources import MemorySource, Source, memory_source
+from replay.starting import Origin, start_from
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
@@ -63,6 +65,22 @@ class Replayed:
             for topic, rows in self.outputs.items()
         ]
         return [*self.errors, *self.innovations, *self.sets, *outputs]
+
+    @property
+    def unjudged(self) -> list[str]:
+        """A sentence for every estimate of which the truth lacks components."""
+        sentences = []
+        for estimates in gaussian_estimates(self.outputs):
+            names = unjudged(estimates, self.sources)
+            if names:
+                stream = estimates.stream
+                what = " ".join(filter(None, split_topic(stream.topic)))
+                verb = "is" if len(names) == 1 else "are"
+                sentences.append(
+                    f"{what}: {', '.join(names)} {verb} not judged: {stream.metadata['truth']} lacks "
+                    + ("it" if len(names) == 1 else "them")
+                )
+        return sentences
 
     @property
     def failures(self) -> list[str]:
@@ -150,20 +168,27 @@ def replay_to_logs(
     paths: Sequence[Path],
     *,
     order: Clock = "publish_time",
+    origins: Sequence[Origin] = (),
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
 ) -> None:
-    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand."""
+    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
+
+    `origins` are what the runs start from where their spans begin after their priors, one per run.
+    """
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
 
     def write_some(first: int) -> Iterator[int]:
         now = slice(first, first + RUNS_AT_ONCE)
+        begun = [
+            start_from(each, sources[now], origins[now], order) if origins else each for each in bound
+        ]
         with ExitStack() as stack:
             writers = [
                 stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
                 for path, source in zip(paths[now], sources[now], strict=True)
             ]
-            for block in replay(sources[now], bound, order=order, block_messages=block_messages):
+            for block in replay(sources[now], begun, order=order, block_messages=block_messages):
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block])
                 yield first
@@ -180,7 +205,7 @@ def estimates_metadata(
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
-    run = source.run or RunMetadata("unknown")
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath((log or Path(source.name)).resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()})
     return replace(run, notes={"log": place, "estimators": settings})

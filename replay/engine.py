@@ -16,7 +16,7 @@ from typing import Any, Generic
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Stream, Topic
+from recorders.log import Clock, Stream, Topic, schemas
 from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
@@ -153,9 +153,12 @@ def replay(
         order: the clock to go by, publish time or (as it arrived) log time.
         block_messages: about how many messages of a run are in memory at once.
 
-    Raises BadInput where an estimator raises, or no run has a message for it.
+    Raises BadInput where an estimator raises, no run has a message for it, or a run's span begins after
+    the prior of an estimator (see `replay.starting`).
     """
     whole = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    for bound in estimators:
+        _refuse_old_priors(bound, sources, whole, order)
     given = [{topic: whole[topic] for topic in bound.whole} for bound in estimators]
     states: list[Any] = [None] * len(estimators)
     for index, bound in enumerate(estimators):
@@ -178,6 +181,27 @@ def replay(
                     states[index], produced = bound.run(states[index], Block(streams, events))
                 outputs += produced
         yield outputs
+
+
+def prior_topics(bound: Bound, source: Source) -> list[str]:
+    """The topics that an estimator takes its first state from."""
+    schema_name = schemas.GAUSSIAN_ESTIMATE.full_name
+    return [topic for topic in bound.whole if source.topics[topic].schema_name == schema_name]
+
+
+def _refuse_old_priors(
+    bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
+) -> None:
+    """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
+    for topic in prior_topics(bound, sources[0]):
+        for run, source in enumerate(sources):
+            times_ns = whole[topic].of_run(run).times(order)[:1]
+            if source.start_ns is not None and len(times_ns) and times_ns[0] < source.start_ns:
+                raise BadInput(
+                    f"{source.name}: the replay would start {bound.name} from {topic}, which is "
+                    f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
+                    "to start from with --start-from truth or --start-from ESTIMATES"
+                )
 
 
 def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, Ragged]:

@@ -68,7 +68,10 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any]]) -> dict[s
 
 
 def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of position, orientation and every other component over all runs and steps."""
+    """RMSE of position, orientation and every other component over all runs and steps.
+
+    NaN, which is written as null, for a component that the truth lacks.
+    """
     values: dict[str, float] = {}
     if len(errors.error) and errors.position:
         values["position_rmse_m"] = _rms(errors.error[:, errors.position])
@@ -76,9 +79,15 @@ def accuracy(errors: Errors) -> dict[str, float]:
         values["orientation_rmse_deg"] = float(np.degrees(_rms(errors.error[:, errors.rotation])))
     for column, name in enumerate(errors.components):
         if len(errors.error) and column not in errors.position:
-            quantity, _, unit = name.rpartition("_")
-            values[f"{quantity}_rmse_{unit}".strip("_")] = _rms(errors.error[:, [column]])
+            values[_rmse_of(name)] = _rms(errors.error[:, [column]])
+    values |= {_rmse_of(name): np.nan for name in errors.unjudged}
     return values | {"estimates_without_truth": errors.without_truth}
+
+
+def _rmse_of(component: str) -> str:
+    """What the RMSE of a component is called: `turn_rmse_radps` of `turn_radps`."""
+    quantity, _, unit = component.rpartition("_")
+    return f"{quantity}_rmse_{unit}".strip("_")
 
 
 def _rms(error: Floats) -> float:

@@ -34,11 +34,16 @@ class Happened(NamedTuple):
 def draw_events(canvas: Canvas, scene: Scene, case: str) -> rrb.TextLogView:
     """The events of a case: one entity per estimator and sensor."""
     root = entity_path("events", case)
-    for who, level, time_ns, texts in (*_of_estimators(scene, case), *_of_sensors(scene, case)):
+    unread = Happened("log", "INFO", np.full(len(scene.unread), canvas.epoch_ns), _not_drawn(scene))
+    for who, level, time_ns, texts in (unread, *_of_estimators(scene, case), *_of_sensors(scene, case)):
         lines = [f"{who}: {text}" for text in texts]
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
     return events_view(root)
+
+
+def _not_drawn(scene: Scene) -> list[str]:
+    return [f"{topic} is not drawn: {reason}" for topic, reason in scene.unread.items()]
 
 
 def events_view(root: str) -> rrb.TextLogView:

@@ -77,7 +77,7 @@ def _errors_of_run(errors: Errors, run: int) -> Errors:
 
 
 def _canvas(scene: Scene, recording: rr.RecordingStream) -> Canvas:
-    epoch_ns = scene.source.run.epoch_ns if scene.source.run else 0
+    epoch_ns = scene.source.epoch_ns
     none = np.empty(0, np.int64)
     steps_ns = np.unique(
         np.concatenate([none, *(each.publish_time_ns for each in scene.outputs.values())])

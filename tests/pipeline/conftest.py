@@ -36,11 +36,11 @@ class Said(NamedTuple):
         return json.loads(self.out)
 
 
-def run_here(*arguments: str) -> Said:
+def run_here(*arguments: str | Path) -> Said:
     """The command line in this process: quick, and no warning goes unseen."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
-        code = main(arguments)
+        code = main([str(each) for each in arguments])
     return Said(code, out.getvalue(), err.getvalue())
 
 

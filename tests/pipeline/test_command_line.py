@@ -9,15 +9,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from recorders.log import open_log, read_streams
+from recorders.log import open_log, read_streams, write_log
 
 Fuselog = Callable[..., Any]
+PLACE = {"components": "y_m,x_m", "kinds": "linear,linear"}
 
 
 @pytest.fixture
@@ -128,6 +130,26 @@ def test_a_span_is_replayed_and_judged_alone(world: Path, fuselog: Fuselog) -> N
     assert log.run is not None
     assert len(stamps_ns) > 0
     assert stamps_ns.max() < log.run.epoch_ns + 10**9
+
+
+@pytest.mark.usefixtures("here")
+def test_what_the_truth_lacks_is_said_once_and_the_rest_is_judged(world: Path, fuselog: Fuselog) -> None:
+    """A truth without heading: position and its NEES of two components, for every estimator."""
+    log = open_log(world / "log.mcap")
+    streams = read_streams(log, list(log.topics))
+    truth = streams["/robot1/truth"]
+    streams["/robot1/truth"] = replace(
+        truth, columns={**truth.columns, "state": truth["state"][:, 1::-1]}, metadata=PLACE
+    )
+    write_log("log.mcap", list(streams.values()), log.run)
+    said = fuselog("replay", "log.mcap", "-e", "ekf", "-e", "ukf", "--save", "log.rrd", "--json")
+    assert said.code == 0
+    for name in ("ekf", "ukf"):
+        assert said.err.count(f"{name} robot1: heading_rad is not judged: /robot1/truth lacks it") == 1
+        assert said.json["metrics"][f"{name}.heading_rmse_rad.robot1"] is None
+        assert said.json["metrics"][f"{name}.position_rmse_m.robot1"] < 0.1
+        assert 0.2 < said.json["metrics"][f"{name}.nees.robot1"] < 6
+    assert Path("log.rrd").exists()
 
 
 @pytest.mark.usefixtures("here")
