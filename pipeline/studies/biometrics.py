@@ -156,7 +156,8 @@ def _complete(replayed: Replayed) -> dict[str, Fused]:
     found = {
         topic: fused_of(rows.of_run(0))
         for topic, rows in replayed.outputs.items()
-        if split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single"
+        if topic.endswith("/fused")
+        and (split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single")
     }
     return {topic: fused for topic, fused in found.items() if fused.is_complete}
 

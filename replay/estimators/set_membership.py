@@ -31,6 +31,7 @@ from replay.estimators.feasible_sets import (
     to_blame,
 )
 from replay.estimators.pseudo_ellipsoids import Weighting, fit, outline
+from replay.measurements import PLANE, read_vectors
 
 LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
@@ -86,7 +87,7 @@ def frames(
 
 def map_and_arena(landmarks: Stream, margin_m: float) -> tuple[dict[int, Floats], Arena]:
     """The landmarks by number and the arena that the log states, or the one around them."""
-    places = landmarks["position_m"][:, :2]
+    places = read_vectors(landmarks, "position_m", PLANE)
     numbers = landmarks["landmark_id"].tolist()
     stated = landmarks.metadata.get("arena_m")
     if stated is None:
