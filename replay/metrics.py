@@ -92,6 +92,8 @@ def consistency(errors: Errors) -> dict[str, float]:
     if len(nees) == 0:
         return {}
     values = {"nees": float(nees.mean())}
+    if len(nees) < len(errors.nees):  # of singular covariances there is none
+        values["estimates_without_nees"] = float(len(errors.nees) - len(nees))
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
         squared = normalized_error_squared(errors.error[:, errors.position], block)

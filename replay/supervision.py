@@ -39,7 +39,7 @@ UNSOUND = (
     "the stamps of its estimates go back",
 )
 NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK = range(len(UNSOUND))
-# A share of a variance: a covariance that is singular but for rounding, as of few particles, is one.
+# A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
 INDEFINITE = 1e-9
 FOREVER = np.iinfo(np.int64).max
 
@@ -228,8 +228,6 @@ class Watch:
         found = np.full(self.runs, -1)
         mean, covariance = (np.ascontiguousarray(stream[name]) for name in ("mean", "covariance"))
         size = isqrt(covariance.shape[1])
-        # what is no state, such as a number of things, need not have a covariance that is definite
-        is_state = "truth" in stream.metadata
         _compiled()(
             self.runs,
             estimates.offsets,
@@ -237,7 +235,6 @@ class Watch:
             np.ascontiguousarray(before_ns),
             mean,
             covariance,
-            is_state,
             rows,
             found,
             scratch=partial(np.empty, (size, size)),
@@ -353,7 +350,6 @@ def find_unsound(
     before_ns: Integers,
     mean: Floats,
     covariance: Floats,
-    is_state: bool,
     rows: Integers,
     found: Integers,
     factor: Floats,
@@ -367,7 +363,6 @@ def find_unsound(
         before_ns: (runs,) the last stamp before these.
         mean: (n, d).
         covariance: (n, t * t) row-major.
-        is_state: whether the covariance must be positive definite.
         rows: (runs,) filled.
         found: (runs,) filled.
         factor: (t, t) to work in.
@@ -385,7 +380,7 @@ def find_unsound(
             wrong = GOES_BACK
         elif not np.isfinite(total):
             wrong = NOT_FINITE
-        elif is_state:
+        else:
             for column in range(size):  # Cholesky
                 variance = covariance[row, column * size + column]
                 for i in range(column, size):
@@ -393,7 +388,7 @@ def find_unsound(
                     for k in range(column):
                         entry -= factor[i, k] * factor[column, k]
                     if i == column:
-                        is_wrong = not variance > 0.0 or entry < -INDEFINITE * variance
+                        is_wrong = not variance >= 0.0 or entry < -INDEFINITE * variance
                         factor[i, i] = np.sqrt(entry) if entry > ROUNDING * variance else 0.0
                     elif factor[column, column] > 0.0:
                         factor[i, column] = entry / factor[column, column]

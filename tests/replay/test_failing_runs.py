@@ -296,7 +296,8 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
         ([[4.0, 2.0], [2.0, 1.0]], True),  # singular, as of few particles
         ([[4.0, 2.1], [2.1, 1.0]], False),
         ([[4.0, 0.0], [0.0, -1.0]], False),
-        ([[0.0, 0.0], [0.0, 1.0]], False),
+        ([[0.0, 0.0], [0.0, 1.0]], True),
+        ([[0.0, 0.5], [0.5, 1.0]], False),
         ([[1.0, 1.0, 0.5], [1.0, 1.0, 0.0], [0.5, 0.0, 1.0]], False),
     ],
 )
@@ -310,7 +311,6 @@ def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool) -> 
         np.zeros(1, np.int64),
         np.zeros((1, size)),
         np.reshape(covariance, (1, -1)),
-        True,
         rows,
         found,
         np.empty((size, size)),
