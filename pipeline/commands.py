@@ -15,7 +15,7 @@ from pipeline.ensemble import Replayed, judge, replay_to_logs
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
-from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
+from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
@@ -24,6 +24,9 @@ from replay.engine import configure, find_estimator
 from replay.metrics import Output, find_metrics, measure
 from replay.sources import LogSource
 from replay.starting import Origin, from_estimates, from_truth
+
+# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
+TOLD = ("failure", "skipped", "coverage")
 
 
 def replay_logs(
@@ -49,7 +52,7 @@ def replay_logs(
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [_span(source, start_s, end_s, order) for source in opened]
-    replay_to_logs(
+    seconds = replay_to_logs(
         sources,
         estimators,
         paths,
@@ -59,7 +62,7 @@ def replay_logs(
     )
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
-    _print_outcome(replayed, (), as_json=as_json, written=paths)
+    _print_outcome(replayed, (), as_json=as_json, written=paths, seconds=seconds)
     if save is not None or connect is not None:
         _show(replayed, save, connect)
 
@@ -202,9 +205,7 @@ def evaluate_logs(
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
     replayed = judge(sources, _read_outputs(opened), gap_limit_s)
-    telling = [
-        each for each in replayed.judged if not isinstance(each, Output) or each.leaf != "failure"
-    ]
+    telling = [each for each in replayed.judged if not isinstance(each, Output) or each.leaf not in TOLD]
     if not measure(telling, find_metrics(metrics)):
         raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
     _state_losses([*opened, *(source.log for source in sources)])
@@ -265,7 +266,12 @@ def _hash_files(paths: Sequence[Path]) -> str:
 
 
 def _print_outcome(
-    replayed: Replayed, metrics: Sequence[str], *, as_json: bool, written: Sequence[Path]
+    replayed: Replayed,
+    metrics: Sequence[str],
+    *,
+    as_json: bool,
+    written: Sequence[Path],
+    seconds: Mapping[str, float] | None = None,
 ) -> None:
     values = plain(measure(replayed.judged, find_metrics(metrics)))
     failures = replayed.failures
@@ -275,9 +281,19 @@ def _print_outcome(
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
     if as_json:
-        print_json({"metrics": values, "failures": failures, "written": [str(path) for path in written]})
+        outcome = {
+            "metrics": values,
+            "failures": failures,
+            "losses": replayed.losses,
+            "written": [str(path) for path in written],
+        }
+        print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
         return
     print_metrics(values)
+    for sentence in replayed.losses:
+        say(sentence)
+    if seconds:
+        print_table(("estimator", "time (s)"), list(seconds.items()))
     for path in written:
         say(str(path))
 

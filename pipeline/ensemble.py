@@ -6,6 +6,7 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 import hashlib
 import json
 import os
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
@@ -20,7 +21,7 @@ import numpy as np
 from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
-from replay.engine import BLOCK_MESSAGES, bind, collect, replay
+from replay.engine import BLOCK_MESSAGES, Report, bind, collect, replay
 from replay.evaluation import (
     Errors,
     Innovations,
@@ -30,13 +31,16 @@ from replay.evaluation import (
     split_topic,
     unjudged,
 )
-from replay.metrics import Output
+from replay.failures import sentences_of
+from replay.metrics import Output, estimated_share
 from replay.set_errors import SetErrors, set_errors
 from replay.sources import MemorySource, Source, memory_source
 from replay.starting import Origin, start_from
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
+# Less than this share of a span is said; a run's first measurements may well be before the prior.
+LEAST_SHARE = 0.995
 
 Settings = Mapping[str, Mapping[str, Any]]
 Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
@@ -89,18 +93,34 @@ class Replayed:
         silent: dict[tuple[str, int], str] = {}
         for topic, rows in self.outputs.items():
             what = " ".join(filter(None, split_topic(topic)))
-            reasons = dict(enumerate(rows.stream.metadata.get("reasons", "").split("; ")))
             for run, source in enumerate(self.sources):
                 found = rows.of_run(run)
                 if rows.stream.schema.full_name == schemas.FAILURE.full_name and len(found):
                     elapsed_s = (int(found.publish_time_ns[0]) - source.epoch_ns) * 1e-9
-                    reason = reasons.get(int(found["reason"][0]), "no reason given")
+                    reason = sentences_of(found.take(slice(0, 1)))[0]
                     failed[what, run] = f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}"
                 elif rows.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name and not len(
                     found
                 ):
                     silent[what, run] = f"{source.name}: {what} gave no estimates"
         return list({**silent, **failed}.values())
+
+    @property
+    def losses(self) -> list[str]:
+        """A sentence for every case that was not estimated throughout, and for measurements not used."""
+        said = []
+        for topic, rows in self.outputs.items():
+            what = " ".join(filter(None, split_topic(topic)))
+            schema = rows.stream.schema.full_name
+            if schema == schemas.COVERAGE.full_name and (share := estimated_share(rows)) is not None:
+                if share < LEAST_SHARE:
+                    said.append(
+                        f"{what}: {100 * share:.1f} % of the span was estimated; its figures are of that"
+                    )
+            elif schema == schemas.SKIPPED.full_name:
+                counts = Counter(sentences_of(rows.stream))
+                said += [f"{what}: {count} not used: {reason}" for reason, count in counts.items()]
+        return said
 
 
 def record_ensemble(
@@ -145,7 +165,9 @@ def replay_in_memory(
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
-        outputs |= collect(replay(sources, bound, order=order))
+        report = Report()
+        outputs |= collect(replay(sources, bound, order=order, report=report))
+        outputs |= collect([report.coverage])
     return outputs
 
 
@@ -171,11 +193,13 @@ def replay_to_logs(
     origins: Sequence[Origin] = (),
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
-) -> None:
+) -> dict[str, float]:
     """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
 
     `origins` are what the runs start from where their spans begin after their priors, one per run.
+    Returns how many seconds each estimator took, by label.
     """
+    seconds: dict[str, float] = defaultdict(float)
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
 
     def write_some(first: int) -> Iterator[int]:
@@ -188,14 +212,24 @@ def replay_to_logs(
                 stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
                 for path, source in zip(paths[now], sources[now], strict=True)
             ]
-            for block in replay(sources[now], begun, order=order, block_messages=block_messages):
+            part = Report()
+            blocks = replay(sources[now], begun, order=order, block_messages=block_messages, report=part)
+            for block in chain(blocks, _coverage_of(part)):
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block])
                 yield first
+            for label, time_s in part.seconds.items():
+                seconds[label] += time_s
 
     parts = map(write_some, range(0, len(sources), RUNS_AT_ONCE))
     for _ in progress(chain.from_iterable(parts), "replaying", None):
         pass
+    return dict(seconds)
+
+
+def _coverage_of(report: Report) -> Iterator[list[Ragged]]:
+    """The last block of a replay; it is there only when the others have been taken."""
+    yield report.coverage
 
 
 def estimates_metadata(

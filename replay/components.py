@@ -1,6 +1,7 @@
 """A vector's components by the names that its channel states; their order never matters."""
 
 from collections.abc import Mapping
+from typing import cast
 
 from recorders.errors import BadInput
 from replay.tangent import TANGENT_WIDTHS, Kind, are_kinds, things
@@ -49,7 +50,7 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
     ]
 
 
-def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, str]:
+def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
     """Names and kinds as a channel states them, in its order; empty where it names none.
 
     A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
@@ -63,4 +64,4 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
             f"{where}: components '{stated.get('components', '')}' with kinds '{listed}': give each "
             "component a name of its own and a kind; an axis has two in a row, a quaternion four"
         )
-    return dict(zip(names, kinds, strict=True))
+    return dict(zip(names, cast("list[Kind]", kinds), strict=True))

@@ -101,6 +101,8 @@ def consistency(errors: Errors) -> dict[str, float]:
     if len(nees) == 0:
         return {}
     values = {"nees": float(nees.mean())}
+    if len(nees) < len(errors.nees):  # of singular covariances there is none
+        values["estimates_without_nees"] = float(len(errors.nees) - len(nees))
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
         squared = normalized_error_squared(errors.error[:, errors.position], block)
@@ -128,6 +130,21 @@ def failures(output: Output) -> dict[str, float]:
     return {"failed_runs": float(np.count_nonzero(np.diff(output.rows.offsets)))}
 
 
+def estimated_share(coverage: Ragged) -> float | None:
+    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    spans_s = (coverage["end_time_ns"] - coverage.stream.publish_time_ns).sum() * 1e-9
+    return float(min(coverage["estimated_s"].sum() / spans_s, 1.0)) if spans_s > 0 else None
+
+
+def coverage(output: Output) -> dict[str, float]:
+    """What share of the span the other figures are of, and how many measurements were not used."""
+    schema = output.rows.stream.schema.full_name
+    if schema == schemas.SKIPPED.full_name:
+        return {"skipped_measurements": float(len(output.rows))}
+    share = estimated_share(output.rows) if schema == schemas.COVERAGE.full_name else None
+    return {} if share is None else {"estimated_share": share}
+
+
 def solution(output: Output) -> dict[str, float]:
     """How the batch solutions ended: the share that converged, and the most iterations of one."""
     if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name or len(output.rows) == 0:
@@ -143,4 +160,5 @@ ACCURACY = Metric("RMSE of position and other components against truth", Errors,
 CONSISTENCY = Metric("NEES against its chi-square bounds", Errors, consistency)
 INNOVATION = Metric("NIS, and the share of measurements that a gate kept out", Innovations, innovation)
 FAILURES = Metric("how many runs an estimator could not follow to the end", Output, failures)
+COVERAGE = Metric("what share of the span was estimated, and what was not used", Output, coverage)
 SOLUTION = Metric("how many batch solutions converged, and how fast", Output, solution)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Stream, make_stream, schemas
-from replay.blocks import Ragged, gather
+from replay.blocks import gather
 from replay.components import match_components, match_tangent, stated_components
-from replay.engine import Bound, Recursive, prior_topics
+from replay.engine import Bound
 from replay.evaluation import split_topic, truth_at
 from replay.sources import Source
 from replay.tangent import tangent_components
@@ -42,17 +42,9 @@ def start_from(
                 for source, origin in zip(sources, origins, strict=True)
             ]
         )
-        for topic in prior_topics(bound, sources[0])
+        for topic in bound.priors
     }
-
-    def handed(given: Mapping[str, Ragged]) -> dict[str, Ragged]:
-        known = {**given, **priors}
-        return {topic: known[topic] for topic in (*bound.whole, *bound.streams) if topic in known}
-
-    whole = tuple(topic for topic in bound.whole if topic not in priors)
-    if isinstance(bound, Recursive):
-        return replace(bound, whole=whole, start=lambda given: bound.start(handed(given)))
-    return replace(bound, whole=whole, solve=lambda given: bound.solve(handed(given)))
+    return replace(bound, given=priors)
 
 
 def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clock) -> Stream:

@@ -32,6 +32,7 @@ from replay.estimators.feasible_sets import (
     to_blame,
 )
 from replay.estimators.pseudo_ellipsoids import Weighting, fit, outline
+from replay.measurements import PLANE, read_vectors
 
 LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
@@ -90,7 +91,8 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
     What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
     where nothing says how far the robot can be from what it sees.
     """
-    place_of = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
+    places_m = read_vectors(landmarks, "position_m", PLANE)
+    place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
     range_m = _maximum_range_m(stream, known) if known.arena_m is None else np.inf
     cuts = np.flatnonzero(np.diff(stream.publish_time_ns)) + 1
     for rows in np.split(np.arange(len(stream)), cuts):

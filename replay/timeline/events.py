@@ -8,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
+from replay.failures import sentences_of
 from replay.timeline.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
 
 NOT_SENSED = frozenset(
@@ -68,11 +69,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         ]
         yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
-        reasons = stream.metadata.get("reasons", "").split("; ")
-        texts = [
-            f"failed: {reasons[reason] if reason < len(reasons) else reason}"
-            for reason in stream["reason"].tolist()
-        ]
+        texts = [f"failed: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.RELATIVE_BEARING):
         pairs = zip(stream["first_id"].tolist(), stream["second_id"].tolist(), strict=True)

@@ -202,7 +202,7 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
         "/estimates/ekf:2/robot1/failure",
         schemas.FAILURE,
         [source.streams["/robot1/truth"].publish_time_ns[9]],
-        metadata={"reasons": "one; another"},
+        metadata={"reasons": '["one; two", "another"]'},
         reason=[1],
     )
     show(
