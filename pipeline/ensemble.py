@@ -6,6 +6,7 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 import hashlib
 import json
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
@@ -16,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
+from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
@@ -93,10 +96,36 @@ def record_ensemble(
     progress: Progress = no_progress,
     executor: Executor | None = None,
 ) -> list[MemorySource]:
-    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`."""
+    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`.
+
+    Raises BadInput where the first run shows that memory cannot hold them all.
+    """
     record = partial(_record, scenario, dict(parameters), seed)
-    recorded = executor.map(record, range(runs)) if executor else map(record, range(runs))
-    return list(progress(recorded, f"recording {scenario}", runs))
+    begin_s = time.perf_counter()
+    first = record(0)
+    _require_memory(scenario, runs, first, time.perf_counter() - begin_s)
+    others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
+    return list(progress(chain([first], others), f"recording {scenario}", runs))
+
+
+def _require_memory(scenario: str, runs: int, first: MemorySource, duration_s: float) -> None:
+    """Raise BadInput with what all runs take, judged by the first, where that is more than there is.
+
+    Replay lays the runs end to end, which holds every column twice; estimates come on top.
+    """
+    columns = [
+        column
+        for stream in first.streams.values()
+        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
+    ]
+    need = 2 * runs * sum(column.nbytes for column in columns)
+    there = psutil.virtual_memory().available
+    if need > there:
+        raise BadInput(
+            f"{runs} runs of {scenario} take at least {need / 1e9:.3g} GB of memory, where "
+            f"{there / 1e9:.3g} GB are free, and about {duration_s * runs / 3600:.2g} h to record; "
+            "ask for fewer runs or shorter ones"
+        )
 
 
 def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:

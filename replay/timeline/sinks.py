@@ -4,6 +4,7 @@ A file appears under its name only when it is whole. A live receiver is asked be
 because Rerun itself waits many seconds for one that is not there, and forever for one that is silent.
 """
 
+import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -54,6 +55,17 @@ def open_recording(
         recording.set_log_tick_enabled(False)
         yield recording
         _finish(recording, save, connect)
+
+
+def rerun_path(path: Path) -> str:
+    """A file's name where Rerun takes it as UTF-8, whatever the locale is.
+
+    Raises BadInput where the name is not UTF-8.
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise BadInput(f"{path}: Rerun opens only files whose names are UTF-8; rename it") from None
 
 
 def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:

@@ -20,6 +20,7 @@ from rerun.experimental import ViewerClient
 
 from recorders.atomic import scratch_folder, whole_file
 from recorders.errors import BadInput
+from replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
 RERUN = (sys.executable, "-m", "replay.timeline.keeper")
@@ -67,7 +68,7 @@ def screenshot(
             _set_cursor(client, rrd, at_s)
             picture = folder / "picture.png"
             for _ in range(_PICTURES):
-                client.save_screenshot(str(picture))
+                client.save_screenshot(rerun_path(picture))
             views = client.get_state().views
         said = PngInfo()
         said.add_text("Software", SOFTWARE)
@@ -195,7 +196,7 @@ def _require_timeline(rrd: Path) -> None:
 
 
 def _load(client: ViewerClient, rrd: Path) -> None:
-    client.open(str(rrd.resolve()))
+    client.open(rerun_path(rrd.resolve()))
     end = time.monotonic() + _LOAD_S
     while client.get_state().loading and time.monotonic() < end:
         time.sleep(0.1)
