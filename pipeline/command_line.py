@@ -299,7 +299,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(error.format_message().rstrip(".") + hint)
     except (click.Abort, KeyboardInterrupt) as error:
         click.echo("fuselog: stopped", err=True)
-        return 128 + (error.number if isinstance(error, Stopped) else signal.SIGINT)
+        cause = error.__cause__ or error  # click wraps it
+        return 128 + (cause.number if isinstance(cause, Stopped) else signal.SIGINT)
     except BrokenPipeError:
         _drop_output()
         return 1

@@ -103,29 +103,32 @@ def record_ensemble(
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
     first = record(0)
-    _require_memory(scenario, runs, first, time.perf_counter() - begin_s)
+    took_s = time.perf_counter() - begin_s
+    # replay lays the runs end to end, which holds every column twice; estimates come on top
+    require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
     others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
     return list(progress(chain([first], others), f"recording {scenario}", runs))
 
 
-def _require_memory(scenario: str, runs: int, first: MemorySource, duration_s: float) -> None:
-    """Raise BadInput with what all runs take, judged by the first, where that is more than there is.
-
-    Replay lays the runs end to end, which holds every column twice; estimates come on top.
-    """
-    columns = [
-        column
-        for stream in first.streams.values()
-        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
-    ]
-    need = 2 * runs * sum(column.nbytes for column in columns)
-    there = psutil.virtual_memory().available
-    if need > there:
+def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
+    """Raise BadInput with what something takes, where that is more memory than is free."""
+    time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
+    there_bytes = psutil.virtual_memory().available
+    if need_bytes > there_bytes:
+        need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
         raise BadInput(
-            f"{runs} runs of {scenario} take at least {need / 1e9:.3g} GB of memory, where "
-            f"{there / 1e9:.3g} GB are free, and about {duration_s * runs / 3600:.2g} h to record; "
+            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
             "ask for fewer runs or shorter ones"
         )
+
+
+def _size(source: MemorySource) -> int:
+    """Bytes of all columns of a run."""
+    return sum(
+        column.nbytes
+        for stream in source.streams.values()
+        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
+    )
 
 
 def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:

@@ -17,7 +17,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 
@@ -39,7 +39,8 @@ def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
 
     Raises BadInput where it cannot be written.
     """
-    with _parent_of(place, make=parents), working_folder(place) as work, _telling(place, work):
+    _clear_leftovers(place)
+    with _parent_of(place, make=parents), _working_folder(place) as work, _telling(place, work):
         new = work / (_NEW + place.suffix)
         yield new
         with new.open("rb+") as file:
@@ -60,7 +61,7 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
         raise BadInput(f"{place}: another fuselog is writing it; wait, or give another --out")
     if place.exists():
         check(place)
-    with _parent_of(place, make=True), working_folder(place) as work, _telling(place, work):
+    with _parent_of(place, make=True), _working_folder(place) as work, _telling(place, work):
         new, old = work / _NEW, work / _OLD
         new.mkdir()
         yield new
@@ -71,24 +72,25 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
 
 
 @contextmanager
-def working_folder(place: Path) -> Iterator[Path]:
-    """A private folder `.NAME.RANDOM.part` beside `place`, which is removed at the end.
+def scratch_folder(name: str) -> Iterator[Path]:
+    """A private folder among the system's temporary ones, which is removed at the end.
 
-    What killed writers of the same place left is removed first. Raises BadInput where no folder can be
-    made.
+    Raises BadInput where it cannot be made.
     """
+    place = Path(tempfile.gettempdir()) / name
     _clear_leftovers(place)
+    with _working_folder(place) as work:
+        yield work
+
+
+@contextmanager
+def _working_folder(place: Path) -> Iterator[Path]:
     with _telling(place):
         work, lock = _make(place)
     try:
         yield work
     finally:
         _remove(work, place, lock)
-
-
-def scratch_folder(name: str) -> AbstractContextManager[Path]:
-    """A working folder in the system's folder for temporary files."""
-    return working_folder(Path(tempfile.gettempdir()) / name)
 
 
 def _make(place: Path) -> tuple[Path, FileLock]:

@@ -56,7 +56,10 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     assert "NaN" not in text
     assert "Infinity" not in text
     values = json.loads(text)
-    assert list(values) == ["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims"]
+    assert list(values) == [
+        *["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
+    ]
+    assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"
     assert values["settings"]["seed"] == 5
     assert values["settings"]["record"]["parameters"] == {"duration_s": 2}
@@ -76,8 +79,16 @@ def test_a_run_twice_gives_the_same_bytes(result: Path, fuselog: Fuselog) -> Non
     with chdir(result.parent):
         assert fuselog(*RUN, "--logs", "3", "--out", "second").code == 0
     first, again = _contents(result), _contents(second)
+    said, said_again = (json.loads(each.pop("result.json")) for each in (first, again))
+    assert said.pop("files").items() - said_again.pop("files").items() == {_own_entry(result)}
+    assert said == said_again
     assert {name: again[name] for name in first} == first
     assert len(again) == len(first) + 2
+
+
+def _own_entry(result: Path) -> tuple[str, str]:
+    """What result.json says of itself: of another list of files, another number."""
+    return "result.json", json.loads((result / "result.json").read_text())["files"]["result.json"]
 
 
 def test_the_first_runs_log_is_recorded_again_from_the_seed(result: Path, fuselog: Fuselog) -> None:
@@ -104,7 +115,8 @@ def test_the_report_is_one_page_with_all_numbers(result: Path, tmp_path: Path, f
     text = page.read_text()
     loaded = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?(?!#|data:)([^"\'>)]+)', text)
     assert loaded == []
-    assert text.count("<svg") == 2
+    assert text.count('<img src="data:image/svg+xml;base64,') == 2
+    assert "<svg" not in text
     assert text.count("position_rmse_m") >= 2
     assert "seed 5" in text
 
