@@ -130,8 +130,9 @@ def _is_picture(path: Path) -> bool:
 
 
 def _is_report(path: Path) -> bool:
-    with path.open("rb") as page:
-        return b'<meta name="generator" content="fuselog">' in page.read(1000)
+    from pipeline.report import is_report
+
+    return is_report(path)
 
 
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)

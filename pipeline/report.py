@@ -1,6 +1,7 @@
 """The report: result folders as one self-contained HTML page."""
 
 import base64
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from recorders.errors import BadInput
 
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
+_SIGNATURE = b"<!-- fuselog "
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,18 @@ def write_report(folders: Sequence[Path], page: Path) -> None:
     environment.filters["value"] = format_value
     text = environment.get_template("report.html").render(sections=sections)
     with whole_file(page) as new:
-        new.write_text(text, encoding="utf-8", errors="backslashreplace")
+        new.write_bytes(_signed(text.encode(errors="backslashreplace")))
+
+
+def is_report(page: Path) -> bool:
+    """Whether a file is a page that `write_report` wrote, as it was written."""
+    content = page.read_bytes()
+    return content == _signed(content.rpartition(_SIGNATURE)[0])
+
+
+def _signed(page: bytes) -> bytes:
+    """The page with its own SHA-256 at its end."""
+    return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
 
 
 def _section(folder: Path) -> Section:

@@ -269,6 +269,13 @@ def test_a_result_with_notes_or_edits_stays(
     _check_refusal(_run(COMMANDS[command], Path("out")), here, _state(here), "out")
 
 
+def test_a_page_with_notes_stays(here: Path, before: Path) -> None:
+    _place_ours(before, "report -o", Path("out.html"))
+    page = Path("out.html")
+    page.write_text(page.read_text().replace("<h1>", "<p>mine</p><h1>"))
+    _check_refusal(_run(COMMANDS["report -o"], page), here, _state(here), "a report of fuselog")
+
+
 @pytest.mark.parametrize(
     ("command", "given"), [(name, given) for name, each in COMMANDS.items() for given in each.inputs]
 )
