@@ -109,6 +109,8 @@ def _clear_leftovers(place: Path) -> bool:
     """Remove what killed writers of a place left; whether one is at work."""
     at_work = False
     for work in place.parent.glob(f".{escape(place.name)}.*.part"):
+        if "." in work.name.removeprefix(f".{place.name}.").removesuffix(".part"):
+            continue  # of another place, whose name goes on
         if not _is_ours(work):
             _LOG.warning("%s: not made by fuselog, or by another user; it stays as it is", work)
             continue
@@ -148,8 +150,8 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
     if old.exists() and new.exists():  # stopped between the two renames
         try:
             old.rename(place)
-        except OSError as error:
-            _LOG.warning("%s: what was in %s, which is taken (%s)", old, place, error.strerror)
+        except OSError:
+            _LOG.warning("%s: was %s before a command was killed; move it yourself", old, place)
             lock.release()
             return
     for member in work.iterdir():

@@ -142,6 +142,23 @@ def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, na
     raise AssertionError("never came to the end")
 
 
+def test_places_whose_names_go_on_are_others(tmp_path):
+    """`r` is not `r.v2`: neither its writer nor what one left is taken for that of the other."""
+    with whole_folder(tmp_path / "r.v2", refuse):
+        fill(tmp_path / "r")
+    left = tmp_path / ".r.v2.leftover.part"
+    for name in ("old", "new"):
+        (left / name).mkdir(parents=True)
+        (left / name / "a").write_text(name)
+    (left / "fuselog.lock").touch()
+    fill(tmp_path / "r")
+    assert contents(tmp_path / "r") == {"a": "new"}
+    assert left.exists()
+    with pytest.raises(BadInput, match="it stays"):
+        fill(tmp_path / "r.v2", refuse)
+    assert contents(tmp_path) == {"r/a": "new", "r.v2/a": "old"}
+
+
 def test_a_leftover_is_known_by_more_than_its_name(tmp_path, caplog):
     """What only looks like one stays, and that is said."""
     place = tmp_path / "f"
