@@ -6,9 +6,11 @@ An output is never an input, another output or a symbolic link, by whatever name
 
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.results import RESULT_FILE, read_result
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
 
@@ -35,6 +37,8 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
         _refuse_link(path)
         if _identity(path) in taken:
             raise BadInput(f"{path}: would replace the {taken[_identity(path)]}; give another name")
+        if _is_of_result(path):
+            raise BadInput(f"{path}: belongs to the result that it is in; give another name")
         if path.exists() and not (path.is_file() and kind.is_written(path)):
             raise BadInput(
                 f"{path}: exists and is not {kind.what}; give another name, or remove it yourself"
@@ -55,6 +59,16 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
 def _refuse_link(path: Path) -> None:
     if path.is_symlink():
         raise BadInput(f"{path}: is a symbolic link; give the place that it leads to, or another name")
+
+
+def _is_of_result(path: Path) -> bool:
+    """Whether a result folder lists a file as its own."""
+    place = path.resolve()
+    for folder in place.parents:
+        if (folder / RESULT_FILE).is_file():
+            with suppress(BadInput):
+                return place.relative_to(folder).as_posix() in read_result(folder).files
+    return False
 
 
 def _identity(path: Path) -> Hashable:

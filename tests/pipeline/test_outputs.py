@@ -306,6 +306,15 @@ def test_a_suffix_says_what_is_written(command: str, here: Path) -> None:
         _check_refusal(_run(COMMANDS[command], Path(name)), here, _state(here))
 
 
+def test_what_belongs_to_a_result_is_no_output(here: Path) -> None:
+    for arguments in (
+        "record landmarks -o result/logs/run-0000.mcap",
+        "replay log.mcap -e ekf -o result/estimates/run-0000.mcap",
+        "view log.mcap --save result/timeline.rrd",
+    ):
+        _check_refusal(run_here(*arguments.split()), here, _state(here), "belongs to the result")
+
+
 def test_two_outputs_are_two_files(here: Path) -> None:
     Path("dir").mkdir()
     shutil.copy("log.estimates.mcap", "dir")
