@@ -354,7 +354,8 @@ def _sentence(error: Exception, place: str) -> str:
         place = os.fsdecode(error.filename) if error.filename else place
         return f"{place}: {error.strerror or error}"
     if isinstance(error, MemoryError):
-        return f"not enough memory; ask for fewer runs or less time ({error})"
+        why = f" ({error})" if str(error) else ""
+        return f"not enough memory; ask for fewer runs or less time{why}"
     return str(error)
 
 

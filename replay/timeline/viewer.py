@@ -128,8 +128,12 @@ def _running(
             stderr=said,
             start_new_session=True,  # an interrupt from the terminal is ours to handle
         )
-    with process:  # which closes the pipe, and waits
+    assert process.stdin is not None
+    try:
         yield process
+    finally:
+        process.stdin.close()  # which ends it
+        process.wait()
 
 
 def _private_environment(folder: Path) -> dict[str, str]:
