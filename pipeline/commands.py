@@ -8,14 +8,15 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
 from pipeline.experiment import load_experiment, run_experiment
+from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
+from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
@@ -48,6 +49,8 @@ def replay_logs(
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
+    timelines = [] if save is None else [(save, TIMELINE)]
+    check_files([*((path, ESTIMATES) for path in paths), *timelines], {"log": logs})
     estimators = _settings_of_estimators(names, parse_settings(settings))
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
@@ -70,19 +73,17 @@ def replay_logs(
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """Where the estimates of each log go: beside it, to the one file given, or into a folder.
 
-    Raises BadInput where two would be the same, or one would replace a log.
+    Raises BadInput where two would be the same.
     """
-    if out is not None and out.suffix == ".mcap":
+    if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
             raise BadInput(f"--out {out}: {len(logs)} logs have an estimates log each; give a folder")
-        paths = [out]
-    else:
-        paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
+        return [out]
+    if out is not None and out.suffix and not out.is_dir():
+        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder; make it if it is one")
+    paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
     places = [path.resolve() for path in paths]
-    sources = {log.resolve() for log in logs}
     for path, place in zip(paths, places, strict=True):
-        if place in sources:
-            raise BadInput(f"{path}: the estimates would replace the log; give another --out")
         if places.count(place) > 1:
             raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
     return paths
@@ -201,6 +202,8 @@ def evaluate_logs(
         if not any(topic.startswith("/estimates/") for topic in each.topics):
             raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
     places = logs or [_source_path(each) for each in opened]
+    if out is not None:
+        check_folder(out, {"input": [*estimates, *places]})
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
@@ -325,10 +328,12 @@ def view_path(
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
     from replay.timeline import viewer
 
-    with TemporaryDirectory(prefix="fuselog-view-") as folder:
-        rrd = path / "timeline.rrd" if path.is_dir() else path
+    rrd = path / "timeline.rrd" if path.is_dir() else path
+    outputs = [(save, TIMELINE), (screenshot, PICTURE)]
+    check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
+    with scratch_folder("fuselog-view") as folder:
         if rrd.suffix != ".rrd":
-            rrd = save or Path(folder) / "timeline.rrd"
+            rrd = save or folder / "timeline.rrd"
             _draw_log(path, rrd, connect, focus, gap_limit_s, recover=recover)
         elif save is not None or connect is not None or focus is not None:
             raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
@@ -369,6 +374,8 @@ def run_named(
     """Run an experiment and print its metrics and claims."""
     label, experiment = load_experiment(name, parse_settings(settings), over)
     folder = out or Path("out") / label
+    inputs = [Path(name)] if name.endswith(".toml") else []
+    check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
     result = run_experiment(label, experiment, folder, data=data, logs=logs, progress=progress)
     if as_json:
         print_json(result.model_dump(mode="json"))

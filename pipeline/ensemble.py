@@ -6,6 +6,7 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 import hashlib
 import json
 import os
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
+from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
@@ -131,10 +134,39 @@ def record_ensemble(
     progress: Progress = no_progress,
     executor: Executor | None = None,
 ) -> list[MemorySource]:
-    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`."""
+    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`.
+
+    Raises BadInput where the first run shows that memory cannot hold them all.
+    """
     record = partial(_record, scenario, dict(parameters), seed)
-    recorded = executor.map(record, range(runs)) if executor else map(record, range(runs))
-    return list(progress(recorded, f"recording {scenario}", runs))
+    begin_s = time.perf_counter()
+    first = record(0)
+    took_s = time.perf_counter() - begin_s
+    # replay lays the runs end to end, which holds every column twice; estimates come on top
+    require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
+    others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
+    return list(progress(chain([first], others), f"recording {scenario}", runs))
+
+
+def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
+    """Raise BadInput with what something takes, where that is more memory than is free."""
+    time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
+    there_bytes = psutil.virtual_memory().available
+    if need_bytes > there_bytes:
+        need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
+        raise BadInput(
+            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
+            "ask for fewer runs or shorter ones"
+        )
+
+
+def _size(source: MemorySource) -> int:
+    """Bytes of all columns of a run."""
+    return sum(
+        column.nbytes
+        for stream in source.streams.values()
+        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
+    )
 
 
 def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:

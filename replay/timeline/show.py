@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, printable
 from recorders.registry import available, load
 from replay.blocks import Ragged, gather
 from replay.evaluation import Errors
@@ -53,7 +53,7 @@ def show(
     timeline: Timeline = load("timelines", scenario) if scenario in available("timelines") else GENERIC
     application = f"fuselog-{scenario}" if scenario else "fuselog"
     with open_recording(application, _identity(scene), save=save, connect=connect) as recording:
-        recording.send_recording_name(source.name)
+        recording.send_recording_name(printable(source.name))
         layout = timeline.draw(_canvas(scene, recording), scene)
         recording.send_blueprint(
             rrb.Blueprint(

@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 import warnings
@@ -487,10 +488,29 @@ def test_the_picture_shows_the_estimators_and_no_view_complains(rrd: Path, tmp_p
 
 
 def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
-    try:
-        with pytest.raises(BadInput, match="--at 99: the run goes from 0 to 20 s"):
-            screenshot(rrd, tmp_path / "a.png", at_s=99.0)
-    except BadInput as error:
-        if "Vulkan driver" in str(error):
-            pytest.skip(str(error))
-        raise
+    with pytest.raises(BadInput) as refused:
+        screenshot(rrd, tmp_path / "a.png", at_s=99.0)
+    if "Vulkan driver" in str(refused.value):
+        pytest.skip(str(refused.value))
+    refused.match("--at 99: the run goes from 0 to 20 s")
+
+
+def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:
+    """Nobody is left to end it: it notices that the pipe from its parent has closed."""
+    program = (
+        "import sys, time; from pathlib import Path; from replay.timeline.viewer import listen\n"
+        "with listen(Path(sys.argv[1]), '--headless') as listener:\n"
+        "    print(listener.url, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        port = int(parent.stdout.readline().rpartition(":")[2].partition("/")[0])
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)):
+                return
+        time.sleep(0.05)
+    raise AssertionError("the viewer still answers")
