@@ -263,7 +263,7 @@ def _refuse_old_priors(
     bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
-    for topic in bound.priors:
+    for topic in bound.priors.keys() - bound.given.keys():
         for run, source in enumerate(sources):
             times_ns = whole[topic].of_run(run).times(order)[:1]
             if source.start_ns is not None and len(times_ns) and times_ns[0] < source.start_ns:
