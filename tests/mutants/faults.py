@@ -178,6 +178,24 @@ FAULTS = [
         "return reports",
         "tests/recorders/test_ais.py",
     ),
+    Fault(
+        "recorders/importers/mrclam.py",
+        "start_ns = max(odometry_ns[0], truth_ns[0])",
+        "start_ns = min(odometry_ns[0], truth_ns[0])",
+        "tests/recorders/test_mrclam.py",
+    ),
+    Fault(
+        "recorders/importers/mrclam.py",
+        'order = np.argsort(times_ns, kind="stable")',
+        "order = np.arange(len(times_ns))",
+        "tests/recorders/test_mrclam.py",
+    ),
+    Fault(
+        "recorders/importers/broad.py",
+        "turn_rate_radps=samples[:, 3:6]",
+        "turn_rate_radps=samples[:, 6:]",
+        "tests/recorders/test_broad.py",
+    ),
     # the log
     Fault(
         "recorders/log/streams.py",
@@ -251,6 +269,19 @@ FAULTS = [
         'kind="stable")] = np.arange(len(ranks))',
         'kind="stable")[::-1]] = np.arange(len(ranks))',
         ENGINE,
+    ),
+    # the caches
+    Fault(
+        "replay/cache.py",
+        "return content if header.startswith(_digest(content)) else None",
+        "return content",
+        "tests/replay/test_compile.py",
+    ),
+    Fault(
+        "replay/compile.py",
+        "{getattr(kind, 'fields', '')} ",
+        "",
+        "tests/replay/test_compile.py",
     ),
     # evaluation, consistency, metrics
     Fault(
@@ -429,6 +460,18 @@ FAULTS = [
         "prior = np.log(genuine.sum() / (~genuine).sum())",
         "prior = 0.0",
         FUSION,
+    ),
+    Fault(
+        "replay/tracks.py",
+        "live_ns = round(live_s * 1e9)",
+        "live_ns = round(live_s * 1e6)",
+        "tests/replay/test_report_tracker.py",
+    ),
+    Fault(
+        "replay/timeline/show.py",
+        "return digest.hexdigest()[:16]",
+        'return "0" * 16',
+        "tests/replay/test_timeline.py",
     ),
     # the pipeline
     Fault(

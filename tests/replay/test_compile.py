@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+import replay.compile
 from recorders.errors import BadInput
 from recorders.log import loops
 from replay.compile import _load, cache_folder, compile_over_runs, compiled
@@ -54,7 +55,11 @@ def imported(module: str, folder: Path, cache: Path) -> list[str]:
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", "import third_party"],
         cwd=folder,
-        env={"HOME": str(folder), "FUSELOG_CACHE": str(cache)},
+        env={
+            "HOME": str(folder),
+            "FUSELOG_CACHE": str(cache),
+            "PYTHONPATH": str(Path(replay.compile.__file__).parents[1]),  # the tree that is under test
+        },
         capture_output=True,
         text=True,
         check=False,
@@ -131,17 +136,21 @@ def found_in_the_cache() -> bool:
     return bool(loop.keywords["loop"].stats.cache_hits)
 
 
-@pytest.mark.parametrize("damage", ["emptied", "cut", "flipped", "not ours", "another kernel's"])
+@pytest.mark.parametrize(
+    "damage", ["emptied", "cut", "flipped", "unlike its checksum", "not ours", "another kernel's"]
+)
 def test_a_damaged_file_is_compiled_anew_and_replaced(kernels: Path, damage: str):
     """As a loss of power leaves it; what is executed has to be what was written."""
     assert not found_in_the_cache()
     assert found_in_the_cache()
     (path,) = kernels.iterdir()
     whole = path.read_bytes()
+    middle = len(whole) // 2
     changed = {
         "emptied": b"",
-        "cut": whole[: len(whole) // 2],
-        "flipped": whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:],
+        "cut": whole[:middle],
+        "flipped": whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :],
+        "unlike its checksum": bytes([whole[0] ^ 1]) + whole[1:],
         "not ours": b"\x80\x04.",
     }
     path.write_bytes(changed.get(damage, whole))
