@@ -76,7 +76,7 @@ def make(recipe: Recipe, places: Mapping[str, Path]) -> Golden:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Whether an output is an estimator's; every replay says of itself what it covered and what failed."""
+    """Whether an output is an estimator's; how much was estimated, and that none failed, is not."""
     if stream.schema.full_name == schemas.FAILURE.full_name:
         return len(stream) > 0
     return stream.schema.full_name != schemas.COVERAGE.full_name
