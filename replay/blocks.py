@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Clock, Stream
-from recorders.log.streams import concatenate
 from replay.compile import compile_over_runs
+from replay.failures import join_streams
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,17 @@ def gather(parts: Sequence[Stream]) -> Ragged:
     offsets = np.zeros(len(parts) + 1, np.int64)
     np.cumsum([len(part) for part in parts], out=offsets[1:])
     filled = [part for part in parts if len(part)] or list(parts[:1])
-    return Ragged(concatenate(filled), offsets)
+    return Ragged(join_streams(filled), offsets)
+
+
+def join(parts: Sequence[Ragged]) -> Ragged:
+    """Join blocks of one topic, each run's rows together."""
+    if len(parts) == 1:
+        return parts[0]
+    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:

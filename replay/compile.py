@@ -9,6 +9,7 @@ which also run uncompiled.
 
 import ast
 import inspect
+import os
 import pickle
 import sys
 import textwrap
@@ -47,6 +48,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
+        if _is_uncompiled():
+            return np.errstate(all="ignore")(function)
         bundle = _Bundle()
         name = bundle.add(function.__name__, function)
         names = ", ".join(inspect.signature(function).parameters)
@@ -73,7 +76,12 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
+    if _is_uncompiled():
+        return uncompiled_over_runs(run_once)
     bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
@@ -84,6 +92,22 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         f"        {kernel}(run, {names})",
     )
     return partial(_over_runs, name=run_once.__name__, loop=loop)
+
+
+def _is_uncompiled() -> bool:
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
+
+
+def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """What `compile_over_runs` returns, in plain Python; NaN and infinity raise nothing here either."""
+
+    def loop(runs: int, *arguments: Any, scratch: Callable[[], Any] | None = None) -> None:
+        memory = [scratch()] if scratch else []
+        with np.errstate(all="ignore"):
+            for run in range(runs):
+                run_once(run, *arguments, *memory)
+
+    return loop
 
 
 def _over_runs(
@@ -125,8 +149,9 @@ class _Bundle:
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
         # one piece is faster where no counting stands in the way; elsewhere it only compiles longer
-        self._decorator = f"@numba.njit({inner}, forceinline={not allocates}, _nrt={allocates})"
-        self.allocates = allocates
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt={allocates}{bounds}"
+        self._decorator = f"@numba.njit({inner}, forceinline={not allocates}, {self.options})"
         self.imports = {"import numba", "import numpy"}
         self.definitions: list[str] = []
         self._names: dict[Any, str] = {}
@@ -214,7 +239,7 @@ def _compile(bundle: _Bundle, definition: str) -> Callable[..., Any]:
                 "from __future__ import annotations",
                 *sorted(bundle.imports),
                 *bundle.definitions,
-                f"@numba.njit(nogil=True, _nrt={bundle.allocates})",
+                f"@numba.njit(nogil=True, {bundle.options})",
                 definition,
                 "",
             ]

@@ -308,8 +308,19 @@ INNOVATION = _declare(
 )
 FAILURE = _declare(
     "Failure",
-    "A run ended here; the channel's metadata lists the reasons by number.",
+    "A run ended here; the channel's metadata lists the reasons by number, as JSON.",
     _identifier("reason"),
+)
+SKIPPED = _declare(
+    "Skipped",
+    "A measurement was not used; the channel's metadata lists the reasons by number, as JSON.",
+    _identifier("reason"),
+)
+COVERAGE = _declare(
+    "Coverage",
+    "For how much of a run, from this stamp to the end, there are estimates.",
+    Field("end_time_ns", "time_ns"),
+    _real("estimated_s"),
 )
 SOLUTION = _declare(
     "Solution",

@@ -38,14 +38,16 @@ from replay.estimators.gaussian import (
     wrap,
 )
 from replay.estimators.landmarks import (
+    POSE,
     Landmarks,
     fill_motion_jacobians,
     fill_sensor_jacobian,
     map_of_runs,
     rows_on_map,
-    start,
     stated,
 )
+from replay.failures import Failure, failure_stream
+from replay.priors import no_priors, read_priors
 
 Integers = NDArray[np.int64]
 Mode = Literal["alone", "naive", "ci", "joint"]
@@ -80,6 +82,18 @@ class Carried(NamedTuple):
     velocity: Floats
     time_ns: Integers
     failure: Integers
+
+
+class State(NamedTuple):
+    """What goes from block to block, and why robots take no part: (runs, robots), "" where they do.
+
+    `told` says of whom that was told, or need not be.
+    """
+
+    carried: Carried
+    landmarks: Landmarks
+    reasons: NDArray[np.str_]
+    told: NDArray[np.bool_]
 
 
 class Settings(NamedTuple):
@@ -316,25 +330,40 @@ def _compiled(mode: Mode, criterion: Criterion) -> Function:
     return compile_over_runs(cooperation(mode == "joint", mode == "ci", criterion == "trace"))
 
 
-def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> tuple[Carried, Landmarks]:
-    """All robots at their priors, and the maps; raises BadInput as `landmarks.start` does."""
-    started = [start(whole, f"{prefix}/prior")[0] for prefix in prefixes]
-    runs, size = len(started[0].mean), 3 * len(prefixes)
+def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
+    """All robots at their priors, and the maps.
+
+    A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
+    that is so for all, or the map is not planar.
+    """
+    priors, errors = [], []
+    for prefix in prefixes:
+        prior = whole[f"{prefix}/prior"]
+        try:
+            priors.append(read_priors(prior, POSE))
+        except BadInput as error:
+            errors.append(error)
+            priors.append(no_priors(prior.runs, POSE, str(error)))
+    if len(errors) == len(prefixes):
+        raise errors[0]
+    runs, size = len(priors[0].mean), 3 * len(prefixes)
     covariance = np.zeros((runs, size, size))
-    for index, each in enumerate(started):
+    for index, each in enumerate(priors):
         covariance[:, 3 * index : 3 * index + 3, 3 * index : 3 * index + 3] = each.covariance
+    mean = np.concatenate([each.mean for each in priors], axis=1)
     carried = Carried(
-        np.concatenate([each.mean for each in started], axis=1),
-        covariance,
+        np.nan_to_num(mean),
+        np.nan_to_num(covariance),
         np.zeros((runs, len(prefixes), 2)),
-        np.stack([each.time_ns for each in started], axis=1),
+        np.stack([each.time_ns for each in priors], axis=1),
         np.full(runs, ALL_WELL),
     )
-    return carried, map_of_runs(whole["/landmarks"])
+    reasons = np.stack([each.reasons for each in priors], axis=1)
+    return State(carried, map_of_runs(whole["/landmarks"]), reasons, reasons == "")
 
 
 def run(
-    state: tuple[Carried, Landmarks],
+    state: State,
     block: Block,
     *,
     name: str,
@@ -342,11 +371,12 @@ def run(
     mode: Mode,
     criterion: Criterion,
     settings: Settings,
-) -> tuple[tuple[Carried, Landmarks], list[Ragged]]:
+) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
-    before, landmarks = state
+    before, landmarks, reasons, told = state
     carried = copy.deepcopy(before)
-    events = _events(block, landmarks, prefixes, mode, settings, carried.time_ns)
+    is_able = reasons == ""
+    events = _events(block, landmarks, prefixes, mode, settings, carried.time_ns, is_able)
     count = int(events.emit.max(initial=-1)) + 1
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
     loop = _compiled(mode, criterion)
@@ -354,7 +384,31 @@ def run(
     poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
     failed_ns = carried.time_ns.max(axis=1)
     failures = failures_of(f"/estimates/{name}", before.failure, carried.failure, failed_ns)
-    return (carried, landmarks), [*poses, failures]
+    told, excluded = _excluded(name, prefixes, block, reasons, told)
+    return State(carried, landmarks, reasons, told), [*poses, failures, *excluded]
+
+
+def _excluded(
+    name: str,
+    prefixes: tuple[str, ...],
+    block: Block,
+    reasons: NDArray[np.str_],
+    told: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], list[Ragged]]:
+    """Who takes no part (runs, robots) was told of, each at its first odometry; and these failures."""
+    told, outputs = told.copy(), []
+    for robot, prefix in enumerate(prefixes):
+        odometry = block.streams[f"{prefix}/odometry"]
+        new = np.flatnonzero(~told[:, robot] & (np.diff(odometry.offsets) > 0))
+        told[new, robot] = True
+        times_ns = odometry.stream.publish_time_ns[odometry.offsets[new]]
+        failures = [
+            Failure(int(time_ns), str(reasons[run, robot]))
+            for run, time_ns in zip(new, times_ns, strict=True)
+        ]
+        stream = failure_stream(f"/estimates/{name}{prefix}/failure", failures)
+        outputs.append(Ragged(stream, np.searchsorted(new, np.arange(len(told) + 1))))
+    return told, outputs
 
 
 def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, results: Results) -> Ragged:
@@ -385,8 +439,12 @@ def _events(
     mode: Mode,
     settings: Settings,
     start_ns: Integers,
+    is_able: NDArray[np.bool_],
 ) -> Events:
-    """The block's events as columns; a robot's estimate is due at its odometry."""
+    """The block's events as columns; a robot's estimate is due at its odometry.
+
+    `is_able` (runs, robots) says who takes part.
+    """
     order = block.events
     value = np.stack(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
@@ -396,11 +454,13 @@ def _events(
     robot, sees = np.divmod(order.topic, 2)
     numbers = np.array([_number(prefix) for prefix in prefixes])
     fellow = np.minimum(np.searchsorted(numbers, target_id), len(numbers) - 1)
-    is_fellow = (sees == 1) & (numbers[fellow] == target_id) & (fellow != robot)
+    acts = is_able[run_of, robot]
+    is_fellow = (sees == 1) & (numbers[fellow] == target_id) & (fellow != robot) & acts
+    is_fellow &= is_able[run_of, fellow]
     place = rows_on_map(landmarks, (run_of << 32) + target_id)
-    is_mapped = (sees == 1) & (place >= 0) & settings.anchor[robot]
-    due = (sees == 0) & (order.time_ns >= start_ns[run_of, robot])
-    kept = np.flatnonzero((sees == 0) | is_mapped | (is_fellow & (mode != "alone")))
+    is_mapped = (sees == 1) & (place >= 0) & settings.anchor[robot] & acts
+    due = (sees == 0) & (order.time_ns >= start_ns[run_of, robot]) & acts
+    kept = np.flatnonzero(((sees == 0) & acts) | is_mapped | (is_fellow & (mode != "alone")))
     return Events(
         np.searchsorted(kept, order.offsets),
         order.time_ns[kept],

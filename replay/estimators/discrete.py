@@ -16,6 +16,7 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from replay.blocks import Block, Events, Ragged, of_runs
 from replay.compile import compile_over_runs
+from replay.components import Components
 from replay.engine import Bound, Recursive
 from replay.estimators.gaussian import (
     ALL_WELL,
@@ -30,6 +31,8 @@ from replay.estimators.gaussian import (
     is_finite,
     no_innovation,
 )
+from replay.measurements import read_vectors
+from replay.priors import gaussians
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
 
@@ -51,14 +54,14 @@ class Steps(NamedTuple):
 class System(NamedTuple):
     """One kind of system: the measurements' topic and column, names, and its filters by kind.
 
-    `reads` numbers make a measurement. `noise` names what the topic's metadata states and the filters
-    use, `measured` and `state` the components, `sampled` the dimension in which a filter samples.
+    `reads` are the components of a measurement. `noise` names what the topic's metadata states and the
+    filters use, `measured` and `state` the components, `sampled` the dimension that a filter samples in.
     `memory(noise, sets)` makes what the steps work in.
     """
 
     topic: str
     column: str
-    reads: int
+    reads: Components
     noise: tuple[str, ...]
     measured: tuple[str, ...]
     state: tuple[str, ...]
@@ -185,8 +188,9 @@ def bind_system(
         if topic is not None and topic.metadata.get("system") == label and PRIOR in topics:
             noise = np.array([_stated(topic, each) for each in system.noise])
             settings = Filter(name, system, kind, noise, sampler_at(system.sampled), seed)
-            begin, step = partial(start, system=system), partial(run, settings=settings)
-            return [Recursive(name, (topic.name,), (PRIOR,), begin, step)]
+            priors: dict[str, Components] = {PRIOR: dict.fromkeys(system.state, "linear")}
+            step = partial(run, settings=settings)
+            return [Recursive(name, (topic.name,), (PRIOR,), start, step, priors)]
     return []
 
 
@@ -197,37 +201,18 @@ def _stated(topic: Topic, name: str) -> float:
         raise BadInput(f"topic {topic.name} does not state {name}; record it again") from None
 
 
-def start(whole: Mapping[str, Ragged], system: System) -> State:
-    """The state at every run's prior.
-
-    Raises BadInput where a run has no prior, or one of another size or without a positive definite
-    covariance.
-    """
-    prior = whole[PRIOR]
-    size = len(system.state)
-    if np.any(np.diff(prior.offsets) == 0):
-        raise BadInput(f"topic {PRIOR}: a run has no prior message; the filter cannot start")
-    rows = prior.offsets[:-1]
-    mean = prior["mean"][rows]
-    if mean.shape[1] != size or prior["covariance"].shape[1] != size * size:
-        raise BadInput(f"topic {PRIOR}: a prior of ({', '.join(system.state)}) is needed")
-    covariance = prior["covariance"][rows].reshape(-1, size, size)
-    if not np.all(np.linalg.eigvalsh(covariance)[:, 0] > 0):
-        raise BadInput(f"topic {PRIOR}: the prior's covariance is not positive definite")
-    time_ns = prior.stream.publish_time_ns[rows]
-    return Carried(mean, covariance, time_ns, np.full(prior.runs, ALL_WELL)), (None,) * prior.runs
+def start(whole: Mapping[str, Ragged]) -> State:
+    """The state at every run's prior."""
+    time_ns, mean, covariance = gaussians(whole[PRIOR])
+    return Carried(mean, covariance, time_ns, np.full(len(mean), ALL_WELL)), (None,) * len(mean)
 
 
 def run(state: State, block: Block, *, settings: Filter) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.Recursive`."""
     before, generators = state
     system, offsets = settings.system, block.events.offsets
-    measured = block.streams[system.topic][system.column][block.events.source]
-    if measured.shape[1] != system.reads:
-        raise BadInput(
-            f"topic {system.topic}: {system.reads} numbers per message are needed, "
-            f"got {measured.shape[1]}"
-        )
+    stream = block.streams[system.topic].stream
+    measured = read_vectors(stream, system.column, system.reads)[block.events.source]
     if settings.sampler.redrawn:
         generators = seeded_by_data(generators, measured, offsets, settings.seed)
     after = copy.deepcopy(before)

@@ -17,6 +17,7 @@ from replay.estimators.gaussian import (
     regression,
     sample_memory,
 )
+from replay.measurements import PLANE
 from replay.sampling.sets import SampleSets
 
 STATES = 4
@@ -150,7 +151,7 @@ def square_covariance(mean: Floats, covariance: Floats, first: int, second: int)
 EXTENDED_TARGET = System(
     topic="/surface_point",
     column="position_m",
-    reads=2,
+    reads=PLANE,
     noise=("size_drift_m2", "position_drift_m2", "point_variance_m2"),
     measured=("x_m", "y_m", "x_squared_m2", "y_squared_m2"),
     state=("half_x_m", "half_y_m", "x_m", "y_m"),

@@ -45,12 +45,16 @@ from replay.estimators.gaussian import (
     no_innovation,
     sampled,
 )
+from replay.measurements import PLANE, read_vectors
+from replay.priors import gaussians
 from replay.sampling import Sampler, Sampling
 from replay.sampling.names import Unscented
 from replay.sampling.samplers import no_samples
 from replay.sampling.sets import Generators, SampleSets, seeded_by_data, sets_by_runs
+from replay.tangent import Kind
 
 USES = 2  # of samples per event: prediction and update
+POSE: dict[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 SENSORS = {
     "range_bearing": schemas.RANGE_BEARING,
     "range": schemas.RANGE,
@@ -279,29 +283,11 @@ def _compiled(kind: str) -> tuple[Function, Function]:
 
 
 def start(whole: Mapping[str, Ragged], prior_topic: str) -> State:
-    """The state at every run's prior, and the maps.
-
-    Raises BadInput where a run has no prior, or one that is no pose with a positive definite covariance,
-    or the map is not planar.
-    """
-    prior = whole[prior_topic]
-    rows = prior.offsets[:-1]
-    if np.any(np.diff(prior.offsets) == 0):
-        raise BadInput(f"topic {prior_topic}: a run has no prior message; the filter cannot start")
-    mean = prior["mean"][rows]
-    if mean.shape[1] != 3 or prior["covariance"].shape[1] != 9:
-        raise BadInput(f"topic {prior_topic}: a prior of (x_m, y_m, heading_rad) is needed")
-    covariance = prior["covariance"][rows].reshape(-1, 3, 3)
-    if np.any(np.linalg.eigvalsh(covariance)[:, 0] <= 0):
-        raise BadInput(f"topic {prior_topic}: the prior's covariance is not positive definite")
-    carried = Carried(
-        mean,
-        covariance,
-        np.zeros((prior.runs, 2)),
-        prior.stream.publish_time_ns[rows],
-        np.full(prior.runs, -1),
-    )
-    return carried, map_of_runs(whole.get("/landmarks")), (None,) * prior.runs
+    """The state at every run's prior, and the maps; raises BadInput where the map is not planar."""
+    time_ns, mean, covariance = gaussians(whole[prior_topic])
+    runs = len(mean)
+    carried = Carried(mean, covariance, np.zeros((runs, 2)), time_ns, np.full(runs, ALL_WELL))
+    return carried, map_of_runs(whole.get("/landmarks")), (None,) * runs
 
 
 def map_of_runs(landmarks: Ragged | None) -> Landmarks:
@@ -314,7 +300,7 @@ def map_of_runs(landmarks: Ragged | None) -> Landmarks:
     run = np.repeat(np.arange(landmarks.runs), np.diff(landmarks.offsets))
     keys = (run << 32) + landmarks["landmark_id"]
     order = np.argsort(keys, kind="stable")
-    return Landmarks(keys[order], np.ascontiguousarray(positions[order, :2]))
+    return Landmarks(keys[order], read_vectors(landmarks.stream, "position_m", PLANE)[order])
 
 
 def run(
@@ -516,6 +502,7 @@ def _bind(
                     settings=settings,
                     outputs=outputs,
                 ),
+                {whole[0]: POSE},
             )
         )
     return bound

@@ -82,7 +82,7 @@ def memory_of(noise: Floats, sets: SampleSets) -> SampleMemory:  # noqa: ARG001
 REACTOR = System(
     topic="/pressure",
     column="value",
-    reads=1,
+    reads={"total_pressure": "linear"},
     noise=("step_s", "process_variance", "pressure_variance"),
     measured=("total_pressure",),
     state=("pressure_a", "pressure_b"),

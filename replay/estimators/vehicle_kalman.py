@@ -7,20 +7,25 @@ the symmetric measurement equation filter", 2016, section 4.1. Each vehicle is a
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 
 from recorders.log import schemas
 from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import noise_moments, turn
 from recorders.parameters import Parameters
+from replay.measurements import PLANE, Vectors
 from replay.plain import Floats, Given, Integers, Messages, Results, recursive
 
 
 class KalmanParameters(Parameters):
-    """How the vehicle is supposed to move; None takes what its prior's channel states."""
+    """How the vehicle is supposed to move; None takes what its prior's channel states.
+
+    A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used.
+    """
 
     turn_rate_radps: float | None = None
     acceleration_sigma_mps2: NonNegativeFloat | None = None
+    sigma_fix_m: PositiveFloat | None = None
 
 
 class Motion(NamedTuple):
@@ -42,7 +47,7 @@ class State(NamedTuple):
 
 def start(given: Given[KalmanParameters]) -> tuple[Motion, State]:
     """The state at every run's prior."""
-    time_ns, mean, covariance = given.prior("prior", len(PLANE_MOTION))
+    time_ns, mean, covariance = given.prior("prior")
     motion = Motion(
         given.stated("prior", "turn_rate_radps"), given.stated("prior", "acceleration_sigma_mps2")
     )
@@ -127,7 +132,8 @@ VEHICLE_KALMAN = recursive(
     whole={"prior": schemas.GAUSSIAN_ESTIMATE},
     components=dict.fromkeys(PLANE_MOTION, "linear"),
     truth="truth",
-    measured={"x_m": "linear", "y_m": "linear"},
+    measured=PLANE,
+    vectors={"fix": Vectors({"position_m": PLANE}, "covariance_m2", "sigma_fix_m")},
     start=start,
     follow=follow,
 )
