@@ -5,9 +5,6 @@ file has changed, and stops on a damaged file. So the sources of a kernel and of
 become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
 model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
 which also run uncompiled.
-
-For finding a fault: with FUSELOG_UNCOMPILED=1 all kernels are plain Python, and an index beyond an array
-is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
 """
 
 import ast
@@ -51,7 +48,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
-        if _is_asked_for("FUSELOG_UNCOMPILED"):
+        if _is_uncompiled():
             return np.errstate(all="ignore")(function)
         bundle = _Bundle()
         name = bundle.add(function.__name__, function)
@@ -79,8 +76,11 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if _is_asked_for("FUSELOG_UNCOMPILED"):
+    if _is_uncompiled():
         return uncompiled_over_runs(run_once)
     bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
@@ -92,6 +92,10 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         f"        {kernel}(run, {names})",
     )
     return partial(_over_runs, name=run_once.__name__, loop=loop)
+
+
+def _is_uncompiled() -> bool:
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -135,10 +139,6 @@ def _over_runs(
         ) from error
 
 
-def _is_asked_for(switch: str) -> bool:
-    return os.environ.get(switch) == "1"
-
-
 class _Bundle:
     """Sources in the order they are needed, and the imports above them.
 
@@ -148,8 +148,9 @@ class _Bundle:
     def __init__(self, allocates: bool = True) -> None:
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
-        self.options = f"_nrt={allocates}, boundscheck={_is_asked_for('FUSELOG_BOUNDSCHECK')}"
         # one piece is faster where no counting stands in the way; elsewhere it only compiles longer
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt={allocates}{bounds}"
         self._decorator = f"@numba.njit({inner}, forceinline={not allocates}, {self.options})"
         self.imports = {"import numba", "import numpy"}
         self.definitions: list[str] = []
