@@ -34,6 +34,10 @@ WRITING = "tests/recorders/test_log_writing.py"
 ENGINE = "tests/replay/test_engine.py"
 EVALUATION = "tests/replay/test_evaluation.py"
 FUSION = "tests/replay/test_biometrics.py"
+VECTORS = "tests/replay/test_reading_streams.py"
+SPANS = "tests/pipeline/test_spans.py"
+FAILING = "tests/replay/test_failing_runs.py"
+OUTPUTS = "tests/pipeline/test_outputs.py"
 
 FAULTS = [
     # models of sensors and motion
@@ -515,5 +519,172 @@ FAULTS = [
         "if defaults.get(name) != value}",
         "if name not in defaults}",
         "tests/pipeline/test_command_line.py",
+    ),
+    # what is read, what a replay starts from, how runs fail
+    Fault(
+        "replay/components.py",
+        "return [names.index(name) for name in wanted]",
+        "return [*range(len(wanted))]",
+        "tests/replay/test_components.py",
+    ),
+    Fault(
+        "replay/components.py",
+        "end, end + TANGENT_WIDTHS[kind]",
+        "end, end + numbers.stop - numbers.start",
+        "tests/replay/test_components.py",
+    ),
+    Fault(
+        "replay/measurements.py",
+        "found[missing] = sigma**2 * np.eye(len(rows))",
+        "found[missing] = sigma * np.eye(len(rows))",
+        VECTORS,
+    ),
+    Fault(
+        "replay/measurements.py",
+        "np.isnan(found).any(axis=(1, 2))",
+        "np.isnan(found).all(axis=(1, 2))",
+        VECTORS,
+    ),
+    Fault(
+        "replay/measurements.py",
+        "np.ascontiguousarray(stream[field][:, columns])",
+        "np.ascontiguousarray(stream[field][:, : len(columns)])",
+        VECTORS,
+    ),
+    Fault("replay/priors.py", "whole[:, rows][:, :, rows]", "whole[:, rows]", VECTORS),
+    Fault("replay/starting.py", 'start_ns, side="left"', 'start_ns, side="right"', SPANS),
+    Fault(
+        "replay/starting.py",
+        "covariance[own, own] = sigma**2",
+        "covariance[own, own] = sigma",
+        SPANS,
+    ),
+    Fault(
+        "replay/starting.py",
+        "is_late = source.start_ns is not None and len(prior) and prior.times(order)[0]",
+        "is_late = source.start_ns is not None and len(prior) and prior.publish_time_ns[0]",
+        SPANS,
+    ),
+    Fault(
+        "replay/starting.py",
+        'mean, covariance = stream["mean"][before - 1], stream["covariance"][before - 1]',
+        'mean, covariance = stream["mean"][-1], stream["covariance"][-1]',
+        SPANS,
+    ),
+    Fault(
+        "pipeline/commands.py",
+        "zero_ns = source.zero_ns(order)",
+        'zero_ns = source.zero_ns("publish_time")',
+        SPANS,
+    ),
+    Fault(
+        "replay/failures.py",
+        "places = np.array([*map(merged.index, _reasons(part)), len(merged)])",
+        "places = np.array([*range(len(_reasons(part))), len(merged)])",
+        FAILING,
+    ),
+    Fault(
+        "replay/supervision.py",
+        "output.stream.publish_time_ns < self._end_ns[run]",
+        "output.stream.publish_time_ns <= self._end_ns[run]",
+        FAILING,
+    ),
+    Fault("replay/supervision.py", "if time_ns[row] < last_ns:", "if time_ns[row] <= last_ns:", FAILING),
+    Fault(
+        "replay/supervision.py",
+        "factor[i, column] = entry / factor[column, column]",
+        "factor[i, column] = entry",
+        FAILING,
+    ),
+    Fault(
+        "replay/supervision.py",
+        "median = np.argmax(2 * reached >= reached[:, -1:], axis=1)",
+        "median = np.argmax(reached >= reached[:, -1:], axis=1)",
+        FAILING,
+    ),
+    Fault(
+        "replay/metrics.py",
+        'coverage["estimated_s"].sum() / spans_s',
+        'coverage["estimated_s"].mean() / spans_s',
+        FAILING,
+    ),
+    Fault(
+        "pipeline/ensemble.py",
+        "is_part=len(sources) > RUNS_AT_ONCE",
+        "is_part=False",
+        FAILING,
+    ),
+    Fault(
+        "replay/estimators/solutions.py",
+        "in_order = np.lexsort((last, run))",
+        "in_order = np.arange(len(run))",
+        "tests/replay/test_angle_streams.py",
+    ),
+    Fault(
+        "replay/set_evaluation.py",
+        "self.bound_holds & self.in_arena & ~self.inside",
+        "self.bound_holds & ~self.inside",
+        "tests/replay/test_set_membership.py",
+    ),
+    Fault(
+        "replay/engine.py",
+        "and len(times_ns) and times_ns[0] < source.start_ns:",
+        "and len(times_ns) and times_ns[0] > source.start_ns:",
+        SPANS,
+    ),
+    # what is written over, and how
+    Fault(
+        "pipeline/outputs.py",
+        'taken[_identity(path)] = f"output {path}"',
+        'taken[path] = f"output {path}"',
+        OUTPUTS,
+    ),
+    Fault(
+        "pipeline/outputs.py",
+        "return state.st_dev, state.st_ino",
+        "return path.parent.resolve(), path.name",
+        OUTPUTS,
+    ),
+    Fault(
+        "pipeline/outputs.py",
+        "return run is not None and run.seed is not None and not _is_estimates(run)",
+        "return run is not None and run.seed is not None",
+        OUTPUTS,
+    ),
+    Fault(
+        "recorders/atomic.py",
+        "            place.rename(old)\n            check(old)",
+        "            place.rename(old)",
+        "tests/recorders/test_atomic.py tests/pipeline/test_outputs.py",
+    ),
+    Fault(
+        "recorders/atomic.py",
+        "return not others and (not members or",
+        "return (not members or",
+        "tests/recorders/test_atomic.py",
+    ),
+    Fault(
+        "recorders/atomic.py",
+        "            old.rename(place)\n",
+        "            shutil.rmtree(old)\n",
+        "tests/recorders/test_atomic.py",
+    ),
+    Fault(
+        "recorders/log/container.py",
+        "return entry if entry.message_end_time else None",
+        "return entry",
+        "tests/recorders/test_log_foreign.py",
+    ),
+    Fault(
+        "recorders/log/container.py",
+        "if known[number].offset >= end:",
+        "if known[number].offset > position:",
+        "tests/recorders/test_log_damage.py tests/recorders/test_log_by_hand.py",
+    ),
+    Fault(
+        "recorders/parsing.py",
+        "parse_float=_finite, parse_constant=_finite)",
+        "parse_float=_finite)",
+        "tests/recorders/test_parameters.py",
     ),
 ]
