@@ -1,0 +1,1 @@
+"""Models written once, and the methods that estimate with them."""
