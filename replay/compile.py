@@ -24,6 +24,7 @@ from typing import Any
 
 import numba
 from numba.core.errors import NumbaError
+from numba.core.registry import cpu_target
 
 from recorders.errors import BadInput
 
@@ -128,14 +129,15 @@ class _Bundle:
         if key in self._names:
             return self._names[key]
         own = self._names[key] = f"{name}_{len(self._names)}"
-        if isinstance(value, FunctionType):
+        if isinstance(value, FunctionType) and not _is_known_to_numba(value):
             self.definitions.append(f"{self._decorator}\n{self._source(own, value)}")
         elif isinstance(value, ModuleType):
-            self.imports.add(f"import {value.__name__} as {own}")
+            self.imports.add(f"import {value.__name__} as {own}{_source_hash(value.__name__)}")
         elif literal is not None:
             self.definitions.append(f"{own} = {literal}")
         else:
-            self.imports.add(f"from {value.__module__} import {origin} as {own}")
+            module = value.__module__
+            self.imports.add(f"from {module} import {origin} as {own}{_source_hash(module)}")
         return own
 
     def _source(self, own: str, function: FunctionType) -> str:
@@ -148,6 +150,26 @@ class _Bundle:
             if isinstance(node, ast.Name):
                 node.id = names.get(node.id, node.id)
         return ast.unparse(definition)
+
+
+def _is_known_to_numba(function: FunctionType) -> bool:
+    """Whether numba has an implementation of its own for it (`numba.extending.overload`)."""
+    context = cpu_target.typing_context
+    context.refresh()
+    try:
+        context.resolve_value_type(function)
+    except ValueError:
+        return False
+    return True
+
+
+def _source_hash(module: str) -> str:
+    """A comment that changes with the source of an imported module, and so makes another kernel."""
+    try:
+        source = inspect.getsource(sys.modules[module])
+    except (OSError, TypeError):  # written in C
+        return ""
+    return f"  # {hashlib.sha256(source.encode()).hexdigest()}"
 
 
 def _literal(value: Any) -> str | None:

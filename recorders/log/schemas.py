@@ -299,12 +299,13 @@ DENSITY_ESTIMATE = _declare(
 )
 INNOVATION = _declare(
     "Innovation",
-    "How one measurement fitted the prediction, and whether the gate let it in.",
+    "How one measurement fitted the prediction, and whether the gate let it in; a likelihood of zero else.",
     _identifier("target_id"),
     _identifier("accepted"),
     _vector("innovation", may_be_nan=True),
     _vector("covariance", may_be_nan=True),
     _real("normalised_innovation_squared"),
+    _real("log_likelihood", may_be_nan=True),
 )
 FAILURE = _declare(
     "Failure",

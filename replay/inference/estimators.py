@@ -8,6 +8,7 @@ import copy
 from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -349,26 +350,25 @@ class Filter:
     def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
         """Filter a block."""
         happenings = happenings_of(self.stage, self.found, block, state.points)
+        tick, waiting = state.tick, None
+        if self.parameters.every_s is not None:
+            every_ns = round(self.parameters.every_s * 1e9)
+            happenings, tick = with_ticks(happenings, state.carried.time_ns, tick, every_ns)
         if state.waiting is not None:
             happenings = joined(state.waiting, happenings)
-        waiting = None
-        if self.stage.model.control is not None and self.stage.model.control.interpolated:
-            happenings, waiting = interpolated(self.stage, happenings)
-        return self.follow(state._replace(waiting=waiting), happenings)
+        control = self.stage.model.control
+        if control is not None and control.interpolated:
+            happenings, waiting = interpolated(happenings, len(control.components))
+        return self.follow(state._replace(waiting=waiting, tick=tick), happenings)
 
     def finish(self, state: State) -> list[Ragged]:
         """What still waits for a control that does not come any more."""
         if state.waiting is None:
             return []
-        return self.follow(state, held(self.stage, state.waiting))[1]
+        return self.follow(state, held(state.waiting, self.stage.model.controls))[1]
 
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
-        tick = state.tick
-        if self.parameters.every_s is not None:
-            happenings, tick = with_ticks(
-                happenings, state.carried.time_ns, tick, round(self.parameters.every_s * 1e9)
-            )
         model, sensors = self.stage.model, self.stage.sensors
         names = number_fields(model.parameters)
         loop, steps = _compiled(model, self.stage.motion, sensors, self.method, names)
@@ -404,7 +404,7 @@ class Filter:
         made.append(
             failures_of(f"/estimates/{self.name}", before.failure, carried.failure, carried.time_ns)
         )
-        return State(carried, state.points, generators, state.waiting, tick), made
+        return state._replace(carried=carried, generators=generators), made
 
     @cached_property
     def gates(self) -> Floats:
@@ -615,30 +615,33 @@ def _of_rows(happenings: Happenings, chosen: NDArray[np.bool_]) -> Happenings:
     return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
 
 
-def interpolated(stage: Stage, happenings: Happenings) -> tuple[Happenings, Happenings]:
+def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Happenings]:
     """Events with the control at their stamps, linear between messages; and those still to wait.
 
     What comes after a run's last control message waits for the next, with that message before it.
     """
     data, is_control = happenings.data.copy(), happenings.source == CONTROL
-    ready = np.zeros(len(data), bool)
-    columns = slice(data.shape[1] - stage.model.controls, None)
-    for begin, end in zip(happenings.offsets[:-1], happenings.offsets[1:], strict=True):
+    ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
+    columns = range(data.shape[1] - controls, data.shape[1])
+    for begin, end in pairwise(happenings.offsets):
         at = begin + np.flatnonzero(is_control[begin:end])
         if not len(at):
             continue
-        times_ns = happenings.time_ns[at] - happenings.time_ns[at[0]]
         inside = slice(begin, at[-1] + 1)
-        wanted_ns = happenings.time_ns[inside] - happenings.time_ns[at[0]]
-        for column in range(*columns.indices(data.shape[1])):
+        times_ns, wanted_ns = (happenings.time_ns[rows] - happenings.time_ns[begin] for rows in (at, inside))
+        for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
-        ready[inside] = True
-    return _of_rows(happenings._replace(data=data), ready), _of_rows(happenings, ~ready)
+        ready[inside], waiting[begin : at[-1]] = True, False
+    return _of_rows(happenings._replace(data=data), ready), _of_rows(happenings, waiting)
 
 
-def held(stage: Stage, happenings: Happenings) -> Happenings:
-    """Events after the last control, which holds; the recursion takes NaN for what it has."""
-    return happenings
+def held(happenings: Happenings, controls: int) -> Happenings:
+    """Events that wait for a control message that does not come: the last one holds."""
+    data = happenings.data.copy()
+    for begin, end in pairwise(happenings.offsets):
+        if begin < end:
+            data[begin:end, -controls:] = data[begin, -controls:]
+    return happenings._replace(data=data)
 
 
 def with_ticks(
@@ -646,9 +649,7 @@ def with_ticks(
 ) -> tuple[Happenings, Integers]:
     """Events, and between them one every so often, at which an estimate is wanted."""
     times, runs, ticks = [], [], tick.copy()
-    for run, (begin, end) in enumerate(
-        zip(happenings.offsets[:-1], happenings.offsets[1:], strict=True)
-    ):
+    for run, (begin, end) in enumerate(pairwise(happenings.offsets)):
         if begin == end:
             continue
         last_ns = happenings.time_ns[end - 1]
