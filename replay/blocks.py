@@ -70,9 +70,14 @@ class Block(NamedTuple):
 
 
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
-    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs."""
+    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
+
+    An entry may be such a NamedTuple itself.
+    """
     columns: Any = carried
-    return type(carried)(*(column[runs] for column in columns))
+    return type(carried)(
+        *(of_runs(column, runs) if isinstance(column, tuple) else column[runs] for column in columns)
+    )
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:

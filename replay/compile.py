@@ -135,6 +135,9 @@ class _Bundle:
             self.imports.add(f"import {value.__name__} as {own}{_source_hash(value.__name__)}")
         elif literal is not None:
             self.definitions.append(f"{own} = {literal}")
+        elif _is_made_here(value):
+            self.imports.add("import collections")
+            self.definitions.append(f"{own} = collections.namedtuple({own!r}, {value._fields})")
         else:
             module = value.__module__
             self.imports.add(f"from {module} import {origin} as {own}{_source_hash(module)}")
@@ -150,6 +153,12 @@ class _Bundle:
             if isinstance(node, ast.Name):
                 node.id = names.get(node.id, node.id)
         return ast.unparse(definition)
+
+
+def _is_made_here(value: Any) -> bool:
+    """Whether it is a NamedTuple that was made at run time, which no import by name finds."""
+    made = isinstance(value, type) and issubclass(value, tuple) and hasattr(value, "_fields")
+    return made and getattr(sys.modules.get(value.__module__), value.__name__, None) is not value
 
 
 def _is_known_to_numba(function: FunctionType) -> bool:
