@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from pydantic import create_model
 from scipy.stats import chi2
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
+from recorders.parameters import Parameters, build
+from recorders.registry import available, load
 from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
@@ -168,6 +170,71 @@ def modelled(model: Model, method: str, **defaults: Any) -> Estimator[Any]:
         partial(bind_model, model=model, method=chosen),
         variant=chosen.variant,
     )
+
+
+def of_any_model(method: str) -> Estimator[Any]:
+    """The estimator that estimates, by one method, the state of the registered model that fits a log."""
+    chosen = METHODS[method]
+    return Estimator(
+        f"{chosen.summary}, of any model (`fuselog models` lists them)",
+        "a log of one of the models that `fuselog models` lists",
+        _any_parameters(chosen),
+        partial(_bind_fitting, method=chosen),
+        variant=chosen.variant,
+    )
+
+
+def registered_models() -> dict[str, Model]:
+    """All models by name."""
+    return {name: load("models", name, Model) for name in available("models")}
+
+
+@lru_cache(maxsize=16)
+def _any_parameters(method: Method) -> type[Parameters]:
+    """All parameters of all models, none of them set, with those of a method and the model's name.
+
+    What one model wants of a parameter is checked when the log has told which model it is.
+    """
+    fields: dict[str, Any] = {"model": (str | None, None)}
+    for model in registered_models().values():
+        for name, field in model.parameters.model_fields.items():
+            if name not in method.parameters.model_fields:
+                same = fields.get(name, (field.annotation,))[0] == field.annotation
+                fields[name] = (field.annotation if same else Any, None)
+    return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
+
+
+def _bind_fitting(
+    label: str, topics: Mapping[str, Topic], values: Parameters, *, method: Method
+) -> list[Bound]:
+    """Bind the model that is named, or else the one that fits.
+
+    Raises BadInput where none fits, several do, the method cannot serve it, or it has no such parameter.
+    """
+    models = registered_models()
+    given = {name: getattr(values, name) for name in values.model_fields_set}
+    named = given.pop("model", None)
+    if named is not None and named not in models:
+        raise BadInput(f"estimator {label}: no model '{named}'; {choices(named, models)}")
+    fitting = [name for name in ([named] if named else models) if topics_of(models[name], topics)]
+    if len(fitting) > 1:
+        raise BadInput(
+            f"estimator {label}: models {' and '.join(fitting)} fit this log; choose one with --model NAME"
+        )
+    if not fitting:
+        tried = [named] if named else list(models)
+        raise BadInput(
+            f"estimator {label}: no model fits this log, which has {', '.join(topics) or 'no topics'}. "
+            + " ".join(f"{name} needs {needs_of(models[name])}." for name in tried)
+        )
+    (name,) = fitting
+    lacking = method.lacks(models[name])
+    if lacking:
+        raise BadInput(f"estimator {label}: model {name} lacks {lacking}, which this method needs")
+    parameters = build(
+        combined(models[name], method), given, f"estimator {label}, model {name}"
+    )
+    return bind_model(label, topics, parameters, model=models[name], method=method)
 
 
 def bind_model(
