@@ -8,10 +8,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from pipeline.experiment import Experiment, load_scenario, read_toml, shipped
+from pipeline.experiment import Experiment, load_scenario, shipped
 from pipeline.terminal import print_json, print_table, say
 from recorders.errors import BadInput, choices
 from recorders.parameters import build, describe
+from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
 from replay.engine import Estimator

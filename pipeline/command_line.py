@@ -1,16 +1,23 @@
 """The command `fuselog`. Commands import what they need when they run: `--help` answers at once."""
 
 import io
+import logging
 import math
 import os
+import shlex
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import click
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, printable
 
 
 class OutputFile(click.Path):
@@ -96,6 +103,7 @@ def record(
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
     from pipeline.experiment import load_scenario
+    from pipeline.outputs import RECORDED, check_files
     from recorders.log import open_log, write_log
     from recorders.parameters import merge, parse_settings
     from recorders.recording import record_run
@@ -112,8 +120,9 @@ def record(
     else:
         name, values, label = load_scenario(scenario or "")
     values = merge(values, parse_settings(settings))
-    recording, metadata = record_run(name, values, seed or 0, run or 0)
     path = out or Path(f"{label}.mcap")
+    check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
+    recording, metadata = record_run(name, values, seed or 0, run or 0)
     write_log(path, recording.streams, metadata, compression=compression)
     _say_written(path, sum(map(len, recording.streams)))
 
@@ -125,15 +134,17 @@ def record(
 @set_option
 def import_(source: str, path: Path, out: Path | None, settings: tuple[str, ...]) -> None:
     """Import real data of kind SOURCE from PATH, as published, and write their log."""
+    from pipeline.outputs import check_files, imported
     from recorders.log import write_log
     from recorders.parameters import parse_settings
     from recorders.recording import import_run
 
-    recording, metadata = import_run(source, path, parse_settings(settings))
     target = out or Path(f"{source}.mcap")
+    check_files([(target, imported(source))], {"data": [path]})
+    recording, metadata = import_run(source, path, parse_settings(settings))
     write_log(target, recording.streams, metadata)
     for subject, fact in metadata.notes.items():
-        click.echo(f"{subject}: {fact}")
+        click.echo(printable(f"{subject}: {fact}"))
     _say_written(target, sum(map(len, recording.streams)))
 
 
@@ -154,6 +165,21 @@ def _say_written(path: Path, messages: int) -> None:
 )
 @click.option("--arrival-order", is_flag=True, help="Go by log time, as the messages arrived.")
 @click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option(
+    "--start-from",
+    "origins",
+    multiple=True,
+    metavar="truth|ESTIMATES",
+    help="What filters begin with at --start: the log's truth, or the estimates log of an earlier "
+    "replay (one per log).",
+)
+@click.option(
+    "--start-sigma",
+    "sigmas",
+    multiple=True,
+    metavar="COMPONENT=SIGMA",
+    help="How well --start-from truth knows a component (repeatable) [default: as the log's prior].",
+)
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
@@ -231,8 +257,10 @@ def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> 
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
 def report(results: tuple[Path, ...], out: Path) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
+    from pipeline.outputs import REPORT, check_files
     from pipeline.report import write_report
 
+    check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     write_report(list(results), out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
@@ -272,9 +300,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
+    logging.basicConfig(format="fuselog: %(message)s")
     try:
-        fuselog(arguments, prog_name="fuselog", standalone_mode=False)
-        print(end="", flush=True)
+        with _stopped_by_signals():
+            fuselog(arguments, prog_name="fuselog", standalone_mode=False)
+            print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         return 2
@@ -282,38 +312,79 @@ def main(arguments: Sequence[str] | None = None) -> int:
         context = getattr(error, "ctx", None)
         hint = f" (see {context.command_path} --help)" if context else ""
         return _fail(error.format_message().rstrip(".") + hint)
-    except (click.Abort, KeyboardInterrupt):
+    except (click.Abort, KeyboardInterrupt) as error:
         click.echo("fuselog: stopped", err=True)
-        return 130
+        cause = error.__cause__ or error  # click wraps it
+        return 128 + (cause.number if isinstance(cause, Stopped) else signal.SIGINT)
     except BrokenPipeError:
         _drop_output()
         return 1
     except (BadInput, OSError, MemoryError) as error:
         if os.environ.get("FUSELOG_TRACEBACK"):
             raise
-        _drop_output()
-        return _fail(_sentence(error))
+        place = "" if _drop_output() else "standard output"
+        return _fail(_sentence(error, place or f"fuselog {shlex.join(arguments or sys.argv[1:])}"))
     return 0
 
 
-def _sentence(error: Exception) -> str:
+class Stopped(KeyboardInterrupt):
+    """A signal asked the process to end: what holds for Ctrl-C holds for it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Have signals that end the process unwind it, so that what was begun is cleared away."""
+    last_s = -math.inf
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal last_s
+        before_s, last_s = last_s, time.monotonic()
+        if last_s - before_s > 1.0:  # `timeout` sends it twice: to the process and to its group
+            raise Stopped(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = [
+        getattr(signal, name)
+        for name in ("SIGTERM", "SIGHUP")
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL
+    ]
+    for number in asked:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _sentence(error: Exception, place: str) -> str:
+    """What went wrong, and where: `place` is for errors that do not say so themselves."""
     if isinstance(error, OSError):
-        place = f"{error.filename}: " if error.filename else ""
-        return f"{place}{error.strerror or error}"
+        place = os.fsdecode(error.filename) if error.filename else place
+        return f"{place}: {error.strerror or error}"
     if isinstance(error, MemoryError):
-        return f"not enough memory; ask for fewer runs or less time ({error})"
+        why = f" ({error})" if str(error) else ""
+        return f"not enough memory; ask for fewer runs or less time{why}"
     return str(error)
 
 
 def _fail(sentence: str) -> int:
-    line = sentence.strip().replace("\n", " ")
+    line = printable(sentence.strip().replace("\n", " "))
     click.echo(f"fuselog: {line}", err=True)
     return 2
 
 
-def _drop_output() -> None:
-    """Where standard output takes no more, have the interpreter not try again at its end."""
+def _drop_output() -> bool:
+    """Whether standard output takes more; where not, the interpreter must not try again at its end."""
     try:
         print(end="", flush=True)
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True

@@ -4,24 +4,30 @@ Rerun and matplotlib take long to import: only what draws imports them.
 """
 
 import hashlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.ensemble import Replayed, judge, replay_to_logs
 from pipeline.experiment import load_experiment, run_experiment
+from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import plain, result_folder, write_outcome
 from pipeline.studies.localization import summarise
-from pipeline.terminal import print_claims, print_json, print_metrics, progress, say, warn
+from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
+from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Log, open_log
+from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
 from replay.blocks import Ragged, gather
 from replay.engine import configure, find_estimator
 from replay.metrics import Output, find_metrics, measure
-from replay.sources import LogSource, log_span_ns
+from replay.sources import LogSource
+from replay.starting import Origin, from_estimates, from_truth
+
+# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
+TOLD = ("failure", "skipped", "coverage")
 
 
 def replay_logs(
@@ -32,6 +38,8 @@ def replay_logs(
     arrival_order: bool,
     start_s: float | None,
     end_s: float | None,
+    origins: Sequence[str],
+    sigmas: Sequence[str],
     save: Path | None,
     connect: str | None,
     recover: bool,
@@ -41,13 +49,23 @@ def replay_logs(
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
+    timelines = [] if save is None else [(save, TIMELINE)]
+    check_files([*((path, ESTIMATES) for path in paths), *timelines], {"log": logs})
     estimators = _settings_of_estimators(names, parse_settings(settings))
-    sources = [_span(LogSource(open_log(path, recover=recover)), start_s, end_s) for path in logs]
     order: Clock = "log_time" if arrival_order else "publish_time"
-    replay_to_logs(sources, estimators, paths, order=order, progress=progress)
+    opened = [LogSource(open_log(path, recover=recover)) for path in logs]
+    sources = [_span(source, start_s, end_s, order) for source in opened]
+    seconds = replay_to_logs(
+        sources,
+        estimators,
+        paths,
+        order=order,
+        origins=_origins(sources, origins, sigmas, order, gap_limit_s),
+        progress=progress,
+    )
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
-    _print_outcome(replayed, (), as_json=as_json, written=paths)
+    _print_outcome(replayed, (), as_json=as_json, written=paths, seconds=seconds)
     if save is not None or connect is not None:
         _show(replayed, save, connect)
 
@@ -55,19 +73,17 @@ def replay_logs(
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """Where the estimates of each log go: beside it, to the one file given, or into a folder.
 
-    Raises BadInput where two would be the same, or one would replace a log.
+    Raises BadInput where two would be the same.
     """
-    if out is not None and out.suffix == ".mcap":
+    if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
             raise BadInput(f"--out {out}: {len(logs)} logs have an estimates log each; give a folder")
-        paths = [out]
-    else:
-        paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
+        return [out]
+    if out is not None and out.suffix and not out.is_dir():
+        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder; make it if it is one")
+    paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
     places = [path.resolve() for path in paths]
-    sources = {log.resolve() for log in logs}
     for path, place in zip(paths, places, strict=True):
-        if place in sources:
-            raise BadInput(f"{path}: the estimates would replace the log; give another --out")
         if places.count(place) > 1:
             raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
     return paths
@@ -102,20 +118,64 @@ def _settings_of_estimators(
     return chosen
 
 
-def _span(source: LogSource, start_s: float | None, end_s: float | None) -> LogSource:
-    """The part of a log between two times in seconds from its epoch."""
+def _span(source: LogSource, start_s: float | None, end_s: float | None, order: Clock) -> LogSource:
+    """The part of a log between two times in seconds, by the clock that orders the replay."""
     if start_s is not None and end_s is not None and start_s >= end_s:
         raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
+    if start_s is None and end_s is None:
+        return source
+    zero_ns = source.zero_ns(order)
     start_ns, end_ns = (
-        None if time_s is None else source.epoch_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
+        None if time_s is None else zero_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
     )
-    first_ns, last_ns = log_span_ns(source.log)
+    first_ns, last_ns = read_span(source.log, order)
     if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
-        first_s, last_s = ((time_ns - source.epoch_ns) * 1e-9 for time_ns in (first_ns, last_ns))
+        first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
         raise BadInput(
             f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
         )
     return LogSource(source.log, start_ns, end_ns)
+
+
+def _origins(
+    sources: Sequence[LogSource],
+    origins: Sequence[str],
+    sigmas: Sequence[str],
+    order: Clock,
+    gap_limit_s: float,
+) -> list[Origin]:
+    """What each run starts from; none where that is not stated."""
+    stated = _sigmas(sigmas)
+    if origins and sources[0].start_ns is None:
+        raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
+    if stated and tuple(origins) != ("truth",):
+        raise BadInput(f"--start-sigma {sigmas[0]}: is for --start-from truth")
+    if not origins:
+        return []
+    if tuple(origins) == ("truth",):
+        return [from_truth(source, order, gap_limit_s, stated) for source in sources]
+    if len(origins) != len(sources):
+        raise BadInput(
+            f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
+        )
+    opened = [open_log(origin) for origin in origins]
+    for estimates, source in zip(opened, sources, strict=True):
+        _check_same_run(estimates, source.log)
+    return [from_estimates(LogSource(estimates)) for estimates in opened]
+
+
+def _sigmas(texts: Sequence[str]) -> dict[str, float]:
+    """Standard deviations by component, from COMPONENT=SIGMA."""
+    sigmas: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            sigmas[name] = float(value)
+        except ValueError:
+            sigmas[name] = math.nan
+        if not 0 < sigmas[name] < math.inf:
+            raise BadInput(f"--start-sigma {text}: expected COMPONENT=SIGMA with a positive number")
+    return sigmas
 
 
 def _state_losses(logs: Iterable[Log]) -> None:
@@ -142,13 +202,13 @@ def evaluate_logs(
         if not any(topic.startswith("/estimates/") for topic in each.topics):
             raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
     places = logs or [_source_path(each) for each in opened]
+    if out is not None:
+        check_folder(out, {"input": [*estimates, *places]})
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
     replayed = judge(sources, _read_outputs(opened), gap_limit_s)
-    telling = [
-        each for each in replayed.judged if not isinstance(each, Output) or each.leaf != "failure"
-    ]
+    telling = [each for each in replayed.judged if not isinstance(each, Output) or each.leaf not in TOLD]
     if not measure(telling, find_metrics(metrics)):
         raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
     _state_losses([*opened, *(source.log for source in sources)])
@@ -209,20 +269,42 @@ def _hash_files(paths: Sequence[Path]) -> str:
 
 
 def _print_outcome(
-    replayed: Replayed, metrics: Sequence[str], *, as_json: bool, written: Sequence[Path]
+    replayed: Replayed,
+    metrics: Sequence[str],
+    *,
+    as_json: bool,
+    written: Sequence[Path],
+    seconds: Mapping[str, float] | None = None,
 ) -> None:
     values = plain(measure(replayed.judged, find_metrics(metrics)))
     failures = replayed.failures
+    _state_unjudged(replayed)
     for sentence in failures[:5]:
         warn(sentence)
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
     if as_json:
-        print_json({"metrics": values, "failures": failures, "written": [str(path) for path in written]})
+        outcome = {
+            "metrics": values,
+            "failures": failures,
+            "losses": replayed.losses,
+            "written": [str(path) for path in written],
+        }
+        print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
         return
     print_metrics(values)
+    for sentence in replayed.losses:
+        say(sentence)
+    if seconds:
+        print_table(("estimator", "time (s)"), list(seconds.items()))
     for path in written:
         say(str(path))
+
+
+def _state_unjudged(replayed: Replayed) -> None:
+    """What of the estimates has no truth, in one sentence for each."""
+    for sentence in replayed.unjudged:
+        warn(sentence)
 
 
 def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
@@ -246,10 +328,12 @@ def view_path(
     """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
     from replay.timeline import viewer
 
-    with TemporaryDirectory(prefix="fuselog-view-") as folder:
-        rrd = path / "timeline.rrd" if path.is_dir() else path
+    rrd = path / "timeline.rrd" if path.is_dir() else path
+    outputs = [(save, TIMELINE), (screenshot, PICTURE)]
+    check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
+    with scratch_folder("fuselog-view") as folder:
         if rrd.suffix != ".rrd":
-            rrd = save or Path(folder) / "timeline.rrd"
+            rrd = save or folder / "timeline.rrd"
             _draw_log(path, rrd, connect, focus, gap_limit_s, recover=recover)
         elif save is not None or connect is not None or focus is not None:
             raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
@@ -273,6 +357,7 @@ def _draw_log(
         source = LogSource(open_log(_source_path(log), recover=recover))
     replayed = judge([source], outputs, gap_limit_s)
     show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
+    _state_unjudged(replayed)
     _state_losses([log, source.log])
 
 
@@ -289,6 +374,8 @@ def run_named(
     """Run an experiment and print its metrics and claims."""
     label, experiment = load_experiment(name, parse_settings(settings), over)
     folder = out or Path("out") / label
+    inputs = [Path(name)] if name.endswith(".toml") else []
+    check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
     result = run_experiment(label, experiment, folder, data=data, logs=logs, progress=progress)
     if as_json:
         print_json(result.model_dump(mode="json"))

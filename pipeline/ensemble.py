@@ -6,6 +6,8 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 import hashlib
 import json
 import os
+import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
@@ -16,11 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
+from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged
-from replay.engine import BLOCK_MESSAGES, bind, collect, replay
+from replay.engine import BLOCK_MESSAGES, Report, bind, collect, replay
 from replay.evaluation import (
     Errors,
     Innovations,
@@ -28,13 +32,18 @@ from replay.evaluation import (
     gaussian_estimates,
     innovations_of,
     split_topic,
+    unjudged,
 )
-from replay.metrics import Output
+from replay.failures import sentences_of
+from replay.metrics import Output, estimated_share
 from replay.set_errors import SetErrors, set_errors
 from replay.sources import MemorySource, Source, memory_source
+from replay.starting import Origin, start_from
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
+# Less than this share of a span is said; a run's first measurements may well be before the prior.
+LEAST_SHARE = 0.995
 
 Settings = Mapping[str, Mapping[str, Any]]
 Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
@@ -65,24 +74,56 @@ class Replayed:
         return [*self.errors, *self.innovations, *self.sets, *outputs]
 
     @property
+    def unjudged(self) -> list[str]:
+        """A sentence for every estimate of which the truth lacks components."""
+        sentences = []
+        for estimates in gaussian_estimates(self.outputs):
+            names = unjudged(estimates, self.sources)
+            if names:
+                stream = estimates.stream
+                what = " ".join(filter(None, split_topic(stream.topic)))
+                verb = "is" if len(names) == 1 else "are"
+                sentences.append(
+                    f"{what}: {', '.join(names)} {verb} not judged: {stream.metadata['truth']} lacks "
+                    + ("it" if len(names) == 1 else "them")
+                )
+        return sentences
+
+    @property
     def failures(self) -> list[str]:
         """A sentence for every run that an estimator could not follow to the end, or not at all."""
         failed: dict[tuple[str, int], str] = {}
         silent: dict[tuple[str, int], str] = {}
         for topic, rows in self.outputs.items():
             what = " ".join(filter(None, split_topic(topic)))
-            reasons = dict(enumerate(rows.stream.metadata.get("reasons", "").split("; ")))
             for run, source in enumerate(self.sources):
                 found = rows.of_run(run)
                 if rows.stream.schema.full_name == schemas.FAILURE.full_name and len(found):
                     elapsed_s = (int(found.publish_time_ns[0]) - source.epoch_ns) * 1e-9
-                    reason = reasons.get(int(found["reason"][0]), "no reason given")
+                    reason = sentences_of(found.take(slice(0, 1)))[0]
                     failed[what, run] = f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}"
                 elif rows.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name and not len(
                     found
                 ):
                     silent[what, run] = f"{source.name}: {what} gave no estimates"
         return list({**silent, **failed}.values())
+
+    @property
+    def losses(self) -> list[str]:
+        """A sentence for every case that was not estimated throughout, and for measurements not used."""
+        said = []
+        for topic, rows in self.outputs.items():
+            what = " ".join(filter(None, split_topic(topic)))
+            schema = rows.stream.schema.full_name
+            if schema == schemas.COVERAGE.full_name and (share := estimated_share(rows)) is not None:
+                if share < LEAST_SHARE:
+                    said.append(
+                        f"{what}: {100 * share:.1f} % of the span was estimated; its figures are of that"
+                    )
+            elif schema == schemas.SKIPPED.full_name:
+                counts = Counter(sentences_of(rows.stream))
+                said += [f"{what}: {count} not used: {reason}" for reason, count in counts.items()]
+        return said
 
 
 def record_ensemble(
@@ -93,10 +134,39 @@ def record_ensemble(
     progress: Progress = no_progress,
     executor: Executor | None = None,
 ) -> list[MemorySource]:
-    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`."""
+    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`.
+
+    Raises BadInput where the first run shows that memory cannot hold them all.
+    """
     record = partial(_record, scenario, dict(parameters), seed)
-    recorded = executor.map(record, range(runs)) if executor else map(record, range(runs))
-    return list(progress(recorded, f"recording {scenario}", runs))
+    begin_s = time.perf_counter()
+    first = record(0)
+    took_s = time.perf_counter() - begin_s
+    # replay lays the runs end to end, which holds every column twice; estimates come on top
+    require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
+    others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
+    return list(progress(chain([first], others), f"recording {scenario}", runs))
+
+
+def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
+    """Raise BadInput with what something takes, where that is more memory than is free."""
+    time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
+    there_bytes = psutil.virtual_memory().available
+    if need_bytes > there_bytes:
+        need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
+        raise BadInput(
+            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
+            "ask for fewer runs or shorter ones"
+        )
+
+
+def _size(source: MemorySource) -> int:
+    """Bytes of all columns of a run."""
+    return sum(
+        column.nbytes
+        for stream in source.streams.values()
+        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
+    )
 
 
 def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:
@@ -127,7 +197,9 @@ def replay_in_memory(
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
-        outputs |= collect(replay(sources, bound, order=order))
+        report = Report()
+        outputs |= collect(replay(sources, bound, order=order, report=report))
+        outputs |= collect([report.coverage])
     return outputs
 
 
@@ -150,27 +222,46 @@ def replay_to_logs(
     paths: Sequence[Path],
     *,
     order: Clock = "publish_time",
+    origins: Sequence[Origin] = (),
     block_messages: int = BLOCK_MESSAGES,
     progress: Progress = no_progress,
-) -> None:
-    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand."""
+) -> dict[str, float]:
+    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
+
+    `origins` are what the runs start from where their spans begin after their priors, one per run.
+    Returns how many seconds each estimator took, by label.
+    """
+    seconds: dict[str, float] = defaultdict(float)
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
 
     def write_some(first: int) -> Iterator[int]:
         now = slice(first, first + RUNS_AT_ONCE)
+        begun = [
+            start_from(each, sources[now], origins[now], order) if origins else each for each in bound
+        ]
         with ExitStack() as stack:
             writers = [
                 stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
                 for path, source in zip(paths[now], sources[now], strict=True)
             ]
-            for block in replay(sources[now], bound, order=order, block_messages=block_messages):
+            part = Report()
+            blocks = replay(sources[now], begun, order=order, block_messages=block_messages, report=part)
+            for block in chain(blocks, _coverage_of(part)):
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block])
                 yield first
+            for label, time_s in part.seconds.items():
+                seconds[label] += time_s
 
     parts = map(write_some, range(0, len(sources), RUNS_AT_ONCE))
     for _ in progress(chain.from_iterable(parts), "replaying", None):
         pass
+    return dict(seconds)
+
+
+def _coverage_of(report: Report) -> Iterator[list[Ragged]]:
+    """The last block of a replay; it is there only when the others have been taken."""
+    yield report.coverage
 
 
 def estimates_metadata(
@@ -180,7 +271,7 @@ def estimates_metadata(
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
-    run = source.run or RunMetadata("unknown")
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath((log or Path(source.name)).resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()})
     return replace(run, notes={"log": place, "estimators": settings})

@@ -1,6 +1,5 @@
 """Experiments: scenario (or real data) x estimators x metrics, one TOML file each."""
 
-import tomllib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pipeline.ensemble import Progress, no_progress
 from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge
+from recorders.parsing import read_toml
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine import configure
@@ -90,16 +90,6 @@ def shipped(kind: str) -> dict[str, Path]:
     """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
         return {path.stem: path for path in sorted(folder.glob("*.toml"))}
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file's values; raises BadInput where it is missing or malformed."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise BadInput(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInput(f"{path}: is not readable as TOML ({error})") from None
 
 
 def load_experiment(

@@ -9,11 +9,10 @@ from typing import Any
 
 from pipeline.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, open_log
+from recorders.log import Log, RunMetadata, open_log, read_span
 from recorders.parameters import describe
 from recorders.recording import Recorder
 from recorders.registry import load
-from replay.sources import log_span_ns
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
@@ -22,7 +21,7 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
     if as_json:
         print_json(_as_json(log))
         return
-    first_ns, last_ns = log_span_ns(log)
+    first_ns, last_ns = read_span(log, "log_time")
     duration_s = (last_ns - first_ns) * 1e-9
     begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
     span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
@@ -39,7 +38,7 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
 
 
 def _as_json(log: Log) -> dict[str, Any]:
-    first_ns, last_ns = log_span_ns(log)
+    first_ns, last_ns = read_span(log, "log_time")
     topics = [
         {
             "topic": topic.name,

@@ -1,19 +1,23 @@
 """The report: result folders as one self-contained HTML page."""
 
+import base64
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, select_autoescape
-from markupsafe import Markup
 
 from pipeline.results import MetricTable, Result, metric_tables, read_result
 from pipeline.terminal import format_value
+from recorders.atomic import whole_file
 from recorders.errors import BadInput
 
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
+_SIGNATURE = b"<!-- fuselog "
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,7 @@ class Section:
     result: Result
     metrics: list[MetricTable]
     tables: dict[str, pd.DataFrame]
-    figures: dict[str, Markup]
+    figures: dict[str, str]
 
 
 def write_report(folders: Sequence[Path], page: Path) -> None:
@@ -35,21 +39,26 @@ def write_report(folders: Sequence[Path], page: Path) -> None:
     environment = Environment(loader=PackageLoader("pipeline", "."), autoescape=select_autoescape())
     environment.filters["value"] = format_value
     text = environment.get_template("report.html").render(sections=sections)
-    part = page.with_name(page.name + ".part")
-    try:
-        page.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(page)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise BadInput(f"{page}: cannot be written ({error.strerror})") from error
+    with whole_file(page) as new:
+        new.write_bytes(_signed(text.encode(errors="backslashreplace")))
+
+
+def is_report(page: Path) -> bool:
+    """Whether a file is a page that `write_report` wrote, as it was written."""
+    content = page.read_bytes()
+    return content == _signed(content.rpartition(_SIGNATURE)[0])
+
+
+def _signed(page: bytes) -> bytes:
+    """The page with its own SHA-256 at its end."""
+    return b"%b%b%b -->\n" % (page, _SIGNATURE, hashlib.sha256(page).hexdigest().encode())
 
 
 def _section(folder: Path) -> Section:
     result = read_result(folder)
     try:
-        tables = {path.stem: pd.read_parquet(path) for path in sorted(folder.glob("tables/*.parquet"))}
-        figures = {path.stem: _inline(path) for path in sorted(folder.glob("figures/*.svg"))}
+        tables = {path.stem: _read_table(path) for path in sorted(folder.glob("tables/*.parquet"))}
+        figures = {unquote(path.stem): _as_image(path) for path in sorted(folder.glob("figures/*.svg"))}
     except (OSError, ValueError) as error:
         raise BadInput(f"{folder}: a table or figure is damaged ({error}); run it again") from error
     short = {
@@ -60,7 +69,11 @@ def _section(folder: Path) -> Section:
     return Section(result, metric_tables(result.metrics), short, figures)
 
 
-def _inline(path: Path) -> Markup:
-    """An SVG figure as part of the page, without its XML prologue."""
-    text = path.read_text(encoding="utf-8")
-    return Markup(text[text.index("<svg") :])
+def _read_table(path: Path) -> pd.DataFrame:
+    with path.open("rb") as file:
+        return pd.read_parquet(file)
+
+
+def _as_image(path: Path) -> str:
+    """An SVG figure as the address of an image: what scripts and links it may hold are dead there."""
+    return "data:image/svg+xml;base64," + base64.b64encode(path.read_bytes()).decode()

@@ -1,23 +1,25 @@
 """What an experiment yields, and its folder: tables, figures, claims, result.json.
 
-A result folder is built beside its place and moved there when it is whole.
+A result folder is built beside its place and moved there when it is whole. result.json lists what is in
+it, so that nothing else is ever replaced with it.
 """
 
-import fcntl
+import hashlib
 import json
 import math
-import os
 import re
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
+from recorders.atomic import whole_folder
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
+from recorders.parsing import parse_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,7 +61,11 @@ class Outcome:
 
 
 class Result(Parameters):
-    """What result.json says."""
+    """What result.json says.
+
+    `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
+    without it. A timeline has none: Rerun numbers its rows by the clock.
+    """
 
     experiment: str
     fuselog: str
@@ -67,6 +73,7 @@ class Result(Parameters):
     input_sha256: str
     metrics: dict[str, MetricValue]
     claims: list[Claim]
+    files: dict[str, str | None] = {}
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
@@ -105,54 +112,60 @@ def metric_tables(metrics: Mapping[str, MetricValue]) -> list[MetricTable]:
     ]
 
 
-@contextmanager
-def result_folder(folder: Path) -> Iterator[Path]:
+def result_folder(folder: Path) -> AbstractContextManager[Path]:
     """A folder to fill, beside its place; it replaces an earlier result there when all went well.
 
     Raises BadInput where something else than a result of ours is in the place, where another process
     is filling it, or where it cannot be written.
     """
-    place = folder.resolve()
-    if place.exists() and not (place / RESULT_FILE).is_file():
-        raise BadInput(f"{folder}: exists and is no fuselog result; give another folder with --out")
-    part, old = (place.with_name(place.name + ending) for ending in (".part", ".old"))
+    named = folder.name not in ("", "..")  # as `.` is not
+    return whole_folder(
+        folder if named else folder.resolve(), lambda found: _require_ours(found, folder)
+    )
+
+
+def _require_ours(found: Path, place: Path) -> None:
+    """Raise BadInput unless a folder holds a result of ours, as it was written, and nothing else."""
     try:
-        with _held(part):
-            yield part
-            shutil.rmtree(old, ignore_errors=True)
-            if place.exists():
-                place.rename(old)
-            part.rename(place)
-            shutil.rmtree(old, ignore_errors=True)
-    except BlockingIOError:
-        raise BadInput(f"{folder}: another fuselog is writing it; wait, or give another --out") from None
-    except OSError as error:
-        raise BadInput(f"{folder}: cannot be written ({error.strerror or error})") from error
+        result = read_result(found)
+    except BadInput:
+        raise BadInput(
+            f"{place}: exists and is no fuselog result; give another folder with --out"
+        ) from None
+    if _sealed(result) != result:
+        raise BadInput(
+            f"{place / RESULT_FILE}: was changed, or an older fuselog wrote it; give another --out"
+        )
+    expected = {Path(name): digest for name, digest in result.files.items()}
+    parents = {parent for name in expected for parent in name.parents}
+    for path in sorted(found.rglob("*")):
+        name = path.relative_to(found)
+        if path.is_symlink() or not (path.is_file() if name in expected else name in parents):
+            what = "was not written by fuselog"
+        elif (
+            name in expected and name != Path(RESULT_FILE) and expected[name] not in (None, _hash(path))
+        ):
+            what = "was changed since fuselog wrote it"
+        else:
+            continue
+        raise BadInput(f"{place / name}: {what}; move it away, or give another folder with --out")
 
 
-@contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """An empty folder that this process alone may fill; it is removed where that goes wrong.
+def _sealed(result: Result) -> Result:
+    """The result with the SHA-256 of its own text among its files."""
+    files = {name: digest for name, digest in result.files.items() if name != RESULT_FILE}
+    bare = result.model_copy(update={"files": files})
+    digest = hashlib.sha256(_text(bare).encode()).hexdigest()
+    return result.model_copy(update={"files": {**files, RESULT_FILE: digest}})
 
-    The lock goes with the process, however that ends, and what it left is cleared here.
-    """
-    new_parents = [parent for parent in folder.parents if not parent.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        try:
-            for path in folder.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-            yield
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            for parent in new_parents:
-                with suppress(OSError):
-                    parent.rmdir()
-            raise
-    finally:
-        os.close(handle)
+
+def _text(result: Result) -> str:
+    return json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_outcome(
@@ -168,23 +181,43 @@ def write_outcome(
     for name, table in outcome.tables.items():
         (folder / "tables").mkdir(exist_ok=True)
         columns = pyarrow.Table.from_pandas(table, preserve_index=False)
-        pyarrow.parquet.write_table(columns, folder / "tables" / f"{name}.parquet")
-        pyarrow.csv.write_csv(columns, folder / "tables" / f"{name}.csv")
+        with (folder / "tables" / f"{name}.parquet").open("wb") as file:
+            pyarrow.parquet.write_table(columns, file)
+        with (folder / "tables" / f"{name}.csv").open("wb") as file:
+            pyarrow.csv.write_csv(columns, file)
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
+        path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
-            figure.savefig(folder / "figures" / f"{name}.svg", metadata={"Date": None})
-    result = Result(
-        experiment=experiment,
-        fuselog=version("fuselog"),
-        settings=dict(settings),
-        input_sha256=outcome.input_sha256,
-        metrics=plain(outcome.metrics),
-        claims=[_decided(claim) for claim in outcome.claims],
+            _show_names_as_they_are(figure)
+            figure.savefig(path, metadata={"Date": None})
+    written = sorted(path for path in folder.rglob("*") if path.is_file())
+    result = _sealed(
+        Result(
+            experiment=experiment,
+            fuselog=version("fuselog"),
+            settings=dict(settings),
+            input_sha256=outcome.input_sha256,
+            metrics=plain(outcome.metrics),
+            claims=[_decided(claim) for claim in outcome.claims],
+            files={
+                path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else _hash(path)
+                for path in written
+            },
+        )
     )
-    text = json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False)
-    (folder / RESULT_FILE).write_text(text + "\n", encoding="utf-8")
+    (folder / RESULT_FILE).write_text(_text(result), encoding="utf-8")
     return result
+
+
+def _show_names_as_they_are(figure: "Figure") -> None:
+    """Titles and labels hold names from logs: a dollar sign in them begins no formula."""
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
+    texts = [text for legend in legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
+    for text in texts:
+        text.set_parse_math(False)
 
 
 def _decided(claim: Claim) -> Claim:
@@ -199,7 +232,7 @@ def read_result(folder: Path) -> Result:
     """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
     path = folder / RESULT_FILE
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:

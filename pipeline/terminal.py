@@ -1,4 +1,7 @@
-"""What the terminal shows: progress bars and tables. Standard output is for results alone."""
+"""What the terminal shows: progress bars and tables. Standard output is for results alone.
+
+Texts may come from a log or a file's name: what could steer a terminal is shown, not obeyed.
+"""
 
 import json
 import os
@@ -12,6 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from pipeline.results import Claim, MetricValue, metric_tables
+from recorders.errors import printable
 
 
 def _console(*, stderr: bool) -> Console:
@@ -34,12 +38,12 @@ def progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[An
 
 def say(text: str) -> None:
     """A line on standard output; the terminal breaks it, not we, so that paths stay whole."""
-    out.print(text, soft_wrap=True)
+    out.print(printable(text), soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """A line on standard error."""
-    err.print(f"fuselog: {text}", soft_wrap=True)
+    err.print(printable(f"fuselog: {text}"), soft_wrap=True)
 
 
 def print_json(value: Any) -> None:
@@ -52,13 +56,17 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title:
     """A table; columns of numbers are set right, long texts are broken into lines."""
     body = [list(row) for row in rows]
     table = Table(
-        title=title or None, title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False
+        title=printable(title) or None,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        show_edge=False,
     )
     for index, column in enumerate(columns):
         numeric = bool(body) and all(isinstance(row[index], int | float | None) for row in body)
-        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+        table.add_column(printable(column), justify="right" if numeric else "left", overflow="fold")
     for row in body:
-        table.add_row(*map(format_value, row))
+        table.add_row(*(printable(format_value(value)) for value in row))
     out.print(table)
 
 

@@ -1,4 +1,4 @@
-"""The one exception for what a user can mend, and how its sentences offer the right name."""
+"""The one exception for what a user can mend, and how its sentences are worded and shown."""
 
 from collections.abc import Collection
 from difflib import get_close_matches
@@ -15,3 +15,11 @@ def choices(name: str, known: Collection[str]) -> str:
     """The end of a sentence on an unknown name: the one that was probably meant, else all there are."""
     near = get_close_matches(name, known, n=1) or [each for each in known if name and name in each]
     return f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known) or 'none'}"
+
+
+def printable(text: str) -> str:
+    """A text for a terminal: line breaks stay, other control characters are shown by their numbers."""
+    return "".join(
+        each if each.isprintable() or each == "\n" else each.encode("unicode_escape").decode()
+        for each in text
+    )

@@ -1,13 +1,14 @@
 """Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import shorten
+from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recorders.errors import BadInput, choices
+from recorders.parsing import DEEPEST, parse_toml
 
 
 class Parameters(BaseModel):
@@ -121,10 +122,14 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         parts = key.strip().split(".")
         if not equals or not all(parts):
             raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
+        if len(parts) > DEEPEST:
+            raise BadInput(f"--set {key[:40]}...: names more than {DEEPEST} tables, one in another")
         try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+            value = parse_toml(f"value = {text}")["value"]
+        except TOMLDecodeError:
             value = text
+        except ValueError as error:
+            raise BadInput(f"--set {key}: the value cannot be used: {error}") from None
         target = values
         for part in parts[:-1]:
             target = target.setdefault(part, {})

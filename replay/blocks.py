@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Clock, Stream
-from recorders.log.streams import concatenate
 from replay.compile import compile_over_runs
+from replay.failures import join_streams
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Events(NamedTuple):
     is_last: NDArray[np.bool_]
 
 
-CarriedType = TypeVar("CarriedType", bound=NamedTuple)
+CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 
 
 class Block(NamedTuple):
@@ -75,7 +75,8 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
     An entry may be such a NamedTuple itself.
     """
     columns: Any = carried
-    return type(carried)(
+    made: Any = type(carried)
+    return made(
         *(of_runs(column, runs) if isinstance(column, tuple) else column[runs] for column in columns)
     )
 
@@ -101,7 +102,17 @@ def gather(parts: Sequence[Stream]) -> Ragged:
     offsets = np.zeros(len(parts) + 1, np.int64)
     np.cumsum([len(part) for part in parts], out=offsets[1:])
     filled = [part for part in parts if len(part)] or list(parts[:1])
-    return Ragged(concatenate(filled), offsets)
+    return Ragged(join_streams(filled), offsets)
+
+
+def join(parts: Sequence[Ragged]) -> Ragged:
+    """Join blocks of one topic, each run's rows together."""
+    if len(parts) == 1:
+        return parts[0]
+    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:

@@ -23,6 +23,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core.errors import NumbaError
 from numba.core.registry import cpu_target
 
@@ -52,10 +53,16 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
+    if os.environ.get("FUSELOG_UNCOMPILED") == "1":
+        return uncompiled_over_runs(run_once)
+    bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
     # a division by zero gives infinity, which is a failure of its run, and no exception
     inner = "error_model='numpy', forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True"
-    bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates})")
+    bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates}{bounds})")
     kernel = bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
     text = "\n".join(
@@ -64,7 +71,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
             "import numba",
             *sorted(bundle.imports),
             *bundle.definitions,
-            f"@numba.njit(cache=True, nogil=True, _nrt={allocates})",
+            f"@numba.njit(cache=True, nogil=True, _nrt={allocates}{bounds})",
             f"def loop(first, end, {names}):",
             "    for run in range(first, end):",
             f"        {kernel}(run, {names})",
@@ -72,6 +79,18 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         ]
     )
     return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
+
+
+def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """What `compile_over_runs` returns, in plain Python; NaN and infinity raise nothing here either."""
+
+    def loop(runs: int, *arguments: Any, scratch: Callable[[], Any] | None = None) -> None:
+        memory = [scratch()] if scratch else []
+        with np.errstate(all="ignore"):
+            for run in range(runs):
+                run_once(run, *arguments, *memory)
+
+    return loop
 
 
 def _over_runs(

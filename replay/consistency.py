@@ -41,6 +41,11 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
 
 
+def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
+    """Whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
+    return np.isfinite(normalized_error_squared(np.zeros(covariance.shape[:-1]), covariance))
+
+
 def component_error_squared(error: Array, covariance: Array) -> Array:
     """Each component's own normalized squared error, (..., n)."""
     return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)

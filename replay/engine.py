@@ -8,22 +8,26 @@ the runs replayed one by one, bit for bit.
 
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import zip_longest
 from typing import Any, Generic
 
-import numpy as np
-
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic
-from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
-from replay.blocks import Block, Ragged, gather, merge_events
+from replay.blocks import Block, Ragged, gather, join, merge_events
+from replay.components import Components
+from replay.priors import start_of_runs
 from replay.sources import Source
+from replay.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
+# The state of what can start in no run.
+_REFUSED = object()
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,10 @@ class Recursive:
         start: whole topics -> the state before the first block.
         run: state and block -> the state after it, and the output streams. States are values: `run`
             never changes the one it is handed.
+        priors: the whole topics that are Gaussian priors, and the components that are wanted of each.
+            `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
+            see `replay.priors`.
+        given: whole topics that are not read from the runs, see `replay.starting`.
     """
 
     name: str
@@ -44,22 +52,40 @@ class Recursive:
     whole: tuple[str, ...]
     start: Callable[[dict[str, Ragged]], Any]
     run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Batch:
     """An estimator that needs everything at once: `solve` turns its topics into output streams.
 
-    `streams` are the measurements, within the span that is replayed; `whole` as for `Recursive`.
+    `streams` are the measurements, within the span that is replayed; `whole` and `priors` as for
+    `Recursive`.
     """
 
     name: str
     streams: tuple[str, ...]
     whole: tuple[str, ...]
     solve: Callable[[dict[str, Ragged]], list[Ragged]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
 
 
 Bound = Recursive | Batch
+
+
+@dataclass
+class Report:
+    """What there is to say of a replay beside its outputs.
+
+    Attributes:
+        seconds: how long each estimator worked, by label; compiling is part of a first use.
+        coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
+    """
+
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    coverage: list[Ragged] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -144,6 +170,7 @@ def replay(
     *,
     order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
+    report: Report | None = None,
 ) -> Iterator[list[Ragged]]:
     """Replay an ensemble; yields the output streams of all estimators, block by block.
 
@@ -152,32 +179,99 @@ def replay(
         estimators: bound estimators with different names.
         order: the clock to go by, publish time or (as it arrived) log time.
         block_messages: about how many messages of a run are in memory at once.
+        report: filled with what there is to say when all is done.
 
-    Raises BadInput where an estimator raises, or no run has a message for it.
+    A run that an estimator cannot follow fails alone, see `replay.supervision`; the failures come last.
+    Raises BadInput where an estimator can follow no run, no run has a message for it, or a run's span
+    begins after the prior of an estimator (see `replay.starting`).
     """
-    whole = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
-    given = [{topic: whole[topic] for topic in bound.whole} for bound in estimators]
-    states: list[Any] = [None] * len(estimators)
-    for index, bound in enumerate(estimators):
-        if isinstance(bound, Recursive):
-            with foreign_code(f"estimator {bound.name}"):
-                states[index] = bound.start(given[index])
-            continue
-        for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
-            with foreign_code(f"estimator {bound.name}"):
-                solved = bound.solve(given[index] | block)
-            yield solved
+    read = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
+    for bound, whole in zip(estimators, wholes, strict=True):
+        _refuse_old_priors(bound, sources, whole, order)
+    watches = [
+        Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch)) for bound in estimators
+    ]
+    states = _start(estimators, watches, wholes)
+    for bound, watch, given in zip(estimators, watches, states, strict=True):
+        if isinstance(bound, Batch):
+            for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
+                yield watch.receive(watch.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
     for block in _ensemble_blocks(sources, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
-        for index, bound in enumerate(estimators):
+        for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
             if isinstance(bound, Recursive):
                 streams = {topic: block[topic] for topic in bound.streams}
-                events = merge_events(streams, order)
-                with foreign_code(f"estimator {bound.name}"):
-                    states[index], produced = bound.run(states[index], Block(streams, events))
-                outputs += produced
+                work = partial(_advance, bound, states[index], order)
+                states[index], produced = watch.take(work, streams)
+                outputs += watch.receive(produced)
         yield outputs
+    yield [failures for watch in watches for failures in watch.finish()]
+    if report is not None:
+        for watch in watches:
+            report.seconds[watch.name.partition("/")[0]] += watch.seconds
+            report.coverage += watch.coverage()
+
+
+def _start(
+    estimators: Sequence[Bound], watches: Sequence[Watch], wholes: Sequence[Mapping[str, Ragged]]
+) -> list[Any]:
+    """The states of recursions and what batches are given; _REFUSED where no run can start.
+
+    Of what one estimator estimates (each robot, say), what cannot start fails alone. Raises BadInput
+    where that is all.
+    """
+    states: list[Any] = []
+    refused: dict[str, list[BadInput | None]] = {}
+    for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
+        told = refused.setdefault(bound.name.partition("/")[0], [])
+        try:
+            given, unable = start_of_runs(whole, bound.priors)
+            watch.exclude(unable)
+            with foreign_code(f"estimator {bound.name}"):
+                states.append(given if isinstance(bound, Batch) else bound.start(given))
+            told.append(None)
+        except BadInput as error:
+            watch.exclude(dict.fromkeys(range(watch.runs), str(error)))
+            states.append(_REFUSED)
+            told.append(error)
+    for errors in refused.values():
+        if errors[0] is not None and all(errors):
+            raise errors[0]
+    return states
+
+
+def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
+    if given is _REFUSED:
+        return []
+    with foreign_code(f"estimator {bound.name}"):
+        return bound.solve(given | streams)
+
+
+def _advance(
+    bound: Recursive, state: Any, order: Clock, streams: dict[str, Ragged]
+) -> tuple[Any, list[Ragged]]:
+    if state is _REFUSED:
+        return state, []
+    events = merge_events(streams, order)
+    with foreign_code(f"estimator {bound.name}"):
+        return bound.run(state, Block(streams, events))
+
+
+def _refuse_old_priors(
+    bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
+) -> None:
+    """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
+    for topic in bound.priors.keys() - bound.given.keys():
+        for run, source in enumerate(sources):
+            times_ns = whole[topic].of_run(run).times(order)[:1]
+            if source.start_ns is not None and len(times_ns) and times_ns[0] < source.start_ns:
+                raise BadInput(
+                    f"{source.name}: the replay would start {bound.name} from {topic}, which is "
+                    f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
+                    "to start from with --start-from truth or --start-from ESTIMATES"
+                )
 
 
 def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, Ragged]:
@@ -211,13 +305,4 @@ def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
     for block in outputs:
         for ragged in block:
             parts.setdefault(ragged.stream.topic, []).append(ragged)
-    return {topic: _join(found) for topic, found in parts.items()}
-
-
-def _join(parts: list[Ragged]) -> Ragged:
-    if len(parts) == 1:
-        return parts[0]
-    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
-    stream = concatenate([part.stream for part in parts if len(part)] or [parts[0].stream])
-    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
-    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
+    return {topic: join(found) for topic, found in parts.items()}

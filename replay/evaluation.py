@@ -7,8 +7,8 @@ Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,9 +18,10 @@ from scipy.stats import chi2
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.blocks import Ragged
+from replay.components import Components, match_components, match_tangent, stated_components
 from replay.consistency import normalized_error_squared
 from replay.sources import Source
-from replay.tangent import WIDTHS, are_kinds, between, difference, tangent_components
+from replay.tangent import WIDTHS, are_kinds, between, difference, tangent_components, things
 
 Floats = NDArray[np.float64]
 POSITION = ("x_m", "y_m", "z_m")
@@ -42,6 +43,7 @@ class Errors:
         nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
             definite.
         without_truth: how many estimates had no truth within the gap limit.
+        unjudged: the estimate's components that the truth lacks, of which nothing is known here.
     """
 
     estimator: str
@@ -56,6 +58,7 @@ class Errors:
     covariance: Floats
     nees: Floats
     without_truth: int
+    unjudged: tuple[str, ...] = ()
 
     @property
     def position(self) -> list[int]:
@@ -115,39 +118,43 @@ def truth_at(
 
 
 def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float = 0.2) -> Errors | None:
-    """Errors of a Gaussian estimate stream of an ensemble; None unless every run has its truth topic.
+    """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
 
-    Raises BadInput where the stream does not say what its components are, or the truth lacks them.
+    An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, or the
+    truths have nothing in common with the estimates (see `unjudged`).
+
+    Raises BadInput where the stream does not say what its components are, or a truth states that one
+    is of another kind.
     """
     stream = estimates.stream
-    estimator, case = split_topic(stream.topic)
-    components = tuple(stream.components)
-    kinds = tuple(stream.metadata.get("kinds", "").split(","))
-    if len(components) != len(kinds) or not are_kinds(kinds):
-        raise BadInput(
-            f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
-            f"out of {', '.join(WIDTHS)}; an axis has two in a row, a quaternion four"
-        )
+    components = _components(stream)
     truth_topic = stream.metadata.get("truth", "")
-    if not all(truth_topic in source.topics for source in sources):
+    lacking = unjudged(estimates, sources)
+    judged = {name: kind for name, kind in components.items() if name not in lacking}
+    if not judged or not all(truth_topic in source.topics for source in sources):
         return None
-    references = [
-        _reference(source, truth_topic, components, kinds, estimates.of_run(run), gap_limit_s)
-        for run, source in enumerate(sources)
-    ]
-    mean = stream["mean"].reshape(len(stream), len(components))
-    error = difference(mean, np.concatenate(references), kinds)
-    tangent = tangent_components(components, kinds)
-    size = len(tangent)
+    names, kinds = list(judged), list(judged.values())
+    truth = np.concatenate(
+        [
+            reference(source, truth_topic, judged, estimates.of_run(run), gap_limit_s)
+            for run, source in enumerate(sources)
+        ]
+    )
+    where = f"topic {stream.topic}"
+    columns = match_components(stream.metadata, judged, where)
+    mean = stream["mean"].reshape(len(stream), len(components))[:, columns]
+    error = difference(mean, truth, kinds)
+    tangent = tangent_components(names, kinds)
+    size = len(tangent_components(list(components), list(components.values())))
     known = np.isfinite(error).all(axis=1)
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
     epochs = np.array([source.epoch_ns for source in sources])
-    covariance = stream["covariance"].reshape(len(stream), size, size)[known]
+    rows = match_tangent(stream.metadata, judged, where)
+    covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
     return Errors(
-        estimator,
-        case,
+        *split_topic(stream.topic),
         tuple(name for name, _ in tangent),
         tuple(kind for _, kind in tangent),
         run[known],
@@ -158,32 +165,57 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         covariance,
         normalized_error_squared(error[known], covariance),
         int((~known).sum()),
+        lacking,
     )
 
 
-def _reference(
-    source: Source,
-    topic: str,
-    components: Sequence[str],
-    kinds: Sequence[str],
-    estimates: Stream,
-    gap_limit_s: float,
+def unjudged(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
+    """The components of a Gaussian estimate stream that the truth of some run lacks.
+
+    All of an axis or a quaternion where it lacks one of theirs; none where a run has no truth topic at
+    all. Raises BadInput where the stream does not say what its components are.
+    """
+    components = _components(estimates.stream)
+    names = list(components)
+    topic = estimates.stream.metadata.get("truth", "")
+    if not all(topic in source.topics for source in sources):
+        return ()
+    there = set(names).intersection(
+        *(stated_components(source.topics[topic].metadata, {}, topic) for source in sources)
+    )
+    return tuple(
+        name
+        for _, columns in things(list(components.values()))
+        if not there.issuperset(names[columns])
+        for name in names[columns]
+    )
+
+
+def _components(stream: Stream) -> dict[str, Any]:
+    """Names and kinds of an estimate's components; raises BadInput where it does not state them."""
+    names = stream.components
+    kinds = stream.metadata.get("kinds", "").split(",")
+    if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):
+        raise BadInput(
+            f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
+            f"out of {', '.join(WIDTHS)}; an axis has two in a row, a quaternion four"
+        )
+    return dict(zip(names, kinds, strict=True))
+
+
+def reference(
+    source: Source, topic: str, components: Components, estimates: Stream, gap_limit_s: float
 ) -> Floats:
+    """The truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+
+    Raises BadInput where the truth lacks a component.
+    """
     truth = source.read([topic])[topic]
     if len(truth) == 0:
         return np.full((len(estimates), len(components)), np.nan)
-    there = truth.components
-    missing = [name for name in components if name not in there]
-    if missing:
-        raise BadInput(
-            f"{source.name}: topic {topic} has no component {missing[0]} to judge "
-            f"{estimates.topic} by; it has {', '.join(there) or 'no named components'}"
-        )
-    all_kinds = ["linear"] * len(there)
-    columns = [there.index(name) for name in components]
-    for column, kind in zip(columns, kinds, strict=True):
-        all_kinds[column] = kind
-    return truth_at(truth, estimates.publish_time_ns, all_kinds, gap_limit_s)[:, columns]
+    columns = match_components(truth.metadata, components, f"{source.name}: topic {topic}")
+    known = replace(truth, columns={"state": truth["state"][:, columns]})
+    return truth_at(known, estimates.publish_time_ns, list(components.values()), gap_limit_s)
 
 
 def innovations_of(stream: Ragged) -> Innovations:

@@ -68,7 +68,10 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any]]) -> dict[s
 
 
 def accuracy(errors: Errors) -> dict[str, float]:
-    """RMSE of position, orientation and every other component over all runs and steps."""
+    """RMSE of position, orientation and every other component over all runs and steps.
+
+    NaN, which is written as null, for a component that the truth lacks.
+    """
     values: dict[str, float] = {}
     if len(errors.error) and errors.position:
         values["position_rmse_m"] = _rms(errors.error[:, errors.position])
@@ -76,9 +79,15 @@ def accuracy(errors: Errors) -> dict[str, float]:
         values["orientation_rmse_deg"] = float(np.degrees(_rms(errors.error[:, errors.rotation])))
     for column, name in enumerate(errors.components):
         if len(errors.error) and column not in errors.position:
-            quantity, _, unit = name.rpartition("_")
-            values[f"{quantity}_rmse_{unit}".strip("_")] = _rms(errors.error[:, [column]])
+            values[_rmse_of(name)] = _rms(errors.error[:, [column]])
+    values |= {_rmse_of(name): np.nan for name in errors.unjudged}
     return values | {"estimates_without_truth": errors.without_truth}
+
+
+def _rmse_of(component: str) -> str:
+    """What the RMSE of a component is called: `turn_rmse_radps` of `turn_radps`."""
+    quantity, _, unit = component.rpartition("_")
+    return f"{quantity}_rmse_{unit}".strip("_")
 
 
 def _rms(error: Floats) -> float:
@@ -92,6 +101,8 @@ def consistency(errors: Errors) -> dict[str, float]:
     if len(nees) == 0:
         return {}
     values = {"nees": float(nees.mean())}
+    if len(nees) < len(errors.nees):  # of singular covariances there is none
+        values["estimates_without_nees"] = float(len(errors.nees) - len(nees))
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
         squared = normalized_error_squared(errors.error[:, errors.position], block)
@@ -119,6 +130,21 @@ def failures(output: Output) -> dict[str, float]:
     return {"failed_runs": float(np.count_nonzero(np.diff(output.rows.offsets)))}
 
 
+def estimated_share(coverage: Ragged) -> float | None:
+    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    spans_s = (coverage["end_time_ns"] - coverage.stream.publish_time_ns).sum() * 1e-9
+    return float(min(coverage["estimated_s"].sum() / spans_s, 1.0)) if spans_s > 0 else None
+
+
+def coverage(output: Output) -> dict[str, float]:
+    """What share of the span the other figures are of, and how many measurements were not used."""
+    schema = output.rows.stream.schema.full_name
+    if schema == schemas.SKIPPED.full_name:
+        return {"skipped_measurements": float(len(output.rows))}
+    share = estimated_share(output.rows) if schema == schemas.COVERAGE.full_name else None
+    return {} if share is None else {"estimated_share": share}
+
+
 def solution(output: Output) -> dict[str, float]:
     """How the batch solutions ended: the share that converged, and the most iterations of one."""
     if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name or len(output.rows) == 0:
@@ -134,4 +160,5 @@ ACCURACY = Metric("RMSE of position and other components against truth", Errors,
 CONSISTENCY = Metric("NEES against its chi-square bounds", Errors, consistency)
 INNOVATION = Metric("NIS, and the share of measurements that a gate kept out", Innovations, innovation)
 FAILURES = Metric("how many runs an estimator could not follow to the end", Output, failures)
+COVERAGE = Metric("what share of the span was estimated, and what was not used", Output, coverage)
 SOLUTION = Metric("how many batch solutions converged, and how fast", Output, solution)

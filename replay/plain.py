@@ -6,8 +6,8 @@ that has them, name the outputs, and tell of a run that failed while the others 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -17,16 +17,19 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import ParametersType
-from replay.blocks import Block, Ragged
-from replay.compile import compile_over_runs
+from replay.blocks import Block, Ragged, ragged_rows
+from replay.compile import compile_over_runs, uncompiled_over_runs
+from replay.components import Components
 from replay.engine import Batch, Bound, Estimator, Recursive
-from replay.tangent import Kind, tangent_components
+from replay.failures import Failure, failure_stream, reason_of, reason_stream
+from replay.measurements import Vectors, numbers_of
+from replay.priors import gaussians
+from replay.tangent import tangent_components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Components = Mapping[str, Kind]
 
-DIVERGED = "the estimate is not finite: no usable prior, or the filter diverged"
+DIVERGED = "the estimate is no longer finite: the filter diverged"
 
 
 @dataclass(frozen=True)
@@ -51,30 +54,13 @@ class Given(Generic[ParametersType]):
                 f"topic {self.topics[topic].name} does not state {name}; give it with --set {name}=..."
             ) from None
 
-    def prior(self, topic: str, components: int) -> tuple[Integers, Floats, Floats]:
-        """The first Gaussian of every run: stamps (runs,), means (runs, d), covariances (runs, d, d).
+    def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
+        """The prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
-        NaN where a run has none or its covariance is not positive definite: that run has failed.
-        Raises BadInput where no run has one that can be used.
+        They are of the estimate's components, in their order, whatever the log's order is. NaN where a
+        run has none that can be used: it has failed, and gets no messages.
         """
-        ragged = self.whole[topic]
-        runs = np.flatnonzero(np.diff(ragged.offsets))
-        rows = ragged.offsets[runs]
-        time_ns = np.zeros(ragged.runs, np.int64)
-        mean = np.full((ragged.runs, components), np.nan)
-        covariance = np.full((ragged.runs, components, components), np.nan)
-        if ragged["mean"].shape[1] == components:
-            stated = ragged["covariance"][rows].reshape(-1, components, components)
-            usable = np.linalg.eigvalsh(stated)[:, 0] > 0
-            runs, rows = runs[usable], rows[usable]
-            time_ns[runs] = ragged.stream.publish_time_ns[rows]
-            mean[runs], covariance[runs] = ragged["mean"][rows], stated[usable]
-        if np.isnan(mean).all():
-            raise BadInput(
-                f"topic {ragged.stream.topic}: no prior of {components} components with a positive "
-                "definite covariance; the filter cannot start"
-            )
-        return time_ns, mean, covariance
+        return gaussians(self.whole[topic])
 
 
 class Messages(NamedTuple):
@@ -84,7 +70,8 @@ class Messages(NamedTuple):
         offsets: (runs + 1,).
         time_ns: (n,).
         topic: (n,) which stream, in the order in which they were asked for.
-        value: (n, width) the fields after the sensor's clock, in order of declaration; NaN beyond.
+        value: (n, width) the fields after the sensor's clock, in order of declaration; NaN beyond. Of
+            vectors there are the components that were asked for, in that order.
     """
 
     offsets: Integers
@@ -132,13 +119,6 @@ class Estimates(NamedTuple):
     solution: Solution | None = None
 
 
-class Failure(NamedTuple):
-    """When and why a run failed."""
-
-    time_ns: int
-    reason: str
-
-
 class Solved(NamedTuple):
     """The estimates of all runs end to end, run r owning offsets[r]:offsets[r + 1]; failures by run."""
 
@@ -156,6 +136,7 @@ def recursive(
     components: Components,
     truth: str = "",
     measured: Components | None = None,
+    vectors: Mapping[str, Vectors] | None = None,
     start: Callable[[Given[ParametersType]], tuple[Any, Any]],
     follow: Callable[[int, Any, Messages, Any, Results], None],
     compiled: bool = True,
@@ -166,10 +147,13 @@ def recursive(
         summary: what it is, in one line.
         parameters: their type.
         streams: the topics to follow, with their schemas; see `bindings` for their names.
-        whole: the topics that `start` needs whole, such as a map or a prior.
+        whole: the topics that `start` needs whole, such as a map or a prior. Gaussian estimates among
+            them are priors: of the estimate's components, see `Given.prior`.
         components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
         measured: the components of the innovations, where `follow` tells of them.
+        vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
+            does not say of them is refused; without an entry here vectors come as the log has them.
         start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
             runs. A run has failed where its row in the first of them is not finite.
         follow: follow(run, settings, messages, state, results) takes one run through a block of its
@@ -179,10 +163,11 @@ def recursive(
 
     @cache
     def loop() -> Callable[..., None]:
-        return compile_over_runs(follow) if compiled else partial(_over_runs, follow)
+        return compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         outputs = _Outputs(name, _resolved(truth, prefix), components, measured or {})
+        wanted = {found[topic].name: each for topic, each in (vectors or {}).items()}
 
         def started(maps: Mapping[str, Ragged], runs: int) -> _Carried:
             return _Carried(*start(Given(values, found, maps, runs)), np.zeros(runs, bool))
@@ -195,15 +180,16 @@ def recursive(
             # without anything whole, the first block is what tells how many runs there are
             settings, before, told = carried or started({}, len(block.events.offsets) - 1)
             state = type(before)(*(array.copy() for array in before))
-            messages = _messages(block)
+            messages, skipped = _messages(block, wanted, values)
             results = outputs.blank(len(messages.time_ns))
             loop()(len(told), settings, messages, state, results)
             is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
             failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
             made = outputs.of_block(messages, results, np.flatnonzero(failing))
-            return _Carried(settings, state, told | failing), made
+            return _Carried(settings, state, told | failing), [*made, *outputs.of_skipped(skipped)]
 
-        return Recursive(name, _topics(found, streams), _topics(found, whole), begin, advance)
+        read, needed = _topics(found, streams), _topics(found, whole)
+        return Recursive(name, read, needed, begin, advance, _priors(found, whole, components))
 
     return _estimator(summary, parameters, {**streams, **whole}, bind)
 
@@ -231,7 +217,8 @@ def batch(
         def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
             return outputs.of_solved(solve({each: given[found[each].name] for each in found}, values))
 
-        return Batch(name, _topics(found, streams), _topics(found, whole), solve_all)
+        read, needed = _topics(found, streams), _topics(found, whole)
+        return Batch(name, read, needed, solve_all, _priors(found, whole, components))
 
     return _estimator(summary, parameters, {**streams, **whole}, bind)
 
@@ -241,25 +228,28 @@ def each_run(
 ) -> Callable[[Mapping[str, Ragged], ParametersType], Solved]:
     """Solve run by run, for `batch`.
 
-    Where `solve` raises BadInput or meets a singular matrix, that run has failed; where all do, it is
-    the input that is bad.
+    Where `solve` raises, that run has failed; where all do, it is the input that is bad.
     """
 
     def solve_all(given: Mapping[str, Ragged], parameters: ParametersType) -> Solved:
         solved: list[Estimates] = []
         failures: dict[int, Failure] = {}
+        errors: list[Exception] = []
         counts = [0]
         for run in range(next(iter(given.values())).runs):
             streams = {name: ragged.of_run(run) for name, ragged in given.items()}
             try:
                 solved.append(solve(streams, parameters))
                 counts.append(len(solved[-1].time_ns))
-            except (BadInput, np.linalg.LinAlgError) as error:
+            except (MemoryError, OSError):
+                raise
+            except Exception as error:
                 end_ns = max(stream.publish_time_ns.max(initial=0) for stream in streams.values())
-                failures[run] = Failure(int(end_ns), str(error))
+                failures[run] = Failure(int(end_ns), reason_of(error))
+                errors.append(error)
                 counts.append(0)
         if not solved:
-            raise BadInput(failures[0].reason)
+            raise errors[0]
         return Solved(np.cumsum(counts), _joined(solved), failures)
 
     return solve_all
@@ -301,6 +291,16 @@ def _resolved(name: str, prefix: str) -> str:
     return name if name.startswith("/") or not name else f"{prefix}/{name}"
 
 
+def _priors(
+    found: Mapping[str, Topic], whole: Mapping[str, Schema], components: Components
+) -> dict[str, Components]:
+    return {
+        found[name].name: components
+        for name, schema in whole.items()
+        if schema is schemas.GAUSSIAN_ESTIMATE
+    }
+
+
 def _topics(found: Mapping[str, Topic], names: Mapping[str, Schema]) -> tuple[str, ...]:
     return tuple(found[name].name for name in names)
 
@@ -329,30 +329,38 @@ class _Carried(NamedTuple):
     told: NDArray[np.bool_]
 
 
-def _over_runs(follow: Callable[..., None], runs: int, *arguments: Any) -> None:
-    """What `compile_over_runs` makes, in plain Python: a number that is none fails its run, no more."""
-    with np.errstate(all="ignore"):
-        for run in range(runs):
-            follow(run, *arguments)
+class _Skipped(NamedTuple):
+    """Messages that were not used: offsets by run, stamps, and the number of the reason of each."""
+
+    offsets: Integers
+    time_ns: Integers
+    reason: Integers
+    reasons: list[str]
 
 
-def _messages(block: Block) -> Messages:
-    """A block's messages, their fields as numbers."""
+def _messages(
+    block: Block, vectors: Mapping[str, Vectors], parameters: Any
+) -> tuple[Messages, _Skipped]:
+    """A block's messages, their fields as numbers; and those that lack a covariance."""
     events = block.events
-    tables = [_numbers(ragged.stream) for ragged in block.streams.values()]
-    width = max(table.shape[1] for table in tables)
+    read = [
+        numbers_of(ragged.stream, vectors.get(topic), parameters)
+        for topic, ragged in block.streams.items()
+    ]
+    width = max(table.shape[1] for table, _ in read)
     padded = [
-        np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan) for table in tables
+        np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan) for table, _ in read
     ]
     value = np.concatenate(padded)[events.source]
-    return Messages(events.offsets, events.time_ns, events.topic, value)
-
-
-def _numbers(stream: Stream) -> Floats:
-    """The fields after the sensor's clock, side by side."""
-    columns = [stream[entry.name] for entry in stream.schema if entry.name != "sensor_time_ns"]
-    wide = [column if column.ndim == 2 else column[:, None] for column in columns]
-    return np.concatenate(wide, axis=1, dtype=np.float64)
+    skip = np.concatenate([missing for _, missing in read])[events.source]
+    reasons = [vectors[topic].complaint(topic) if topic in vectors else "" for topic in block.streams]
+    skipped = _Skipped(
+        ragged_rows(skip, events.offsets), events.time_ns[skip], events.topic[skip], reasons
+    )
+    kept = Messages(
+        ragged_rows(~skip, events.offsets), events.time_ns[~skip], events.topic[~skip], value[~skip]
+    )
+    return kept, skipped
 
 
 @dataclass(frozen=True)
@@ -384,7 +392,8 @@ class _Outputs:
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
         """The outputs of one block; of several estimates at a stamp the last stands."""
-        said = np.isfinite(results.mean.sum(axis=1) + results.covariance.sum(axis=(1, 2)))
+        # what is said of a covariance that is none is for the replay to find
+        said = np.isfinite(results.mean.sum(axis=1))
         rows = np.flatnonzero(said)
         run = np.searchsorted(messages.offsets, rows, side="right")
         is_last = np.ones(len(rows), bool)
@@ -399,7 +408,7 @@ class _Outputs:
         failures = [Failure(int(messages.time_ns[row]), DIVERGED) for row in ends]
         made = [
             Ragged(self._state(estimates), np.searchsorted(rows, messages.offsets)),
-            Ragged(self._failure(failures, [DIVERGED]), np.searchsorted(ends, messages.offsets)),
+            Ragged(self._failure(failures), np.searchsorted(ends, messages.offsets)),
         ]
         return [*made, self._innovations(messages, results)] if self.measured else made
 
@@ -407,8 +416,7 @@ class _Outputs:
         """The outputs of a batch."""
         offsets, estimates, failures = solved
         failed = sorted(failures)
-        reasons = sorted({failure.reason for failure in failures.values()})
-        failure = self._failure([failures[run] for run in failed], reasons)
+        failure = self._failure([failures[run] for run in failed])
         made = [
             Ragged(self._state(estimates), offsets),
             Ragged(failure, np.searchsorted(failed, np.arange(len(offsets)))),
@@ -423,23 +431,27 @@ class _Outputs:
         mean = np.array(estimates.mean, dtype=float)
         angular = [index for index, kind in enumerate(self.components.values()) if kind == "angle"]
         mean[:, angular] = wrap_angle(mean[:, angular])
-        return self._stream(
+        covariance = np.reshape(estimates.covariance, (len(mean), self.tangent**2))
+        columns = {"mean": mean, "covariance": covariance}
+        blank = self._stream(
             "state",
             schemas.GAUSSIAN_ESTIMATE,
             estimates.time_ns,
             _named(self.components),
-            mean=mean,
-            covariance=np.reshape(estimates.covariance, (len(mean), self.tangent**2)),
+            **{name: np.zeros_like(column) for name, column in columns.items()},
         )
+        return replace(blank, columns={**blank.columns, **columns})
 
-    def _failure(self, failures: Sequence[Failure], reasons: Sequence[str]) -> Stream:
-        return self._stream(
-            "failure",
-            schemas.FAILURE,
-            np.array([failure.time_ns for failure in failures], np.int64),
-            {"reasons": "; ".join(reasons)},
-            reason=[reasons.index(failure.reason) for failure in failures],
-        )
+    def _failure(self, failures: Sequence[Failure]) -> Stream:
+        return failure_stream(f"/estimates/{self.name}/failure", failures)
+
+    def of_skipped(self, skipped: _Skipped) -> list[Ragged]:
+        """What was not used, for estimators of what may lack a covariance."""
+        if not any(skipped.reasons):
+            return []
+        topic = f"/estimates/{self.name}/skipped"
+        stream = reason_stream(topic, schemas.SKIPPED, skipped.time_ns, skipped.reason, skipped.reasons)
+        return [Ragged(stream, skipped.offsets)]
 
     def _innovations(self, messages: Messages, results: Results) -> Ragged:
         rows = np.flatnonzero(np.isfinite(results.squared))

@@ -5,6 +5,7 @@ set at a time are all things whose truth has the estimate's components and is kn
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -75,15 +76,19 @@ def set_errors(
 
 
 def _truths(source: Source, components: Sequence[str]) -> list[Stream]:
-    """The truths of things that have exactly these components."""
-    stated = ",".join(components)
+    """The truths of things that have exactly these components, put into their order."""
     topics = [
         topic.name
         for topic in source.topics.values()
         if topic.schema_name == schemas.TRUTH_STATE.full_name
-        and topic.metadata.get("components") == stated
+        and sorted(topic.metadata.get("components", "").split(",")) == sorted(components)
     ]
-    return list(source.read(topics).values())
+    found = []
+    for truth in source.read(topics).values():
+        columns = [truth.components.index(name) for name in components]
+        state = truth["state"].reshape(-1, len(components))[:, columns]
+        found.append(replace(truth, columns={**truth.columns, "state": state}))
+    return found
 
 
 def _judge_run(

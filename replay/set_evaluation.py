@@ -1,6 +1,6 @@
 """Sets against truth: area, whether the true position is inside, and how often there is no set."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,20 +9,24 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.blocks import Ragged
+from replay.components import Components
 from replay.estimators.feasible_sets import excess_rad, signed_area
-from replay.estimators.set_membership import frames, map_and_arena
-from replay.evaluation import split_topic, truth_at
+from replay.estimators.set_membership import Known, frames
+from replay.evaluation import reference, split_topic
 from replay.sources import Source
 
 Floats = NDArray[np.float64]
+
+PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 
 @dataclass(frozen=True)
 class JudgedSets:
     """The sets of one estimator and case, a row per frame.
 
-    `inside` says whether the truth is in the set, where it is `known`, and `bound_holds` whether all
-    relative bearings of the frame keep their bound there; an empty set has area 0.
+    `inside` says whether the truth is in the set, where it is `known`, `in_arena` whether it is where
+    the robot was taken to be, and `bound_holds` whether all relative bearings of the frame keep their
+    bound there; an empty set has area 0.
     """
 
     estimator: str
@@ -32,13 +36,19 @@ class JudgedSets:
     area_m2: Floats
     known: NDArray[np.bool_]
     inside: NDArray[np.bool_]
+    in_arena: NDArray[np.bool_]
     bound_holds: NDArray[np.bool_]
     faults: int
 
     @property
     def violations(self) -> int:
-        """How many sets miss the truth although their bounds hold: with guaranteed sets, none."""
-        return int((self.known & self.bound_holds & ~self.inside).sum())
+        """How many sets miss the truth although bounds and arena hold: with guaranteed sets, none."""
+        return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
+
+    @property
+    def outside_arena(self) -> int:
+        """How often the robot was not where it was taken to be, so that nothing is guaranteed."""
+        return int((self.known & ~self.in_arena).sum())
 
 
 def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
@@ -46,7 +56,7 @@ def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
     ends = np.cumsum(sizes["elements"].astype(np.int64))
     ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
     frames = []
-    for first, end in zip(np.append(0, ends[:-1]), ends, strict=True):
+    for first, end in zip(np.append(0, ends)[:-1], ends, strict=True):
         cuts = np.flatnonzero(np.diff(ring[first:end])) + 1
         frames.append(np.split(vertex[first:end], cuts) if end > first else [])
     return frames
@@ -77,19 +87,17 @@ def _judge(
     run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
     topic = sizes.stream.metadata["truth"]
     truth = [
-        truth_at(
-            source.read([topic])[topic],
-            sizes.of_run(number).publish_time_ns,
-            source.topics[topic].metadata.get("kinds", "linear,linear").split(","),
-            gap_limit_s,
-        )[:, :2]
+        reference(source, topic, PLACE, sizes.of_run(number), gap_limit_s)
         for number, source in enumerate(sources)
     ]
     places = np.concatenate(truth)
-    holds = [
-        _bounds_hold(sizes.stream.metadata, source, there)
-        for source, there in zip(sources, truth, strict=True)
-    ]
+    in_arena, bound_holds = np.concatenate(
+        [
+            _premises_hold(sizes.of_run(number), source, truth[number])
+            for number, source in enumerate(sources)
+        ],
+        axis=1,
+    )
     sets_of_frames = frames_of(sizes.stream, sets.stream)
     inside = np.zeros(len(places), bool)
     for frame, rings in enumerate(sets_of_frames):
@@ -104,15 +112,21 @@ def _judge(
         areas_of(sets_of_frames),
         np.asarray(np.isfinite(places).all(axis=1)),
         inside,
-        np.concatenate(holds),
+        in_arena,
+        bound_holds,
         faults,
     )
 
 
-def _bounds_hold(stated: Mapping[str, str], source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Whether each frame's relative bearings keep the bound at the places (frames, 2)."""
-    known, _ = map_and_arena(source.read(["/landmarks"])["/landmarks"], 0.0)
-    seen = source.read([stated["measured"]])[stated["measured"]]
-    found = frames(seen, known, float(stated["bound_rad"]), int(stated["least_landmarks"]))
-    excess = [excess_rad(frame.pairs, at) for frame, at in zip(found, places, strict=True)]
-    return np.array([bool(np.all(each <= 0)) for each in excess], bool)
+def _premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
+    """Whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
+    measured = sizes.metadata["measured"]
+    streams = source.read(["/landmarks", measured])
+    hold = np.zeros((2, len(places)), bool)
+    row_of = {time_ns: row for row, time_ns in enumerate(sizes.publish_time_ns.tolist())}
+    for frame in frames(streams[measured], streams["/landmarks"], Known.of(sizes.metadata)):
+        row = row_of.get(frame.time_ns)  # none outside the span that was replayed
+        if row is not None:
+            hold[0, row] = np.all((frame.arena.low <= places[row]) & (places[row] <= frame.arena.high))
+            hold[1, row] = np.all(excess_rad(frame.pairs, places[row]) <= 0)
+    return hold

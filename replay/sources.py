@@ -8,7 +8,17 @@ from typing import Protocol
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Log, RunMetadata, Stream, Topic, read_blocks, read_empty, read_streams
+from recorders.log import (
+    Clock,
+    Log,
+    RunMetadata,
+    Stream,
+    Topic,
+    read_blocks,
+    read_empty,
+    read_span,
+    read_streams,
+)
 from recorders.recording import Recording
 
 
@@ -26,6 +36,10 @@ class Source(Protocol):
     @property
     def epoch_ns(self) -> int:
         """The run's time zero."""
+
+    @property
+    def start_ns(self) -> int | None:
+        """Where the replayed span begins, by the clock of the replay; None where the run begins."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -61,10 +75,18 @@ class LogSource:
         """The log's run metadata."""
         return self.log.run
 
-    @property
+    @cached_property
     def epoch_ns(self) -> int:
-        """The run's time zero; the log's beginning where it does not say."""
-        return self.log.run.epoch_ns if self.log.run else log_span_ns(self.log)[0]
+        """The run's time zero; where the log does not say, its first publish stamp."""
+        return self.zero_ns("publish_time")
+
+    def zero_ns(self, clock: Clock) -> int:
+        """What times in seconds count from, by one of the two clocks.
+
+        It is the epoch that the log states; without one the first stamp of that clock, for the two may
+        have nothing in common (simulated and wall time, say).
+        """
+        return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -106,6 +128,10 @@ class MemorySource:
         """The run's time zero."""
         return self.run.epoch_ns
 
+    @property
+    def start_ns(self) -> None:
+        """A recording is replayed whole."""
+
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
         """The recording's topics."""
@@ -145,13 +171,6 @@ class MemorySource:
         if np.all(clock[1:] >= clock[:-1]) and np.all(position[1:] > position[:-1]):
             return stream
         return stream.take(np.lexsort((position, clock)))
-
-
-def log_span_ns(log: Log) -> tuple[int, int]:
-    """The first and the last log time of a log; zeros where it has no messages."""
-    spans = [region.spans["log_time"] for region in log.container.regions]
-    first = min((span.first_ns for span in spans), default=0)
-    return first, max((span.last_ns for span in spans), default=0)
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:

@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 Kind = Literal["linear", "angle", "axis", "quaternion"]
 # How many components a thing of a kind has.
 WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 2, "quaternion": 4}
+# How many components its error has.
+TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternion": 3}
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
@@ -32,6 +34,15 @@ def are_kinds(kinds: Sequence[str]) -> bool:
     return True
 
 
+def things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
+    """Kind and columns of every number, angle, axis and quaternion."""
+    index = 0
+    while index < len(kinds):
+        width = WIDTHS[kinds[index]]
+        yield kinds[index], slice(index, index + width)
+        index += width
+
+
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
     """Names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
 
@@ -39,7 +50,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
     of kind "rotation".
     """
     found: list[tuple[str, str]] = []
-    for kind, columns in _things(kinds):
+    for kind, columns in things(kinds):
         name = components[columns.start]
         stem = name.rpartition("_")[0] or name
         if kind == "quaternion":
@@ -52,7 +63,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
     """Estimate - truth, both (n, components), in the tangent space (n, tangent components)."""
     parts = []
-    for kind, columns in _things(kinds):
+    for kind, columns in things(kinds):
         if kind in ("axis", "quaternion"):
             relative = compose(conjugate(truth[:, columns]), estimate[:, columns])
             parts.append(rotation_vector(relative))
@@ -65,7 +76,7 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
     """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
     value = np.empty(left.shape)
-    for kind, columns in _things(kinds):
+    for kind, columns in things(kinds):
         here, there = left[:, columns], right[:, columns]
         value[:, columns] = (
             _slerp(here, there, weight)
@@ -105,12 +116,3 @@ def _slerp(left: Floats, right: Floats, weight: Floats) -> Floats:
     length = np.linalg.norm(angle, axis=1, keepdims=True)
     step = np.concatenate([np.cos(length), angle * np.sinc(length / np.pi)], axis=1)
     return compose(left, step)
-
-
-def _things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
-    """Kind and columns of every number, angle, axis and quaternion."""
-    index = 0
-    while index < len(kinds):
-        width = WIDTHS[kinds[index]]
-        yield kinds[index], slice(index, index + width)
-        index += width

@@ -108,7 +108,7 @@ def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFr
     for case, chosen in subsets_of(matchers).items():
         single = [values.get(f"single.{COUNT}.{matchers[index].name}", np.nan) for index in chosen]
         for key in values if len(chosen) > 1 else ():
-            label, quantity, of = key.split(".", 2)
+            label, quantity, of = (*key.split(".", 2), "")[:3]  # failures are of no case
             has_rate = f"{label}.{RATE}.{case}" in values
             if of != case or quantity != (RATE if has_rate else COUNT):
                 continue
@@ -156,7 +156,8 @@ def _complete(replayed: Replayed) -> dict[str, Fused]:
     found = {
         topic: fused_of(rows.of_run(0))
         for topic, rows in replayed.outputs.items()
-        if split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single"
+        if topic.endswith("/fused")
+        and (split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single")
     }
     return {topic: fused for topic, fused in found.items() if fused.is_complete}
 

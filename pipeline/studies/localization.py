@@ -19,7 +19,7 @@ from pipeline.ensemble import (
 )
 from pipeline.experiment import Experiment, Setting, Study, load_scenario
 from pipeline.results import MetricValue, Outcome, split_metric
-from recorders.errors import BadInput
+from recorders.errors import BadInput, printable
 from recorders.log import LogWriter
 from recorders.parameters import merge
 from recorders.recording import import_run
@@ -93,7 +93,7 @@ def summarise(replayed: Replayed, metrics: Sequence[str] = ()) -> Outcome:
         outcome.tables["errors"] = pd.concat([error_table(errors) for errors in judged])
         outcome.tables["steps"] = pd.concat([step_table(errors) for errors in judged])
         for case in dict.fromkeys(errors.case for errors in judged):
-            name = f"errors-{case.replace('/', '-')}" if case else "errors"
+            name = f"errors-{case}" if case else "errors"
             outcome.figures[name] = error_figure([each for each in judged if each.case == case], case)
     return outcome
 
@@ -118,7 +118,8 @@ def error_figure(judged: list[Errors], case: str) -> "Figure":
     runs = len(np.unique(judged[0].run))
     low, high = chi_square_interval(len(judged[0].components), runs)
     below.axhspan(low, high, color="0.85", zorder=0, label="95 % if consistent")
-    above.set(ylabel=label, title=f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}")
+    title = printable(case or "errors").replace("$", r"\$")  # which starts a formula
+    above.set(ylabel=label, title=f"{title}, {runs} {'run' if runs == 1 else 'runs'}")
     below.set(ylabel="mean NEES", xlabel="time (s)", yscale="log")
     above.legend(loc="upper left")
     below.legend(loc="upper left")

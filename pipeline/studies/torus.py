@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.ensemble import Replayed, hash_streams
+from pipeline.ensemble import Replayed, hash_streams, require_memory
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
 from pipeline.studies.cases import replay_cases, rmse_of_runs
@@ -110,6 +110,8 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
         raise BadInput("study torus-propagation is numerics: leave out record, import and estimators")
+    drawn_bytes = experiment.runs * len(options.correlations) * options.random_samples * 2 * 8
+    require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)  # as drawn, and moved
     outcome = Outcome()
     tables = []
     for coupling_rad in setting.progress(

@@ -10,7 +10,6 @@ parameters, or in a file `matchers.toml` of the folder:
     failure = -1             # the score of what could not be enrolled
 """
 
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +21,7 @@ from pydantic import PositiveFloat, field_validator
 from recorders.errors import BadInput
 from recorders.models.scores import Matcher, score_stream
 from recorders.parameters import Parameters, build
+from recorders.parsing import read_toml
 from recorders.recording import Importer, Recording, simulation_stamps_ns
 
 
@@ -82,12 +82,9 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
 
 def _described(folder: Path) -> list[Matcher]:
     path = folder / "matchers.toml"
-    try:
-        matchers = build(Matchers, tomllib.loads(path.read_text(encoding="utf-8")), str(path)).matchers
-    except FileNotFoundError:
-        raise BadInput(f"{path}: missing; name the matchers there or as parameter 'matchers'") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInput(f"{path}: is not readable as TOML ({error})") from None
+    if not path.exists():
+        raise BadInput(f"{path}: missing; name the matchers there or as parameter 'matchers'")
+    matchers = build(Matchers, read_toml(path), str(path)).matchers
     if not matchers:
         raise BadInput(f"{path}: names no matchers; give [[matchers]] with name and modality")
     return matchers

@@ -1,7 +1,7 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
 from recorders.log.opening import Log, Topic, open_log
-from recorders.log.reader import read_blocks, read_empty, read_streams
+from recorders.log.reader import read_blocks, read_empty, read_span, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
 from recorders.log.streams import Clock, Stream, make_stream
@@ -20,6 +20,7 @@ __all__ = [
     "open_log",
     "read_blocks",
     "read_empty",
+    "read_span",
     "read_streams",
     "write_log",
 ]

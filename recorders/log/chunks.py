@@ -36,6 +36,9 @@ _COMPRESS: Mapping[str, Callable[[memoryview], bytes]] = {
     "none": bytes,
 }
 COMPRESSIONS = tuple(_COMPRESS)
+# A byte of lz4 stands for 255 at most, and four of zstd for a block of 128 KiB: a chunk that states more
+# is not given the memory.
+_MOST_FROM_A_BYTE = {"zstd": 1 << 15, "lz4": 255, "": 1}
 
 _UNREADABLE = (
     McapError,
@@ -43,7 +46,6 @@ _UNREADABLE = (
     RuntimeError,
     struct.error,
     zstandard.ZstdError,
-    MemoryError,
     OverflowError,
 )
 _RECORDS: dict[int, Any] = {
@@ -108,6 +110,10 @@ def open_region(raw: bytes, offset: int) -> Contents:
         if found.end != len(data):
             raise ValueError("a record inside it is not whole")
         declarations = [next(read_records(data.data, place)) for place in found.declarations.tolist()]
+    except MemoryError:
+        raise Damaged(
+            f"the chunk at byte {offset} does not fit into memory: it states {_stated_size(raw)} bytes"
+        ) from None
     except _UNREADABLE as error:
         raise Damaged(f"the chunk at byte {offset} is damaged ({error})") from error
     channel_ids = np.flatnonzero(found.counts)
@@ -129,22 +135,32 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
     packed = memoryview(chunk)[place + _LENGTH.size :]
     if len(packed) != packed_length:
         raise ValueError("its length is wrong")
-    data: bytes | memoryview
+    if compression not in _MOST_FROM_A_BYTE:
+        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
+    if size > _MOST_FROM_A_BYTE[compression] * len(packed):
+        raise ValueError("its size is wrong")
+    data: bytes | memoryview = packed
     if compression == "zstd":
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise ValueError("its size is wrong")
         data = zstandard.decompress(packed, size)
     elif compression == "lz4":
-        data = lz4.frame.decompress(packed)
-    elif compression == "":
-        data = packed
-    else:
-        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(packed, size + 1)
+        if not decompressor.eof:
+            raise ValueError("its size is wrong")
     if len(data) != size:
         raise ValueError("its size is wrong")
     if checksum not in (0, zlib.crc32(data)):
         raise ValueError("its checksum is wrong")
     return data
+
+
+def _stated_size(region: bytes) -> int:
+    """How many bytes a region has when it is open, as it says itself."""
+    if region[0] != Opcode.CHUNK:
+        return len(region)
+    return int(_CHUNK_HEAD.unpack_from(region, HEAD_BYTES)[2])
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:

@@ -2,17 +2,20 @@
 
 The data section is walked record by record. A chunk that the summary tells of is stepped over; any other
 is opened on the way, so that a file without an index, or with one that leaves chunks out, is read all
-the same. Messages outside chunks are laid out like an uncompressed chunk, and are read as one.
+the same. Messages outside chunks are laid out like an uncompressed chunk, and are read as one. Behind a
+record that is not whole the walk goes on at the next one of which a whole summary says where it is.
 Source: the MCAP specification (mcap.dev/spec).
 """
 
 import io
 import struct
 import zlib
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from errno import EIO
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -28,8 +31,11 @@ _FOOTER = struct.Struct("<BQQQI8s")
 # The part of the footer that the summary's checksum covers.
 _FOOTER_CHECKED_BYTES = 25
 _LOOSE = frozenset({Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL})
+_DATA_END_BYTES = RECORD_HEAD.size + 4
 # A run of records outside chunks is cut here, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
+# No record has this opcode: it stands for bytes that hold no whole record.
+_LOST = 0
 
 
 @dataclass(frozen=True)
@@ -53,18 +59,22 @@ class Region:
 
 @dataclass
 class Container:
-    """What a file holds: channels and schemas by id, metadata by name, regions in file order."""
+    """What a file holds: channels and schemas by id, metadata by name, regions in file order.
+
+    Both counts are by channel: the messages that can be read, and those that a whole summary states.
+    """
 
     channels: dict[int, records.Channel] = field(default_factory=dict)
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     regions: list[Region] = field(default_factory=list)
     message_counts: Counter[int] = field(default_factory=Counter)
+    stated_counts: Counter[int] = field(default_factory=Counter)
     damages: list[str] = field(default_factory=list)
 
 
 class _Place(NamedTuple):
-    """One record of the data section, or a run of loose ones as if it were one message."""
+    """One record, a run of loose ones as if it were one message, or bytes that are lost."""
 
     opcode: int
     offset: int
@@ -74,6 +84,13 @@ class _Place(NamedTuple):
     def end(self) -> int:
         """Where the next one starts."""
         return self.offset + self.length
+
+
+class _Summary(NamedTuple):
+    """The records of the summary, and where it begins; None where that is not known."""
+
+    records: Sequence[Any] = ()
+    start: int | None = None
 
 
 class _Index(NamedTuple):
@@ -114,59 +131,86 @@ def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _opened(file: BinaryIO, use_index: bool) -> Container:
-    found, summary, index = Container(), [], _Index({}, Counter())
+    found, summary, stated = Container(), _Summary(), _Index({}, Counter())
     size = file.seek(0, io.SEEK_END)
     damage_at_end = ""
     try:
         summary = _summary(file, size)
-        _declare(found, summary)
-        index = _index(summary) if use_index else index
+        _declare(found, summary.records)
+        stated = _index(summary.records)
     except Damaged as damage:
         damage_at_end = str(damage)
-    place = _Place(0, 0, len(MAGIC))
-    for place in _data_section(file, size, index):
+    index = stated if use_index else _Index({}, Counter())
+    chunks = set()
+    place = _Place(_LOST, 0, len(MAGIC))
+    for place in _data_section(file, size, summary):
+        if place.opcode == Opcode.CHUNK:
+            chunks.add(place.offset)
         try:
             _note(found, file, place, index)
         except Damaged as damage:
             found.damages.append(str(damage))
     if place.opcode != Opcode.DATA_END:
         damage_at_end = f"it was cut off: its last {size - place.end} bytes hold no whole record"
+    elif place.end != summary.start:
+        damage_at_end = _behind(file, size, place.end, summary) or damage_at_end
     if damage_at_end:
         found.damages.append(damage_at_end)
-    found.damages += _missing(found, summary, index)
+    found.damages += _missing(found, summary, stated.chunks.keys() - chunks)
+    found.stated_counts = stated.message_counts
     if index.chunks:
         found.message_counts = index.message_counts
     return found
 
 
-def _missing(found: Container, summary: Sequence[Any], index: _Index) -> Iterator[str]:
-    """What the summary tells of and the data section has not."""
-    seen = {region.offset for region in found.regions}
-    for offset in index.chunks.keys() - seen:
+def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
+    """What is left out behind the data section; nothing where nothing is, or the summary is damaged."""
+    position = data_end
+    while (place := _record_at(file, size, position)) is not None:
+        position = place.end
+        end = position + len(MAGIC)
+        if place.opcode == Opcode.FOOTER and end < size:
+            return (
+                f"it ends at byte {end}, and the {size - end} bytes behind that, another log perhaps, "
+                "are left out"
+            )
+    if summary.start is None:
+        return ""
+    return (
+        f"its data end at byte {data_end} and its summary begins at byte {summary.start}: what is "
+        "between is left out"
+    )
+
+
+def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
+    """What the summary tells of and the data section has not: `chunks`, metadata; and the reverse."""
+    for offset in sorted(chunks):
         yield f"there is no chunk at byte {offset}, where its index tells of one"
-    for entry in summary:
+    for entry in summary.records:
         if isinstance(entry, records.MetadataIndex) and entry.name not in found.metadata:
             yield f"its metadata record '{entry.name}' is missing"
+    held = {key for region in found.regions for key in region.channel_ids or ()}
+    for key in sorted(held - found.channels.keys()):
+        count = f"{found.message_counts[key]} " if found.message_counts[key] else ""
+        yield f"{count}messages of channel {key}, which it does not declare, are left out"
 
 
-def _summary(file: BinaryIO, size: int) -> list[Any]:
-    """The records of the summary, none where the file has none. Raises Damaged."""
+def _summary(file: BinaryIO, size: int) -> _Summary:
+    """The summary, without records where the file has none. Raises Damaged."""
     file.seek(max(size - _FOOTER.size, 0))
     footer = file.read(_FOOTER.size)
     if len(footer) < _FOOTER.size:
         raise Damaged("its footer is missing")
-    opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
+    opcode, length, start, offset_start, checksum, magic = _FOOTER.unpack(footer)
     if (opcode, length, magic) != (Opcode.FOOTER, 20, MAGIC):
         raise Damaged("its footer is missing")
-    if start == 0:
-        return []
+    start = start or offset_start or size - _FOOTER.size
     if not len(MAGIC) <= start <= size - _FOOTER.size:
         raise Damaged("its footer is damaged")
-    file.seek(start)
-    summary = file.read(size - _FOOTER.size - start)
+    summary = read_bytes(file, start, size - _FOOTER.size - start)
     if checksum not in (0, zlib.crc32(footer[:_FOOTER_CHECKED_BYTES], zlib.crc32(summary))):
         raise Damaged("its summary is damaged (the checksum is wrong)")
-    return list(read_records(summary))
+    return _Summary(list(read_records(summary)), start)
 
 
 def _index(summary: Sequence[Any]) -> _Index:
@@ -189,31 +233,66 @@ def _index(summary: Sequence[Any]) -> _Index:
     return _Index({}, Counter())
 
 
-def _data_section(file: BinaryIO, size: int, index: _Index) -> Iterator[_Place]:
-    """Every whole record; the message indexes of indexed chunks are stepped over."""
+def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Place]:
+    """Every whole record up to the end of the data section, and what is lost between two of them."""
+    known = _stated_places(summary)
     run = position = len(MAGIC)
-    while position + RECORD_HEAD.size <= size:
-        opcode, length = RECORD_HEAD.unpack(read_bytes(file, position, RECORD_HEAD.size))
-        place = _Place(opcode, position, RECORD_HEAD.size + length)
-        if opcode == 0 or place.end > size:
-            break
-        is_loose = opcode in _LOOSE
+    while (place := _next_place(file, size, position, known)) is not None:
+        is_loose = place.opcode in _LOOSE
         if run < position and (not is_loose or place.end - run > _LOOSE_BYTES):
             yield _Place(Opcode.MESSAGE, run, position - run)
             run = position
         position = place.end
         if not is_loose:
             yield place
-            if opcode == Opcode.DATA_END:
-                return
-            entry = index.chunk(place)
-            run = position = place.end + (entry.message_index_length if entry else 0)
-    if run < position <= size:
+            run = position
+        if place.opcode == Opcode.DATA_END:
+            return
+    if run < position:
         yield _Place(Opcode.MESSAGE, run, position - run)
+
+
+def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place]) -> _Place | None:
+    """The record at `position`, or what is lost up to the next of the known ones; None at the end.
+
+    No record is whole that goes on where another one begins.
+    """
+    place = _record_at(file, size, position)
+    end = place.end if place else size
+    for number in range(bisect_right(known, position, key=attrgetter("offset")), len(known)):
+        if known[number].offset >= end:
+            break
+        if _record_at(file, size, known[number].offset) == known[number]:
+            return _Place(_LOST, position, known[number].offset - position)
+    return place
+
+
+def _record_at(file: BinaryIO, size: int, position: int) -> _Place | None:
+    """The record that stands at `position`; None where there is no whole one."""
+    if position + RECORD_HEAD.size > size:
+        return None
+    opcode, length = RECORD_HEAD.unpack(read_bytes(file, position, RECORD_HEAD.size))
+    place = _Place(opcode, position, RECORD_HEAD.size + length)
+    return None if opcode == _LOST or place.end > size else place
+
+
+def _stated_places(summary: _Summary) -> list[_Place]:
+    """Where the records of the data section are of which a summary states the place."""
+    places = []
+    for record in summary.records:
+        if isinstance(record, records.ChunkIndex):
+            places.append(_Place(Opcode.CHUNK, record.chunk_start_offset, record.chunk_length))
+        elif isinstance(record, records.MetadataIndex):
+            places.append(_Place(Opcode.METADATA, record.offset, record.length))
+    if summary.start is not None:
+        places.append(_Place(Opcode.DATA_END, summary.start - _DATA_END_BYTES, _DATA_END_BYTES))
+    return sorted(places, key=attrgetter("offset"))
 
 
 def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> None:
     """Note what one place of the data section holds. Raises Damaged."""
+    if place.opcode == _LOST:
+        raise Damaged(f"its bytes {place.offset} to {place.end} hold no whole record")
     entry = index.chunk(place)
     if entry is not None:
         span = Span(entry.message_start_time, entry.message_end_time)

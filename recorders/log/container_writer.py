@@ -1,15 +1,14 @@
 """Writing an MCAP file that appears whole or not at all: its records, indexes and summary.
 
-It is written as NAME.part and renamed when it is whole. The small records are mcap's own; chunks and
-their indexes come from `packing`. Source: the MCAP specification (mcap.dev/spec).
+It is renamed when it is whole. The small records are mcap's own; chunks and their indexes come from
+`packing`. Source: the MCAP specification (mcap.dev/spec).
 """
 
-import os
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -18,6 +17,7 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
+from recorders.atomic import whole_file
 from recorders.errors import BadInput
 from recorders.log.ahead import ahead
 from recorders.log.chunks import COMPRESSIONS, MAGIC, RECORD_HEAD, chunk_record
@@ -38,7 +38,6 @@ class ContainerWriter:
         if compression not in COMPRESSIONS:
             raise BadInput(f"compression '{compression}' is none of {', '.join(COMPRESSIONS)}")
         self._path = path
-        self._part = path.with_name(path.name + ".part")
         self._compression = compression
         self._schemas: dict[bytes, records.Schema] = {}
         self._channels: list[records.Channel] = []
@@ -50,15 +49,20 @@ class ContainerWriter:
         self._checksum = 0
         self._failure: BadInput | None = None
         self._file: BinaryIO
+        self._opened: ExitStack
 
     def __enter__(self) -> Self:
-        with self._telling():
-            if self._path.is_dir():
-                raise BadInput(f"{self._path}: is a folder; give the name of a log in it")
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self._part.open("wb")
-        self._append(MAGIC)
-        self._append_record(records.Header(profile="", library=LIBRARY))
+        with ExitStack() as stack:
+            with self._telling():
+                if self._path.is_dir():
+                    raise BadInput(f"{self._path}: is a folder; give the name of a log in it")
+            new = stack.enter_context(whole_file(self._path))
+            with self._telling():
+                self._file = new.open("xb")
+            stack.callback(self._close)
+            self._append(MAGIC)
+            self._append_record(records.Header(profile="", library=LIBRARY))
+            self._opened = stack.pop_all()
         return self
 
     def __exit__(
@@ -67,13 +71,15 @@ class ContainerWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        try:
-            if error is None:
-                self._finish()
-        finally:
-            with suppress(OSError):
-                self._file.close()
-            self._part.unlink(missing_ok=True)  # renamed by now where the file is whole
+        if error is not None:
+            self._opened.__exit__(kind, error, traceback)
+            return
+        with self._opened:
+            self._finish()
+
+    def _close(self) -> None:
+        with suppress(OSError):  # which was told when it was met
+            self._file.close()
 
     def add_schema(self, name: str, description: bytes) -> int:
         """The number of a protobuf schema; it is written where it is new."""
@@ -164,16 +170,13 @@ class ContainerWriter:
             raise self._failure from error
 
     def _finish(self) -> None:
-        """Write what follows the last chunk, and give the file its name."""
+        """Write what follows the last chunk."""
         self.add_metadata(PUBLISH_SPANS, self._publish_spans)
         self._append_record(records.DataEnd(data_section_crc=self._checksum))
         self._append(self._summary_section())
         self._append(MAGIC)
         with self._telling():
-            self._file.flush()
-            os.fsync(self._file.fileno())
             self._file.close()
-            self._part.replace(self._path)
 
     def _summary_section(self) -> bytes:
         """The summary, the offsets of its groups, and the footer."""

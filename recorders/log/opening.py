@@ -72,7 +72,19 @@ class Log:
     @property
     def loss_statement(self) -> str | None:
         """What is missing from a recovered log, in one sentence; None where nothing is."""
-        return f"{self.path}: {_listed(self.container.damages)}" if self.container.damages else None
+        parts = [self._lost_messages(), _listed(self.container.damages, "damages")]
+        stated = ": ".join(filter(None, parts))
+        return f"{self.path}: {stated}" if stated else None
+
+    def _lost_messages(self) -> str:
+        """How many are left out of the messages that a whole summary states; empty where none are."""
+        stated = {
+            topic.name: sum(self.container.stated_counts[key] for key in topic.channel_ids)
+            for topic in self.topics.values()
+        }
+        lost = {name: count - self.topics[name].messages for name, count in stated.items()}
+        parts = [f"{lost[name]} of {stated[name]} of {name}" for name in lost if lost[name] > 0]
+        return f"messages are left out, {_listed(parts, 'topics')}" if parts else ""
 
 
 def open_log(path: str | Path, *, recover: bool = False) -> Log:
@@ -94,7 +106,7 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
     return log
 
 
-def _listed(damages: Sequence[str]) -> str:
+def _listed(parts: Sequence[str], what: str) -> str:
     """The first few, in one sentence."""
-    more = f", and {len(damages) - 3} more damages" if len(damages) > 3 else ""
-    return f"{', '.join(damages[:3])}{more}"
+    more = f", and {len(parts) - 3} more {what}" if len(parts) > 3 else ""
+    return f"{', '.join(parts[:3])}{more}"

@@ -53,6 +53,21 @@ def read_streams(
     return {topic: whole.get(topic) or read_empty(log, topic) for topic in topics}
 
 
+def read_span(log: Log, clock: Clock) -> tuple[int, int]:
+    """The first and the last stamp in ns of a log by one of its clocks; zeros where it has no messages.
+
+    A file that notes only the log times of its chunks, as those of other writers do, is opened chunk by
+    chunk for its publish times. Raises BadInput where one is damaged.
+    """
+    regions = log.container.regions
+    with _reading(log) as file:
+        for rank, region in enumerate(regions):
+            regions[rank] = _timed(log, file, region, clock)
+    spans = [region.spans[clock] for region in regions if clock in region.spans]
+    first_ns = min((span.first_ns for span in spans), default=0)
+    return first_ns, max((span.last_ns for span in spans), default=0)
+
+
 def read_empty(log: Log, topic: str) -> Stream:
     """A topic without its messages: its schema and metadata."""
     return Decoder(log, topic).empty()
@@ -160,6 +175,12 @@ def _contents(log: Log, region: Region, raw: bytes) -> Contents:
                 f"{log.path}: the chunk at byte {region.offset} has messages at times outside those "
                 "that its index states; read it without the index, with --recover"
             )
+    stated = log.container.channels.keys() if region.channel_ids is None else region.channel_ids
+    for channel_id in contents.messages.keys() - stated:
+        raise BadInput(
+            f"{log.path}: the chunk at byte {region.offset} has messages of channel {channel_id}, of "
+            "which its index does not tell; read it without the index, with --recover"
+        )
     return contents
 
 

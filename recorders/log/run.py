@@ -2,9 +2,12 @@
 
 import json
 from dataclasses import dataclass, field
+from textwrap import shorten
+from types import NoneType
 from typing import Any
 
 from recorders.errors import BadInput
+from recorders.parsing import parse_json
 
 RECORD_NAME = "fuselog.run"
 
@@ -39,16 +42,37 @@ class RunMetadata:
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
         """Read the MCAP metadata record back; raises BadInput where it is damaged."""
         try:
+            epoch_ns = _stated(record, "epoch_ns", int)
+            notes = _stated(record, "notes", dict)
+            if epoch_ns >= 2**63:
+                raise ValueError("epoch_ns is past the year 2262")
+            if not all(isinstance(note, str) for note in notes.values()):
+                raise ValueError("notes are not all texts")
             return cls(
                 scenario=record["scenario"],
-                parameters=json.loads(record["parameters"]),
-                seed=json.loads(record["seed"]),
-                run=int(record["run"]),
-                epoch_ns=int(record["epoch_ns"]),
-                notes=json.loads(record["notes"]),
+                parameters=_stated(record, "parameters", dict),
+                seed=_stated(record, "seed", int, NoneType),
+                run=_stated(record, "run", int),
+                epoch_ns=epoch_ns,
+                notes=notes,
             )
         except (KeyError, ValueError) as error:
+            reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise BadInput(
-                f"{path}: the metadata record '{RECORD_NAME}' is damaged ({error}); "
+                f"{path}: the metadata record '{RECORD_NAME}' is damaged ({reason}); "
                 "record or import the run again"
             ) from error
+
+
+_WANTED = {dict: "an object", int: "a whole number", NoneType: "null"}
+
+
+def _stated(record: dict[str, str], name: str, *kinds: type) -> Any:
+    """What the JSON under `name` states, of one of these types; no number of a run is negative."""
+    value = parse_json(record[name])
+    if type(value) not in kinds:
+        wanted = " or ".join(_WANTED[kind] for kind in kinds)
+        raise ValueError(f"{name} is {shorten(record[name], 40)}, expected {wanted}")
+    if isinstance(value, int) and value < 0:
+        raise ValueError(f"{name} is negative")
+    return value

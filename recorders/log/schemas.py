@@ -299,7 +299,7 @@ DENSITY_ESTIMATE = _declare(
 )
 INNOVATION = _declare(
     "Innovation",
-    "How one measurement fitted the prediction, and whether the gate let it in; a likelihood of zero else.",
+    "How one measurement fitted the prediction, and whether the gate let it in.",
     _identifier("target_id"),
     _identifier("accepted"),
     _vector("innovation", may_be_nan=True),
@@ -309,8 +309,19 @@ INNOVATION = _declare(
 )
 FAILURE = _declare(
     "Failure",
-    "A run ended here; the channel's metadata lists the reasons by number.",
+    "A run ended here; the channel's metadata lists the reasons by number, as JSON.",
     _identifier("reason"),
+)
+SKIPPED = _declare(
+    "Skipped",
+    "A measurement was not used; the channel's metadata lists the reasons by number, as JSON.",
+    _identifier("reason"),
+)
+COVERAGE = _declare(
+    "Coverage",
+    "For how much of a run, from this stamp to the end, there are estimates.",
+    Field("end_time_ns", "time_ns"),
+    _real("estimated_s"),
 )
 SOLUTION = _declare(
     "Solution",

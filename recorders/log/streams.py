@@ -117,7 +117,14 @@ def _as_column(what: str, values: ArrayLike, dtype: np.dtype, axes: int = 1) -> 
 
 
 def check_stream(stream: Stream, where: str = "") -> None:
-    """Raise BadInput where lengths differ, a time is out of range, or NaN stands where none may."""
+    """Raise BadInput where lengths differ, a time is out of range, or NaN stands where none may.
+
+    So it does where the topic's name cannot be printed: it ends up in figures, file names and terminals.
+    """
+    if not stream.topic.isprintable():
+        raise BadInput(
+            f"{where}topic {stream.topic!r}: its name holds what cannot be printed; give it another"
+        )
     label = f"{where}topic {stream.topic}"
     for name, times in (("publish_time", stream.publish_time_ns), ("log_time", stream.log_time_ns)):
         if len(times) != len(stream):

@@ -20,6 +20,7 @@ from replay.estimators.solutions import (
     stated,
     table_of,
 )
+from replay.measurements import PLANE, read_vectors
 
 
 class ShooterParameters(Parameters):
@@ -87,7 +88,8 @@ def _latest(positions: Ragged, batches: Batches) -> Array:
         rows = np.flatnonzero(batches.run == run)
         found = np.searchsorted(times[first:end], batches.time_ns[rows], side="right") - 1
         latest[rows] = np.where(found < 0, -1, first + found)
-    fixes = np.concatenate([positions["position_m"], np.full((1, 2), np.nan)])
+    known = read_vectors(positions.stream, "position_m", PLANE)
+    fixes = np.concatenate([known, np.full((1, 2), np.nan)])
     return fixes[latest]
 
 

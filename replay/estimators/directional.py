@@ -17,6 +17,7 @@ from recorders.log import Schema, schemas
 from recorders.parameters import Parameters
 from recorders.simulators.headings import Correlation, equal_sigmas
 from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Noise
+from replay.components import Components
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
@@ -35,7 +36,8 @@ from replay.estimators.torus import (
     run_toroidal_filter,
     run_unscented_filter,
 )
-from replay.plain import Components, Given, Messages, Results, recursive
+from replay.measurements import Vectors
+from replay.plain import Given, Messages, Results, recursive
 from replay.tangent import vector_part_covariance
 
 Floats = NDArray[np.float64]
@@ -185,7 +187,7 @@ def _start_headings(
     filter_of: Callable[[Any], Callable[..., tuple[WrappedNormal, WrappedNormal]]], given: Given[Any]
 ) -> tuple[Advance, WrappedNormal]:
     model, run_filter = heading_model(given), filter_of(given.parameters)
-    _, mean, covariance = given.prior("prior", 2)
+    _, mean, covariance = given.prior("prior")
 
     def advance(state: WrappedNormal, measured: Floats) -> tuple[WrappedNormal, Floats, Floats]:
         offsets = np.array([0, len(measured)])
@@ -210,6 +212,7 @@ def _of_unit_vectors(
         whole={},
         components=kinds,  # type: ignore[arg-type]
         truth="truth",
+        vectors={topic: Vectors({topic: len(kinds)})},
         start=partial(start, topic, len(kinds)),
         follow=follow,
         compiled=False,
@@ -227,6 +230,7 @@ def _of_headings(
         whole={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=components,
         truth="truth",
+        vectors={"headings": Vectors({"value": components})},
         start=partial(_start_headings, filter_of),
         follow=follow,
         compiled=False,

@@ -15,6 +15,7 @@ from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_
 from recorders.models.planar import Components
 from replay.inference.gaussian import Floats
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.measurements import PLANE, read_vectors
 
 STATES = 4
 
@@ -27,18 +28,18 @@ class ExtendedTargetParameters(ModelParameters):
     point_variance_m2: PositiveFloat | None = None
 
 
-def stay(target: Components, control: Any, duration_s: Any, parameters: Any) -> Components:  # noqa: ARG001
+def stay(target: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
     """A random walk's mean."""
     return target[0], target[1], target[2], target[3]
 
 
-def drift(target: Components, duration_s: Any, parameters: Any) -> Components:  # noqa: ARG001
+def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
     """The variances of one step of the walk."""
     size, place = parameters.size_drift_m2, parameters.position_drift_m2
     return size, size, place, place
 
 
-def measure(target: Components, noise: Components, about: Any, parameters: Any) -> Components:  # noqa: ARG001
+def measure(target: Components, noise: Components, about: Any, parameters: Any) -> Components:
     """A point of the surface and its squares, with noise of two scales and of the point itself."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
@@ -52,13 +53,13 @@ def point_noise(parameters: Any) -> Components:
 
 def read(stream: Stream) -> Floats:
     """The pseudo-measurement (n, 4)."""
-    return np.stack(quadratic(stream["position_m"].T), axis=1)
+    return np.stack(quadratic(read_vectors(stream, "position_m", PLANE).T), axis=1)
 
 
 def moments(
     mean: Floats,
     covariance: Floats,
-    about: Any,  # noqa: ARG001
+    about: Any,
     parameters: Any,
     predicted: Floats,
     spread: Floats,

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import make_stream, schemas
+from recorders.log import schemas
 from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
+from replay.failures import reason_stream
 from replay.sampling.sets import SampleSets
 
 Floats = NDArray[np.float64]
@@ -41,13 +42,7 @@ def failures_of(
         reasons: a sentence for each index.
     """
     failed = np.flatnonzero((after != ALL_WELL) & (before == ALL_WELL))
-    stream = make_stream(
-        f"{topic}/failure",
-        schemas.FAILURE,
-        time_ns[failed],
-        metadata={"reasons": "; ".join(reasons)},
-        reason=after[failed],
-    )
+    stream = reason_stream(f"{topic}/failure", schemas.FAILURE, time_ns[failed], after[failed], reasons)
     return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))
 
 
@@ -236,7 +231,7 @@ def linearised(models: Models) -> Filter:
         states: int,
         controls: int,
         components: int,
-        sets: SampleSets,  # noqa: ARG001
+        sets: SampleSets,
     ) -> LinearMemory:
         return LinearMemory(
             transition=np.empty((states, states)),
@@ -251,7 +246,7 @@ def linearised(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
-        event: int,  # noqa: ARG001
+        event: int,
         memory: LinearMemory,
     ) -> bool:
         transition, product, gain = memory.transition, memory.product, memory.gain
@@ -280,7 +275,7 @@ def linearised(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
-        event: int,  # noqa: ARG001
+        event: int,
         memory: LinearMemory,
     ) -> bool:
         difference, innovation_covariance, cross_covariance = innovation

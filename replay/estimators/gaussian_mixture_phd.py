@@ -22,8 +22,11 @@ from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
+from replay.components import Components
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.gaussian import ALL_WELL, NOT_POSITIVE_DEFINITE, cholesky, failures_of
+from replay.measurements import PLANE, read_vectors
+from replay.priors import gaussians
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -188,7 +191,7 @@ def add_detected(
     return end
 
 
-def prepare(mean: Floats, covariance: Floats, variance: float, gain: Floats) -> bool:  # noqa: ARG001
+def prepare(mean: Floats, covariance: Floats, variance: float, gain: Floats) -> bool:
     """Fill what the update of a component needs and all detections share; see `add_detected`."""
     a = covariance[X, X] + variance
     b = covariance[X, Y]
@@ -390,7 +393,7 @@ def _compiled() -> Callable[..., None]:
 def start(whole: Mapping[str, Ragged], *, most: int) -> Mixture | None:
     """A component of weight 1 at each prior; None where there is none: then nothing is known yet.
 
-    Raises BadInput where a prior's covariance is not positive definite, or runs lack one.
+    Raises BadInput where there is no room for all.
     """
     if not whole:
         return None
@@ -398,17 +401,12 @@ def start(whole: Mapping[str, Ragged], *, most: int) -> Mixture | None:
     if len(whole) > most:
         raise BadInput(f"{len(whole)} priors for {most} components; give --set most_components=...")
     mixture = no_components(runs, most)
-    for component, (topic, prior) in enumerate(whole.items()):
-        rows = prior.offsets[:-1]
-        if np.any(np.diff(prior.offsets) == 0):
-            raise BadInput(f"topic {topic}: a run has no prior message; the filter cannot start")
-        covariance = prior["covariance"][rows].reshape(-1, STATES, STATES)
-        if np.any(np.linalg.eigvalsh(covariance)[:, 0] <= 0):
-            raise BadInput(f"topic {topic}: the prior's covariance is not positive definite")
+    for component, prior in enumerate(whole.values()):
+        time_ns, mean, covariance = gaussians(prior)
         mixture.weight[:, component] = 1.0
-        mixture.mean[:, component] = prior["mean"][rows]
+        mixture.mean[:, component] = mean
         mixture.covariance[:, component] = covariance
-        mixture.time_ns[:] = prior.stream.publish_time_ns[rows]
+        mixture.time_ns[:] = time_ns
     mixture.used[:] = len(whole)
     return mixture
 
@@ -510,7 +508,7 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
             f"topic {topic}: {said if len(wrong) else 'detections of scans that are not there'}; "
             "record every scan with its count"
         )
-    ordered = np.ascontiguousarray(place[order, :2]) if len(detection) else np.empty((0, 2))
+    ordered = read_vectors(detection.stream, "position_m", PLANE)[order]
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
 
 
@@ -609,14 +607,14 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> 
     def has(topic: str, schema: Schema) -> bool:
         return topic in topics and topics[topic].schema_name == schema.full_name
 
-    components = ",".join(PLANE_MOTION)
-    priors = tuple(
-        topic
+    components: Components = dict.fromkeys(PLANE_MOTION, "linear")
+    priors = {
+        topic: components
         for topic in topics
         if topic.endswith("/prior")
         and has(topic, schemas.GAUSSIAN_ESTIMATE)
-        and topics[topic].metadata.get("components") == components
-    )
+        and components.keys() <= set(topics[topic].metadata.get("components", "").split(","))
+    }
     bound: list[Bound] = []
     for topic in topics:
         sensor, _, leaf = topic.rpartition("/")
@@ -629,7 +627,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> 
             most = parameters.most_components
             begin = partial(start, most=most)
             advance = partial(run, settings=settings, most=most, outputs=outputs)
-            bound.append(Recursive(outputs.name, (topic, detection), priors, begin, advance))
+            read = (topic, detection)
+            bound.append(Recursive(outputs.name, read, tuple(priors), begin, advance, priors))
     return bound
 
 

@@ -1,7 +1,7 @@
 """Localization of robots in the plane from odometry and sightings of mapped landmarks.
 
-The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the next one. Thrun, Burgard and
-Fox, Probabilistic Robotics, chapters 3 and 7.
+The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the next one. Thrun, Burgard
+and Fox, Probabilistic Robotics, chapters 3 and 7.
 """
 
 from collections.abc import Mapping
@@ -13,10 +13,11 @@ from recorders.log import schemas
 from recorders.models.planar import Components, drive, range_bearing
 from replay.inference.estimators import modelled
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
+from replay.measurements import PLANE
 from replay.tangent import Kind
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
-LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", 2)
+LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)
 
 
 class DeadReckoningParameters(ModelParameters):
@@ -36,7 +37,7 @@ class LocalizationParameters(DeadReckoningParameters):
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
 
 
-def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:  # noqa: ARG001
+def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
     """The pose at the end of an arc."""
     return drive(pose, velocity, duration_s)
 
@@ -83,16 +84,19 @@ def bearing_noise(parameters: Any) -> Components:
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
 MOTION = Motion(move, control_noise=velocity_noise)
-ODOMETRY = Control(
-    "odometry", schemas.ODOMETRY, ("forward_mps", "turn_radps"), estimates=True
-)
+ODOMETRY = Control("odometry", schemas.ODOMETRY, ("forward_mps", "turn_radps"), estimates=True)
 ROBOT = Model(
     "robot pose from odometry and mapped landmarks",
     POSE,
     LocalizationParameters,
     (
         Sensor(
-            "range_bearing", schemas.RANGE_BEARING, {**RANGE, **BEARING}, see, sight_noise, about=LANDMARKS
+            "range_bearing",
+            schemas.RANGE_BEARING,
+            {**RANGE, **BEARING},
+            see,
+            sight_noise,
+            about=LANDMARKS,
         ),
         Sensor("range", schemas.RANGE, RANGE, see_range, range_noise, about=LANDMARKS),
         Sensor("bearing", schemas.BEARING, BEARING, see_bearing, bearing_noise, about=LANDMARKS),

@@ -20,9 +20,11 @@ from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
 from replay.compile import compile_over_runs
+from replay.components import Components
 from replay.engine import Batch, Bound, Estimator
 from replay.estimators.covariance_intersection import rule
 from replay.estimators.gaussian import ALL_WELL, Floats, Function, failures_of
+from replay.priors import gaussians
 
 Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
@@ -266,30 +268,22 @@ def solve(
 ) -> list[Ragged]:
     """Replay the network, see the module; `sensors` are the topics by node.
 
-    Raises BadInput where a run has no proper prior, or a link names an unknown node or arrives before it
-    was sent.
+    Raises BadInput where a link names an unknown node or arrives before it was sent.
     """
-    prior = whole["/prior"]
-    rows = prior.offsets[:-1]
-    if np.any(np.diff(prior.offsets) == 0):
-        raise BadInput("topic /prior: a run has no prior message; the nodes cannot start")
-    size = len(components)
-    covariance = prior["covariance"][rows].reshape(-1, size, size)
-    if np.any(np.linalg.eigvalsh(covariance)[:, 0] <= 0):
-        raise BadInput("topic /prior: the prior's covariance is not positive definite")
-    prior_ns = prior.stream.publish_time_ns[rows]
+    prior_ns, prior_mean, prior_covariance = gaussians(whole["/prior"])
+    runs, size = prior_mean.shape
     activities, sensing, sent = _schedule(whole, sensors, components, prior_ns, parameters.rule)
     count = len(activities.node)
     blank = np.full((count, size), np.nan)
     square = np.full((count, size, size), np.nan)
     results = Results(blank, square, blank.copy(), square.copy(), np.zeros_like(square))
-    failed_ns = np.full(prior.runs, -1)
+    failed_ns = np.full(runs, -1)
     _compiled(parameters.rule, parameters.tolerance)(
-        prior.runs,
+        runs,
         activities,
         sensing,
-        prior["mean"][rows],
-        covariance,
+        prior_mean,
+        prior_covariance,
         prior_ns,
         parameters.rule == TRAP,
         results,
@@ -464,12 +458,27 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters)
     if not sensors or "/links" not in topics or "/prior" not in topics:
         return []
     sensors = dict(sorted(sensors.items()))
-    components = topics["/prior"].metadata.get("components", "").split(",")
-    if len(components) % 2:
-        raise BadInput("topic /prior: the state must be positions and as many velocities")
+    components = state_of(topics["/prior"])
     read = ("/links", *(topic.name for topic in sensors.values()))
     work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
-    return [Batch(name, read, ("/prior",), work)]
+    priors: dict[str, Components] = {"/prior": dict.fromkeys(components, "linear")}
+    return [Batch(name, read, ("/prior",), work, priors)]
+
+
+def state_of(prior: Topic) -> list[str]:
+    """A prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
+
+    Raises BadInput where they are not these.
+    """
+    stated = [name for name in prior.metadata.get("components", "").split(",") if name]
+    positions = [name for name in stated if name.endswith("_m")]
+    components = [*positions, *(f"v{name.removesuffix('_m')}_mps" for name in positions)]
+    if not positions or sorted(components) != sorted(stated):
+        raise BadInput(
+            f"topic {prior.name}: its channel states {', '.join(stated) or 'no components'}; "
+            "positions such as x_m, and for each a velocity such as vx_mps, are needed"
+        )
+    return components
 
 
 NETWORK = Estimator(

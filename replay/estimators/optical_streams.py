@@ -28,6 +28,7 @@ from replay.estimators.solutions import (
     stated,
     table_of,
 )
+from replay.measurements import check_width
 
 Array = NDArray[np.float64]
 NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/attitude"
@@ -98,8 +99,8 @@ def known_biases(sensors: Sequence[int], parameters: Parameters) -> Array:
 def _solve(
     name: str, sensors: list[int], sigma_rad: Array, known_rad: Array, streams: dict[str, Ragged]
 ) -> list[Ragged]:
-    position = [_constant(streams[f"/sensor{s}/position"], "position_m") for s in sensors]
-    turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion") for s in sensors]
+    position = [_constant(streams[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
+    turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
     nominal = Rotation.from_quat(turned, scalar_first=True).inv().as_euler("ZYX")
     scene = Scene(np.array(position), nominal, sigma_rad, known_rad)
     seen = gather_sightings([streams[f"/sensor{s}/line_of_sight"] for s in sensors])
@@ -109,8 +110,9 @@ def _solve(
     )
 
 
-def _constant(ragged: Ragged, field: str) -> Array:
+def _constant(ragged: Ragged, field: str, width: int) -> Array:
     """The one value (width,) that a stream has in all runs."""
+    check_width(ragged.stream, field, width)
     values: Array = ragged[field]
     if len(values) == 0 or (values != values[:1]).any():
         raise BadInput(

@@ -10,6 +10,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import schemas
 from recorders.parameters import Parameters
+from replay.components import Components
 from replay.engine import Estimator
 from replay.estimators.inertial import (
     InertialModel,
@@ -21,9 +22,11 @@ from replay.estimators.inertial import (
     start_inertial_filter,
     start_reckoning,
 )
-from replay.plain import Components, Given, Messages, Results, recursive
+from replay.measurements import Vectors
+from replay.plain import Given, Messages, Results, recursive
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
+FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
 Advance = Callable[[InertialModel, Any, InertialSamples], tuple[Any, OrientationEstimates]]
 
 
@@ -88,6 +91,7 @@ def _inertial(
         whole={},
         components=ORIENTATION,
         truth="truth",
+        vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},
         start=start,
         follow=_follow,
         compiled=False,

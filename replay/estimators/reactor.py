@@ -24,18 +24,22 @@ class ReactorParameters(ModelParameters):
     pressure_variance: PositiveFloat | None = None
 
 
-def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) -> Components:  # noqa: ARG001
+def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
     """One step of the reaction."""
     return react(pressures, parameters.step_s)
 
 
-def process_noise(pressures: Components, duration_s: Any, parameters: Any) -> Components:  # noqa: ARG001
+def process_noise(pressures: Components, duration_s: Any, parameters: Any) -> Components:
     """The variance of each pressure's noise in a step."""
     return parameters.process_variance, parameters.process_variance
 
 
 def moments(
-    mean: Floats, covariance: Floats, control: Any, duration_s: Any, parameters: Any  # noqa: ARG001
+    mean: Floats,
+    covariance: Floats,
+    control: Any,
+    duration_s: Any,
+    parameters: Any,
 ) -> None:
     """Move mean and covariance by their exact moments.
 
@@ -52,7 +56,7 @@ def moments(
             covariance[row, column] += mixed + gain[row] * gain[column] * variance
 
 
-def read(pressures: Components, about: Any, parameters: Any) -> Components:  # noqa: ARG001
+def read(pressures: Components, about: Any, parameters: Any) -> Components:
     """What the sensor reads."""
     return total_pressure(pressures)
 
@@ -73,7 +77,7 @@ REACTOR = Model(
             {"total_pressure": "linear"},
             read,
             reading_noise,
-            read=lambda stream: stream["value"],
+            vector="value",
             linear=True,
         ),
     ),

@@ -28,6 +28,7 @@ from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
+from replay.measurements import PLANE, read_vectors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -465,7 +466,7 @@ def _reports(block: Block, topic: str, settings: Settings) -> Reports:
     variance = np.where(unknown, np.where(np.isnan(speed_mps), fastest, speed_mps) ** 2, 0.0)
     velocity = np.stack([speed_mps * np.sin(course_rad), speed_mps * np.cos(course_rad)], axis=1)
     velocity[unknown] = 0.0
-    position = np.ascontiguousarray(given["position_m"][source, :2])
+    position = read_vectors(given.stream, "position_m", PLANE)[source]
     return Reports(offsets, time_ns, is_last, position, velocity, variance, course_rad, speed_mps)
 
 

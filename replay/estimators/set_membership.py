@@ -5,13 +5,14 @@ pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative be
 repeated on the fault's topic.
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, make_stream, schemas
@@ -31,15 +32,17 @@ from replay.estimators.feasible_sets import (
     to_blame,
 )
 from replay.estimators.pseudo_ellipsoids import Weighting, fit, outline
+from replay.measurements import PLANE, read_vectors
 
 LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """Which set, and from what; a bound or an arena that is None is the one that the log states.
+    """Which set, and from what; a bound, arena or maximum range that is None is the log's own.
 
-    Bearings of one stamp give all their pairs. Without an arena in the log it is the rectangle around
-    the landmarks with `arena_margin_m`.
+    Bearings of one stamp give all their pairs. The arena is (low x, low y, high x, high y). Where nobody
+    states it, a robot is no farther from what it sees than the sensor's maximum range, which is the
+    longest that it measured where nobody states that either.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"
@@ -47,24 +50,50 @@ class SetParameters(Parameters):
     weighting: Weighting = "area"
     sweeps: PositiveInt = 1
     least_landmarks: Annotated[int, Field(ge=2)] = 3
-    arena_margin_m: NonNegativeFloat = 1.25
+    arena_m: tuple[float, float, float, float] | None = None
+    maximum_range_m: PositiveFloat | None = None
+
+
+class Known(NamedTuple):
+    """What is known beside the bearings: their bound, and where the robot can be.
+
+    `arena_m` is (low x, low y, high x, high y). None where it follows from the sensor's maximum range,
+    which is None where that is the longest that it measured.
+    """
+
+    bound_rad: float
+    least_landmarks: int
+    arena_m: tuple[float, ...] | None
+    maximum_range_m: float | None
+
+    def metadata(self) -> dict[str, str]:
+        """As a channel states it."""
+        return {name: json.dumps(value) for name, value in self._asdict().items()}
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> "Known":
+        """What a channel states."""
+        return cls(*(json.loads(metadata[name]) for name in cls._fields))
 
 
 class Frame(NamedTuple):
-    """The relative bearings of one stamp and the numbers (n, 2) of their landmarks."""
+    """The relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
 
     time_ns: int
     pairs: Pairs
     numbers: NDArray[np.int64]
+    arena: Arena
 
 
-def frames(
-    stream: Stream, landmarks: Mapping[int, Floats], bound_rad: float, least_landmarks: int
-) -> Iterator[Frame]:
+def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
     """The frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
 
-    What is not on the map is left out, and so are pairs of one landmark seen twice.
+    What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
+    where nothing says how far the robot can be from what it sees.
     """
+    places_m = read_vectors(landmarks, "position_m", PLANE)
+    place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
+    range_m = _maximum_range_m(stream, known) if known.arena_m is None else np.inf
     cuts = np.flatnonzero(np.diff(stream.publish_time_ns)) + 1
     for rows in np.split(np.arange(len(stream)), cuts):
         if "angle_rad" in stream.columns:
@@ -75,31 +104,40 @@ def frames(
             targets, bearing = stream["target_id"][rows], stream["bearing_rad"][rows]
             numbers = np.stack([targets[first], targets[second]], axis=1)
             angle = wrap_angle(bearing[first] - bearing[second])
-        mapped = np.isin(numbers, list(landmarks)).all(axis=1) & (numbers[:, 0] != numbers[:, 1])
+        mapped = np.isin(numbers, list(place_of)).all(axis=1) & (numbers[:, 0] != numbers[:, 1])
         numbers, angle = numbers[mapped].astype(np.int64), angle[mapped]
-        if len(np.unique(numbers)) < least_landmarks:
+        if len(np.unique(numbers)) < known.least_landmarks:
             continue
-        first, second = (np.array([landmarks[int(n)] for n in side]) for side in numbers.T)
-        time_ns = int(stream.publish_time_ns[rows[0]])
-        yield Frame(time_ns, make_pairs(first, second, angle, bound_rad), numbers)
+        places = np.array([place_of[number] for number in numbers.ravel().tolist()])
+        pairs = make_pairs(places[0::2], places[1::2], angle, known.bound_rad)
+        arena = _arena(known.arena_m) if known.arena_m else _within(places, range_m)
+        yield Frame(int(stream.publish_time_ns[rows[0]]), pairs, numbers, arena)
 
 
-def map_and_arena(landmarks: Stream, margin_m: float) -> tuple[dict[int, Floats], Arena]:
-    """The landmarks by number and the arena that the log states, or the one around them."""
-    places = landmarks["position_m"][:, :2]
-    numbers = landmarks["landmark_id"].tolist()
-    stated = landmarks.metadata.get("arena_m")
-    if stated is None:
-        return dict(zip(numbers, places, strict=True)), arena_around(places, margin_m)
-    try:
-        low_x, low_y, high_x, high_y = (float(part) for part in stated.split(","))
-    except ValueError:
+def _maximum_range_m(stream: Stream, known: Known) -> float:
+    """How far the sensor sees: as stated, else the longest range that it measured."""
+    if known.maximum_range_m is not None:
+        return known.maximum_range_m
+    if "range_m" not in stream.columns:
         raise BadInput(
-            f"topic {landmarks.topic}: arena_m is '{stated}'; low x, low y, high x, high y are needed"
-        ) from None
-    return dict(zip(numbers, places, strict=True)), Arena(
-        np.array([low_x, low_y]), np.array([high_x, high_y])
-    )
+            f"topic {stream.topic}: nothing says where the robot can be: it measures no ranges and "
+            "states no maximum_range_m, and /landmarks states no arena_m; give "
+            "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
+        )
+    return float(stream["range_m"].max(initial=0.0))
+
+
+def _arena(corners_m: tuple[float, ...]) -> Arena:
+    return Arena(np.array(corners_m[:2]), np.array(corners_m[2:]))
+
+
+def _within(places: Floats, range_m: float) -> Arena:
+    """The rectangle no farther than a range from any of the places (n, 2).
+
+    Where there is none one landmark is misidentified, and the robot no farther from one of them.
+    """
+    low, high = places.max(axis=0) - range_m, places.min(axis=0) + range_m
+    return Arena(low, high) if np.all(low < high) else arena_around(places, range_m)
 
 
 def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floats]:
@@ -124,21 +162,20 @@ def solve(
     name: str,
     topic: str,
     truth: str,
-    bound_rad: float,
+    known: Known,
     parameters: SetParameters,
 ) -> list[Ragged]:
     """A set for every frame of every run; see `replay.engine.Batch`."""
     sets, sizes, faults = _Rows(), _Rows(), _Rows()
     landmarks, seen = whole["/landmarks"], whole[topic]
     for run in range(seen.runs):
-        known, arena = map_and_arena(landmarks.of_run(run), parameters.arena_margin_m)
-        for frame in frames(seen.of_run(run), known, bound_rad, parameters.least_landmarks):
-            found = polygons(frame.pairs, arena, parameters)
+        for frame in frames(seen.of_run(run), landmarks.of_run(run), known):
+            found = polygons(frame.pairs, frame.arena, parameters)
             sizes.add(run, frame.time_ns, [sum(map(len, found))])
             for number, ring in enumerate(found):
                 sets.add(run, frame.time_ns, np.full(len(ring), number), ring)
             if not found:
-                blamed = to_blame(frame.pairs, arena)[:1]
+                blamed = to_blame(frame.pairs, frame.arena)[:1]
                 faults.add(run, frame.time_ns, frame.numbers[blamed], frame.pairs.angle_rad[blamed])
     prefix = f"/estimates/{name}"
     metadata = {
@@ -146,8 +183,7 @@ def solve(
         "kinds": "linear,linear",
         "truth": truth,
         "measured": topic,
-        "bound_rad": repr(bound_rad),
-        "least_landmarks": str(parameters.least_landmarks),
+        **known.metadata(),
     }
     ring_id, vertex = sets.columns([(0,), (0, 2)])
     (elements,) = sizes.columns([(0,)])
@@ -215,22 +251,43 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> 
             name=f"{name}{prefix}",
             topic=topic.name,
             truth=f"{prefix}/truth",
-            bound_rad=_bound_rad(topic, parameters),
+            known=_known(topic, topics["/landmarks"], parameters),
             parameters=parameters,
         )
         bound.append(Batch(f"{name}{prefix}", (topic.name,), ("/landmarks",), work))
     return bound
 
 
-def _bound_rad(topic: Topic, parameters: SetParameters) -> float:
-    if parameters.bound_deg is not None:
-        return float(np.radians(parameters.bound_deg))
-    try:
-        return float(topic.metadata["bound_rad"])
-    except (KeyError, ValueError):
+def _known(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
+    """What the parameters say and, where they do not, the channels' metadata."""
+    bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
+    arena_m: tuple[float, ...] | None = parameters.arena_m
+    if arena_m is None and "arena_m" in landmarks.metadata:
+        arena_m = _numbers(landmarks, "arena_m")
+    if arena_m is not None and not (len(arena_m) == 4 and np.all(np.less(arena_m[:2], arena_m[2:]))):
         raise BadInput(
-            f"topic {topic.name} does not state bound_rad; give it with --set bound_deg=..."
-        ) from None
+            f"an arena of {arena_m} m; low x, low y, high x, high y are needed, as --set arena_m=[...] "
+            f"or in the metadata of {landmarks.name}"
+        )
+    range_m = parameters.maximum_range_m
+    if range_m is None and "maximum_range_m" in topic.metadata:
+        range_m = _numbers(topic, "maximum_range_m")[0]
+    if bound_rad is None and "bound_rad" in topic.metadata:
+        bound_rad = _numbers(topic, "bound_rad")[0]
+    if bound_rad is None:
+        raise BadInput(f"topic {topic.name} does not state bound_rad; give it with --set bound_deg=...")
+    return Known(bound_rad, parameters.least_landmarks, arena_m, range_m)
+
+
+def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
+    """Finite numbers, with commas between, that a channel states."""
+    try:
+        numbers = tuple(float(part) for part in topic.metadata[name].split(","))
+    except ValueError:
+        numbers = (np.nan,)
+    if not np.isfinite(numbers).all():
+        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; numbers are needed")
+    return numbers
 
 
 SET_MEMBERSHIP = Estimator(

@@ -1,5 +1,6 @@
 """What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.states import state_metadata
 from replay.blocks import Ragged
+from replay.failures import REASONS
 from replay.least_squares import SENTENCES, Solution
 
 
@@ -92,7 +94,7 @@ def solution_streams(
             f"{topic}/failure",
             schemas.FAILURE,
             ~found,
-            {"reasons": "; ".join(SENTENCES.values())},
+            {REASONS: json.dumps(list(SENTENCES.values()))},
             reason=solution.status[~found],
         ),
     ]

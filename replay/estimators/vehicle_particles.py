@@ -106,7 +106,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameter
     if bound is None:
         return []
     setup, used, priors = bound
-    return [Recursive(name, used, priors, partial(_start, setup, method), partial(_run, setup, method))]
+    begin, advance = partial(_start, setup, method), partial(_run, setup, method)
+    return [Recursive(name, used, tuple(priors), begin, advance, priors)]
 
 
 def _start(setup: Setup, method: Method, whole: Mapping[str, Ragged]) -> Cloud:

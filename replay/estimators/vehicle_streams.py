@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput, choices
 from recorders.log import Topic, make_stream, schemas
@@ -20,6 +20,7 @@ from recorders.models.planar import wrap_angle
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
+from replay.components import Components
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import MISSED, Scanning
 from replay.estimators.vehicle_updates import (
@@ -36,6 +37,9 @@ from replay.estimators.vehicle_updates import (
     where,
 )
 from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
+from replay.failures import Failure, failure_stream, reason_stream
+from replay.measurements import PLANE, read_fixes, read_vectors
+from replay.priors import gaussians
 
 Booleans = NDArray[np.bool_]
 
@@ -45,10 +49,14 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method, and from which scan on the sensor's pose may be found."""
+    """The method, and from which scan on the sensor's pose may be found.
+
+    A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used.
+    """
 
     method: str = "hungarian"
     registration_scan: PositiveInt = 13
+    sigma_fix_m: PositiveFloat | None = None
 
 
 class Carried(NamedTuple):
@@ -70,7 +78,8 @@ class Frames(NamedTuple):
 
     `fixes` (runs, frames, vehicles, 2) with `noise` (runs, frames, vehicles, 2, 2), and scans of the
     network and the infrastructure sensor (runs, frames, detections, 2), are NaN where there are none;
-    `has_network`, `has_sensor` (runs, frames) say where there is a scan.
+    `has_network`, `has_sensor` (runs, frames) say where there is a scan, `skipped` (runs, frames,
+    vehicles) where a fix is not used since its covariance is missing.
     """
 
     counts: Integers
@@ -81,6 +90,7 @@ class Frames(NamedTuple):
     has_network: Booleans
     sensor: Floats
     has_sensor: Booleans
+    skipped: Booleans
 
 
 class Results(NamedTuple):
@@ -112,17 +122,28 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
     fixes, sensor = split_method(parameters.method)
     if fixes not in FIXES:
         raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
-    bound = bind_vehicles(name, topics, fixes, sensor, parameters.registration_scan)
+    bound = bind_vehicles(
+        name, topics, fixes, sensor, parameters.registration_scan, parameters.sigma_fix_m
+    )
     if bound is None:
         return []
     setup, used, priors = bound
-    return [Recursive(name, used, priors, partial(start, setup), partial(run, setup))]
+    begin, advance = partial(start, setup), partial(run, setup)
+    return [Recursive(name, used, tuple(priors), begin, advance, priors)]
 
 
 def bind_vehicles(
-    name: str, topics: Mapping[str, Topic], fixes: str, sensor: str, registration_scan: int
-) -> tuple[Setup, tuple[str, ...], tuple[str, ...]] | None:
-    """What a method is told, the topics it follows and the priors; None where one is missing."""
+    name: str,
+    topics: Mapping[str, Topic],
+    fixes: str,
+    sensor: str,
+    registration_scan: int,
+    sigma_fix_m: float | None = None,
+) -> tuple[Setup, tuple[str, ...], dict[str, Components]] | None:
+    """What a method is told, the topics it follows, and the priors with what is wanted of each.
+
+    None where a topic is missing.
+    """
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -140,8 +161,10 @@ def bind_vehicles(
         motion_of(topics, numbers),
         scanning_of(topics, "/network/scan"),
         scanning_of(topics, "/infrastructure/scan"),
+        sigma_fix_m,
     )
-    return setup, tuple(used), tuple(f"/vehicle{number}/prior" for number in numbers)
+    state: Components = dict.fromkeys(PLANE_MOTION, "linear")
+    return setup, tuple(used), {f"/vehicle{number}/prior": state for number in numbers}
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
@@ -175,21 +198,12 @@ def _stated(topic: Topic, name: str) -> float:
 
 
 def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
-    """Every run's priors; raises BadInput where a run lacks one, or one is no vehicle's state."""
+    """Every run's priors."""
     runs = next(iter(whole.values())).runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
-    for vehicle, (topic, prior) in enumerate(whole.items()):
-        if np.any(np.diff(prior.offsets) == 0):
-            raise BadInput(f"topic {topic}: a run has no prior message; the filter cannot start")
-        if prior["mean"].shape[1] != STATES or prior["covariance"].shape[1] != STATES**2:
-            raise BadInput(f"topic {topic}: a prior of ({', '.join(PLANE_MOTION)}) is needed")
+    for vehicle, prior in enumerate(whole.values()):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        first = prior.offsets[:-1]
-        mean[:, own] = prior["mean"][first]
-        covariance[:, own, own] = prior["covariance"][first].reshape(-1, STATES, STATES)
-        if np.any(np.linalg.eigvalsh(covariance[:, own, own])[:, 0] <= 0):
-            raise BadInput(f"topic {topic}: the prior's covariance is not positive definite")
-    time_ns = prior.stream.publish_time_ns[first]
+        time_ns, mean[:, own], covariance[:, own, own] = gaussians(prior)
     registered, failed = np.zeros((2, runs), bool)
     return Carried(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
 
@@ -222,7 +236,8 @@ def frames_of(setup: Setup, block: Block) -> Frames:
     time_ns[run_of, frame_of] = events.time_ns
     names = {name: index for index, name in enumerate(block.streams)}
     vehicles = setup.motion.vehicles
-    fixes, noise = np.full((*shape, vehicles, 2), np.nan), np.full((*shape, vehicles, 4), np.nan)
+    fixes, noise = np.full((*shape, vehicles, 2), np.nan), np.full((*shape, vehicles, 2, 2), np.nan)
+    skipped = np.zeros((*shape, vehicles), bool)
 
     def place(topic: str) -> tuple[Integers, Integers, Integers]:
         """Runs, frames and rows of a topic's messages."""
@@ -234,8 +249,12 @@ def frames_of(setup: Setup, block: Block) -> Frames:
         if topic.endswith("/fix") and len(ragged):
             vehicle = names[topic]
             at_run, at_frame, row = place(topic)
-            fixes[at_run, at_frame, vehicle] = ragged["position_m"][row]
-            noise[at_run, at_frame, vehicle] = ragged["covariance_m2"][row]
+            read = read_fixes(ragged.stream, "position_m", "covariance_m2", PLANE, setup.sigma_fix_m)
+            skipped[at_run, at_frame, vehicle] = read.missing[row]
+            used = ~read.missing[row]
+            at_run, at_frame, row = at_run[used], at_frame[used], row[used]
+            fixes[at_run, at_frame, vehicle] = read.value[row]
+            noise[at_run, at_frame, vehicle] = read.covariance[row]
 
     def scans(prefix: str) -> tuple[Floats, Booleans]:
         there = np.zeros(shape, bool)
@@ -246,11 +265,12 @@ def frames_of(setup: Setup, block: Block) -> Frames:
         rank = np.arange(len(key)) - np.searchsorted(key, key)
         padded = np.full((*shape, int(rank.max(initial=-1)) + 1, 2), np.nan)
         if len(row):
-            padded[at_run, at_frame, rank] = block.streams[f"{prefix}/detection"]["position_m"][row]
+            seen = block.streams[f"{prefix}/detection"].stream
+            padded[at_run, at_frame, rank] = read_vectors(seen, "position_m", PLANE)[row]
         return padded, there
 
-    matrices = noise.reshape(*shape, vehicles, 2, 2)
-    return Frames(counts, time_ns, fixes, matrices, *scans("/network"), *scans("/infrastructure"))
+    scanned = (*scans("/network"), *scans("/infrastructure"))
+    return Frames(counts, time_ns, fixes, noise, *scanned, skipped)
 
 
 def _advance(
@@ -351,14 +371,20 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
         yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
     failed = np.flatnonzero(failing)
     last = np.maximum(said.sum(axis=1), 1) - 1
-    stream = make_stream(
-        f"/estimates/{setup.name}/failure",
-        schemas.FAILURE,
-        frames.time_ns[failed, last[failed]],
-        metadata={"reasons": FAILED},
-        reason=np.zeros(len(failed), np.int64),
-    )
+    failures = [Failure(int(frames.time_ns[run, last[run]]), FAILED) for run in failed]
+    stream = failure_stream(f"/estimates/{setup.name}/failure", failures)
     yield Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))
+    if setup.fixes == "known":
+        at_run, at_frame, which = np.nonzero(frames.skipped)
+        mend = "its fixes lack a covariance; give --set sigma_fix_m=..."
+        stream = reason_stream(
+            f"/estimates/{setup.name}/skipped",
+            schemas.SKIPPED,
+            frames.time_ns[at_run, at_frame],
+            which,
+            [f"topic /vehicle{number}/fix: {mend}" for number in setup.numbers],
+        )
+        yield Ragged(stream, np.searchsorted(at_run, np.arange(runs + 1)))
 
 
 VEHICLES = Estimator(

@@ -73,6 +73,7 @@ class Setup(NamedTuple):
     motion: Motion
     network: Scanning
     infrastructure: Scanning
+    sigma_fix_m: float | None
 
     @property
     def has_pose(self) -> bool:

@@ -1,8 +1,8 @@
 """Functions written out for one size: tuples, derivatives and differences without loops.
 
 A model is component-first: its functions take and return tuples. numba cannot build a tuple in a loop,
-and constants fold only where they stand in the text (tech: constant seeds make jets three times as fast).
-So the few pieces between arrays and tuples are written as text for the sizes and kinds at hand. Their
+and constants fold only where they stand in the text: constant seeds make jets three times as fast. So
+the few pieces between arrays and tuples are written as text for the sizes and kinds at hand. Their
 source stays available, so that `replay.compile` bundles them as it does any other function.
 
 Kinds and tangent space as in `replay.tangent`: a quaternion q (Hamilton, w x y z) plus a rotation vector
@@ -51,7 +51,7 @@ def tangent_size(kinds: Sequence[str]) -> int:
 
 
 def things(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
-    """Every number, angle, axis and quaternion: kind, first component, first tangent one, tangent size."""
+    """Every number, angle, axis and quaternion: kind, first component and tangent one, tangent size."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
         kind = kinds[component]
@@ -122,7 +122,7 @@ def retraction(kinds: tuple[str, ...]) -> Function:
 
 @lru_cache(maxsize=64)
 def differencing(kinds: tuple[str, ...]) -> Function:
-    """`subtract(a, b, d, k)`: fills column k of d (t, ...) with the tangent vector from b to a, both (n,)."""
+    """`subtract(a, b, d, k)`: column k of d (t, ...) becomes the vector from b to a, both (n,)."""
     lines = ["def subtract(a, b, d, k):"]
     for kind, c, t, _ in things(kinds):
         if kind == "linear":
@@ -158,7 +158,7 @@ def resetting(kinds: tuple[str, ...]) -> Function:
     """`reset(d, rows)`: multiplies the rows (t, m) of every rotation by its right Jacobian at d (t,).
 
     Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
-    Jr(d) = I - (1 - cos t)/t^2 [d]x + (t - sin t)/t^3 [d]x^2, t = |d|. Markley 2003; Mueller et al. 2017.
+    Jr(d) = I - (1 - cos t)/t^2 [d]x + (t - sin t)/t^3 [d]x^2, t = |d|. Markley 2003; Mueller 2017.
     """
     lines = ["def reset(d, rows):"]
     for kind, _, t, _ in things(kinds):
@@ -246,10 +246,12 @@ def derivative(
     slopes = sum(sizes)
     given = [each.entries(sum(sizes[:index]), slopes) for index, each in enumerate(inputs)]
     names = [each.name for each in inputs if not each.zero]
+    found = "".join(f"y{row}, " for row in range(len(outputs)))
     lines = [
         f"def linearise({', '.join([*names, *rest, 'work'])}):",
-        f"    found = function({', '.join([*given, *rest])})",
-        *(f"    work.{values}[{row}] = value_of(found[{row}])" for row in range(len(outputs))),
+        # unpacked first: numba takes seven times as long to compile slopes of a tuple's entries
+        f"    {found} = function({', '.join([*given, *rest])})",
+        *(f"    work.{values}[{row}] = value_of(y{row})" for row in range(len(outputs))),
     ]
     places = [
         (f"work.{each.into}", column, sum(sizes[:index]) + column)
@@ -258,16 +260,16 @@ def derivative(
     ]
     for kind, c, t, _ in things(outputs):
         for matrix, column, slope in places:
-            slope_at = [f"slope_of(found[{c + index}], {slope})" for index in range(WIDTHS[kind])]
+            slope_at = [f"slope_of(y{c + index}, {slope})" for index in range(WIDTHS[kind])]
             if kind in ("linear", "angle"):
                 lines.append(f"    {matrix}[{t}, {column}] = {slope_at[0]}")
             elif kind == "axis":
                 lines.append(
-                    f"    {matrix}[{t}, {column}] = value_of(found[{c}]) * {slope_at[1]} - "
-                    f"value_of(found[{c + 1}]) * {slope_at[0]}"
+                    f"    {matrix}[{t}, {column}] = value_of(y{c}) * {slope_at[1]} - "
+                    f"value_of(y{c + 1}) * {slope_at[0]}"
                 )
             else:
-                point = [f"value_of(found[{c + index}])" for index in range(4)]
+                point = [f"value_of(y{c + index})" for index in range(4)]
                 lines += [f"    point = {_listed(point)}", f"    slopes = {_listed(slope_at)}"]
                 lines += [
                     f"    {matrix}[{t + row - 1}, {column}] = "

@@ -18,7 +18,6 @@ from replay.inference.generate import is_flat, resetting, retraction, tuple_of
 from replay.inference.model import Model
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
 from replay.inference.steps import (
-    ALL_WELL,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Note,
@@ -37,6 +36,7 @@ from replay.inference.steps import (
     state_numbers,
     workspace,
 )
+from replay.results import ALL_WELL
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 
@@ -222,7 +222,7 @@ def _analytic(stage: Stage) -> Steps:
 
 
 def _exact_motion(stage: Stage) -> Function:
-    from replay.inference.steps import motion_noise  # noqa: PLC0415
+    from replay.inference.steps import motion_noise
 
     model, motion = stage.model, stage.motion
     moments, add_noise = motion.moments, motion_noise(model, motion)
@@ -247,7 +247,7 @@ def _exact_motion(stage: Stage) -> Function:
 
 
 def _exact_sensor(stage: Stage, number: int) -> Function:
-    from replay.inference.gaussian import wrap  # noqa: PLC0415
+    from replay.inference.gaussian import wrap
 
     sensor = stage.sensors[number]
     moments, read_about = sensor.moments, reading(sensor).about

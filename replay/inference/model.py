@@ -16,18 +16,19 @@ from pydantic import Field
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream
 from recorders.parameters import Parameters
+from replay.components import Components
 from replay.inference.generate import tangent_size
-from replay.tangent import Kind, are_kinds
+from replay.tangent import are_kinds
 
 Function = Callable[..., Any]
 Floats = NDArray[np.float64]
-Components = Mapping[str, Kind]
 
 
 class ModelParameters(Parameters):
     """Base of a model's parameters: numbers, which are run-time values of the compiled filter.
 
-    A parameter that is None is what the channel of the control or sensor states that uses it.
+    A parameter that is None is what the channels of the log state: a sensor's own first, then those of
+    control, prior and the other sensors.
     """
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -38,15 +39,27 @@ class ModelParameters(Parameters):
 class Map:
     """What measurements are about, by number: the fixed points of a topic of the log.
 
-    A measurement whose field `of` names no point of the map says nothing of the state.
+    Attributes:
+        topic: the map's.
+        schema: of its messages.
+        number: the field that numbers them.
+        point: the vector field of the point.
+        components: of the point, by name.
+        of: the measurement's field that says which point; where it names none, the measurement says
+            nothing of the state.
     """
 
     topic: str
     schema: Schema
     number: str
     point: str
-    size: int
+    components: Components
     of: str = "target_id"
+
+    @property
+    def size(self) -> int:
+        """How many components a point has."""
+        return len(self.components)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +75,6 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
-        stated: parameters that its channel may state.
     """
 
     topic: str
@@ -72,7 +84,6 @@ class Control:
     interpolated: bool = False
     initial: tuple[float, ...] = ()
     estimates: bool = False
-    stated: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,15 +124,17 @@ class Sensor:
         measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
             empty. With `noises`, (state, noise, about, parameters).
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
-            with `noises`, the variances of these. Not needed where `covariance` gives the noise.
-        covariance: the field of the message that holds the covariance of what is measured.
+            with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
+            has neither is passed over, and counted.
+        vector: the field that holds what is measured as a vector, by the names of its components; else
+            every component is a field of its own.
+        covariance: the field that holds the vector's covariance.
         about: what the message is about.
-        read: stream -> (n, measured), NaN where a component is missing; the fields named as the measured
-            components unless given. A pseudo-measurement is one that is computed here.
+        read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
+            message: a pseudo-measurement.
         linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
             moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
             measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
-        stated: parameters that its channel may state.
         log_likelihood: (state, measured, about, parameters) -> log p(measured | state), for methods that
             can use it.
     """
@@ -132,13 +145,13 @@ class Sensor:
     measure: Function
     noise: Function | None = None
     noises: int = 0
+    vector: str = ""
     covariance: str = ""
     about: Map | None = None
     read: Callable[[Stream], Floats] | None = None
     linear: bool = False
     jacobian: Function | None = None
     moments: Function | None = None
-    stated: tuple[str, ...] = ()
     log_likelihood: Function | None = None
 
 
@@ -198,16 +211,16 @@ def check_state(where: str, model: Model) -> None:
     """Raise BadInput where a state's kinds are none."""
     if not are_kinds(model.kinds):
         raise BadInput(
-            f"{where}: a state of kinds {', '.join(model.kinds)}; known are linear, angle, axis (two side "
-            "by side) and quaternion (four side by side)"
+            f"{where}: a state of kinds {', '.join(model.kinds)}; known are linear, angle, axis (two "
+            "side by side) and quaternion (four side by side)"
         )
 
 
 def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> None:
     """Call a motion's functions once, uncompiled.
 
-    `parameters` has a number for every parameter. Raises BadInput where a function fails, or returns what
-    the model denies.
+    `parameters` has a number for every parameter. Raises BadInput where a function fails, or
+    returns what the model denies.
     """
     state, control = _origin(model.kinds), (0.0,) * model.controls
     sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
@@ -234,11 +247,15 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     state, about = _origin(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(f"{where}: measure", sensor.measure, (state, *entering, about, parameters), (size,))
-    if sensor.noise is not None:
+    if sensor.noise is None and (sensor.noises or not sensor.covariance):
+        raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
+    if sensor.covariance and not sensor.vector:
+        raise BadInput(
+            f"{where}: the covariance {sensor.covariance} is of no vector; give `vector`, a field"
+        )
+    if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
         _check(f"{where}: noise", sensor.noise, (parameters,), wanted)
-    elif sensor.noises or not sensor.covariance:
-        raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
 
 
 def _origin(kinds: tuple[str, ...]) -> tuple[float, ...]:
@@ -258,6 +275,8 @@ def _check(what: str, function: Function, arguments: tuple[Any, ...], sizes: tup
             raise BadInput(f"{what}: {type(error).__name__}: {error}") from error
     wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
     if not isinstance(found, tuple):
-        raise BadInput(f"{what}: returns a {type(found).__name__}; return a tuple of {wanted} components")
+        raise BadInput(
+            f"{what}: returns a {type(found).__name__}; return a tuple of {wanted} components"
+        )
     if len(found) not in sizes:
         raise BadInput(f"{what}: returns {len(found)} components; {wanted} are needed")

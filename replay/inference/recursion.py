@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from replay.inference.generate import function_of
 from replay.inference.steps import (
-    ALL_WELL,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -21,6 +20,7 @@ from replay.inference.steps import (
     Stage,
     Steps,
 )
+from replay.results import ALL_WELL
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -68,7 +68,7 @@ class Carried(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The estimates as the recursion fills them in: run r has room from offsets[r] on, up to `end[r]`."""
+    """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
     event: Integers
@@ -89,7 +89,7 @@ class Innovations(NamedTuple):
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     """The loop over the events of one run, for `replay.compile.compile_over_runs`.
 
-    `settings_of(settings, row)` makes the parameters of a row: 0 is the motion's, the others the sensors'.
+    `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
     """
     predict, estimate = steps.predict, steps.estimate
     update = choosing(steps.updates)
@@ -103,8 +103,13 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             carried.control[run, k] = data[first + k]
 
     def advance(
-        run: int, event: int, duration_s: float, happenings: Happenings, settings: Floats,
-        carried: Carried, memory: Any,
+        run: int,
+        event: int,
+        duration_s: float,
+        happenings: Happenings,
+        settings: Floats,
+        carried: Carried,
+        memory: Any,
     ) -> bool:
         """Predict to an event."""
         control = carried.control[run]
@@ -136,7 +141,9 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             drive(run, data, carried)
         if source >= 0 and duration_s >= 0.0:
             row = innovations.end[run]
-            note = Note(innovations.difference[row], innovations.covariance[row], innovations.numbers[row])
+            note = Note(
+                innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
+            )
             parameters = settings_of(settings, source + 1)
             told = update(
                 source, run, carried.belief, data, parameters, gates[source], event, memory, note
@@ -163,10 +170,12 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            failure = take_in(
-                run, event, happenings, settings[run], gates, carried, innovations, memory
-            )
-            if failure == ALL_WELL and happenings.is_due[event] and happenings.time_ns[event] >= start_ns:
+            failure = take_in(run, event, happenings, settings[run], gates, carried, innovations, memory)
+            if (
+                failure == ALL_WELL
+                and happenings.is_due[event]
+                and happenings.time_ns[event] >= start_ns
+            ):
                 row = estimates.end[run]
                 mean, covariance = estimates.mean[row], estimates.covariance[row]
                 estimate(run, carried.belief, mean, covariance)

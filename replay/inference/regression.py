@@ -253,7 +253,8 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)
     read_about, m = reading(sensor).about, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
-    variances_of = sensor.noise if sensor.noises else _no_sensor_variances
+    entering = sensor.noise if sensor.noises else None
+    variances_of = entering or _no_sensor_variances
     add_noise = _no_sensor_noise if sensor.noises else sensor_noise(sensor)
 
     def innovate(

@@ -1,8 +1,8 @@
 """The steps of a recursive Gaussian filter, made for one model: what a method puts together.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
-`linear_sensor`), by samples (`replay.inference.regression`), or by moments that the model knows. All work
-in one workspace, and the Kalman update after them is the same (`kalman_update`).
+`linear_sensor`), by samples (`replay.inference.regression`), or by moments that the model knows. All
+work in one workspace, and the Kalman update after them is the same (`kalman_update`).
 """
 
 from collections.abc import Callable
@@ -36,6 +36,7 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
+from replay.results import ALL_WELL
 
 Floats = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -45,7 +46,7 @@ FAILURES = (
     "the estimate is no longer finite",
 )
 NOT_POSITIVE_DEFINITE, NOT_FINITE = 0, 1  # indices of FAILURES
-ALL_WELL, NOTHING_MEASURED, NOT_STARTED = -1, -2, -3
+NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 
 class Stage(NamedTuple):
@@ -68,8 +69,8 @@ class Steps(NamedTuple):
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well; moves
-            the belief in place. `use` numbers the sets of randomised samples.
+        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well;
+            moves the belief in place. `use` numbers the sets of randomised samples.
         updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
             ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, mean, covariance) fills the estimate.
@@ -323,9 +324,7 @@ def reading(sensor: Sensor) -> Reading:
     """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
     m, about = len(sensor.measured), sensor.about.size if sensor.about else 0
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
-    return Reading(
-        m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about)
-    )
+    return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
 
 
 def sensor_noise(sensor: Sensor) -> Function:
@@ -429,7 +428,9 @@ def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:
     for sensor in sensors:
         for name, kind in sensor.measured.items():
             if slots.setdefault(name, kind) != kind:
-                raise BadInput(f"sensor {sensor.topic}: {name} is {kind} here and {slots[name]} elsewhere")
+                raise BadInput(
+                    f"sensor {sensor.topic}: {name} is {kind} here and {slots[name]} elsewhere"
+                )
     return slots
 
 
@@ -450,7 +451,7 @@ def noting(stage: Stage, number: int) -> Function:
 
 
 def correcting(model: Model) -> Function:
-    """`move(mean, covariance, work)`: the state by `work.step`, and the covariance to where it then is."""
+    """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it."""
     add = retraction(model.kinds)
     if is_flat(model.kinds):
 
@@ -474,7 +475,11 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     Missing components are left out of v, S and C; the log-likelihood is that of the components present,
     and zero where the gate is shut. `gate` (m + 1,) bounds the NIS by the number of components.
     """
-    m, tell, correct = len(stage.sensors[number].measured), noting(stage, number), correcting(stage.model)
+    m, tell, correct = (
+        len(stage.sensors[number].measured),
+        noting(stage, number),
+        correcting(stage.model),
+    )
 
     def update(
         mean: Floats,

@@ -7,12 +7,14 @@ that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
 from replay.evaluation import Errors, split_topic
 from replay.sources import Source
@@ -93,10 +95,25 @@ class Scene:
         return [self.read(topic) for topic in self._truths if _prefix(topic) == case]
 
     def topics_near(self, case: str) -> list[str]:
-        """The run's sensor topics below a case, and those that are below none."""
+        """The run's sensor topics below a case, and those that are below none; see `unread`."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
-        return [topic for topic in self.source.topics if not topic.startswith(elsewhere)]
+        return [
+            topic
+            for topic in self.source.topics
+            if not topic.startswith(elsewhere) and topic not in self.unread
+        ]
+
+    @cached_property
+    def unread(self) -> dict[str, str]:
+        """The run's topics whose messages are no columns, such as images, and why."""
+        found: dict[str, str] = {}
+        for topic in self.source.topics:
+            try:
+                self.source.empty(topic)
+            except BadInput as error:
+                found[topic] = str(error)
+        return found
 
     def read(self, topic: str) -> Stream:
         """One of the run's topics, whole."""

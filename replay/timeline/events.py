@@ -8,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
+from replay.failures import sentences_of
 from replay.timeline.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
 
 NOT_SENSED = frozenset(
@@ -34,11 +35,16 @@ class Happened(NamedTuple):
 def draw_events(canvas: Canvas, scene: Scene, case: str) -> rrb.TextLogView:
     """The events of a case: one entity per estimator and sensor."""
     root = entity_path("events", case)
-    for who, level, time_ns, texts in (*_of_estimators(scene, case), *_of_sensors(scene, case)):
+    unread = Happened("log", "INFO", np.full(len(scene.unread), canvas.epoch_ns), _not_drawn(scene))
+    for who, level, time_ns, texts in (unread, *_of_estimators(scene, case), *_of_sensors(scene, case)):
         lines = [f"{who}: {text}" for text in texts]
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
     return events_view(root)
+
+
+def _not_drawn(scene: Scene) -> list[str]:
+    return [f"{topic} is not drawn: {reason}" for topic, reason in scene.unread.items()]
 
 
 def events_view(root: str) -> rrb.TextLogView:
@@ -63,11 +69,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         ]
         yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
-        reasons = stream.metadata.get("reasons", "").split("; ")
-        texts = [
-            f"failed: {reasons[reason] if reason < len(reasons) else reason}"
-            for reason in stream["reason"].tolist()
-        ]
+        texts = [f"failed: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.RELATIVE_BEARING):
         pairs = zip(stream["first_id"].tolist(), stream["second_id"].tolist(), strict=True)

@@ -56,7 +56,12 @@ def turn_up(canvas: Canvas) -> None:
 
 
 def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
-    """Fixed points (n, 2) with their numbers; close ones share a label, below the lowest of them."""
+    """Fixed points (n, 2) with their numbers; close ones share a label, below the lowest of them.
+
+    A point that single precision, which viewers draw in, puts at infinity is nowhere to be drawn.
+    """
+    is_somewhere = (np.abs(places) <= np.finfo(np.float32).max).all(axis=1)
+    numbers, places = numbers[is_somewhere], places[is_somewhere]
     if len(places) == 0:
         return
     texts = np.array([str(number) for number in numbers.tolist()])

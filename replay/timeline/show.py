@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, printable
 from recorders.registry import available, load
 from replay.blocks import Ragged, gather
 from replay.evaluation import Errors
@@ -53,7 +53,7 @@ def show(
     timeline: Timeline = load("timelines", scenario) if scenario in available("timelines") else GENERIC
     application = f"fuselog-{scenario}" if scenario else "fuselog"
     with open_recording(application, _identity(scene), save=save, connect=connect) as recording:
-        recording.send_recording_name(source.name)
+        recording.send_recording_name(printable(source.name))
         layout = timeline.draw(_canvas(scene, recording), scene)
         recording.send_blueprint(
             rrb.Blueprint(
@@ -77,7 +77,7 @@ def _errors_of_run(errors: Errors, run: int) -> Errors:
 
 
 def _canvas(scene: Scene, recording: rr.RecordingStream) -> Canvas:
-    epoch_ns = scene.source.run.epoch_ns if scene.source.run else 0
+    epoch_ns = scene.source.epoch_ns
     none = np.empty(0, np.int64)
     steps_ns = np.unique(
         np.concatenate([none, *(each.publish_time_ns for each in scene.outputs.values())])

@@ -4,14 +4,16 @@ A file appears under its name only when it is whole. A live receiver is asked be
 because Rerun itself waits many seconds for one that is not there, and forever for one that is silent.
 """
 
+import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import rerun as rr
 
+from recorders.atomic import whole_file
 from recorders.errors import BadInput
 
 # The first bytes of an HTTP/2 client: its preface and empty settings. A server answers with its own.
@@ -30,36 +32,40 @@ def open_recording(
     Args:
         application_id: what the viewer keeps one layout for.
         recording_id: recordings of one id are one recording to a viewer.
-        save: the .rrd file to write; `SAVE.part` until it is whole.
+        save: the .rrd file to write, in a folder that exists.
         connect: a receiver, `rerun+http://HOST:PORT/proxy`.
 
     Raises BadInput where neither is given, the file cannot be written, or the receiver is not there or
     goes away; then no file is left.
     """
+    if save is None and connect is None:
+        raise BadInput("a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both")
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if connect is not None:
         _require_receiver(connect)
         sinks.append(rr.GrpcSink(connect))
-    part = None
-    if save is not None:
-        part = save.with_name(save.name + ".part")
-        _require_writable(part)
-        sinks.append(rr.FileSink(part))
-    if not sinks:
-        raise BadInput("a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both")
-    recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
-    try:
+    with ExitStack() as stack:
+        if save is not None:
+            new = stack.enter_context(whole_file(save, parents=False))
+            sinks.append(rr.FileSink(new))
+        recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+        stack.callback(recording.disconnect)
         recording.set_sinks(*sinks)
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         yield recording
         _finish(recording, save, connect)
-        if part is not None and save is not None:
-            part.replace(save)
-    finally:
-        recording.disconnect()
-        if part is not None:
-            part.unlink(missing_ok=True)
+
+
+def rerun_path(path: Path) -> str:
+    """A file's name where Rerun takes it as UTF-8, whatever the locale is.
+
+    Raises BadInput where the name is not UTF-8.
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise BadInput(f"{path}: Rerun opens only files whose names are UTF-8; rename it") from None
 
 
 def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:
@@ -74,15 +80,6 @@ def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | Non
         raise BadInput(f"--connect {connect}: the receiver went away; start it again") from failure
     if failure is not None:
         raise BadInput(f"{save or connect}: the timeline could not be written ({failure})") from failure
-
-
-def _require_writable(part: Path) -> None:
-    try:
-        part.touch()
-    except OSError as error:
-        raise BadInput(
-            f"{part}: cannot be written ({error.strerror}); --save a file in a folder that exists"
-        ) from None
 
 
 def _require_receiver(url: str) -> None:

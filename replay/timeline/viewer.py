@@ -1,32 +1,35 @@
 """Rerun's viewer, which rerun-sdk brings along: a picture without a screen, and the desktop window.
 
-It runs as a process group of its own, listens on the loopback interface only, reports no usage and
-reaches no network.
+It listens on the loopback interface only, reports no usage, reaches no network, and ends with the
+process that started it, however that ends.
 """
 
 import os
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from shutil import move
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from rerun.experimental import ViewerClient
 
+from recorders.atomic import scratch_folder, whole_file
 from recorders.errors import BadInput
+from replay.timeline.sinks import rerun_path
 
 PACKAGES = "mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri libxkbcommon-x11-0"
-# `python -m rerun_cli` loses the exit code
-RERUN = (sys.executable, "-c", "import sys, rerun_cli.__main__ as cli; sys.exit(cli.main())")
+RERUN = (sys.executable, "-m", "replay.timeline.keeper")
+# What a picture says of who made it, in the PNG keyword `Software`.
+SOFTWARE = "fuselog"
 _START_S = 20.0
 _LOAD_S = 60.0
 _END_S = 5.0
+_SAID = "rerun.log"
 # The viewer's own messages lie on top of the first three or four pictures, however long that takes.
 _PICTURES = 7
 
@@ -57,18 +60,20 @@ def screenshot(
     _require_timeline(rrd)
     if not png.parent.is_dir():
         raise BadInput(f"{png}: its folder does not exist; create it first")
-    with TemporaryDirectory(prefix="fuselog-viewer-") as name:
-        folder = Path(name)
+    with scratch_folder("fuselog-viewer") as folder, whole_file(png, parents=False) as new:
         window = f"{size[0]}x{size[1]}"
         with listen(folder, "--headless", "--hide-welcome-screen", "--window-size", window) as listener:
             client = ViewerClient.connect(listener.url)
             _load(client, rrd)
             _set_cursor(client, rrd, at_s)
-            picture = str(folder / "picture.png")
+            picture = folder / "picture.png"
             for _ in range(_PICTURES):
-                client.save_screenshot(picture)
+                client.save_screenshot(rerun_path(picture))
             views = client.get_state().views
-        move(picture, png)
+        said = PngInfo()
+        said.add_text("Software", SOFTWARE)
+        with Image.open(picture) as image:
+            image.save(new, pnginfo=said)
     return [f"{view.name}: {report}" for view in views for report in view.reports]
 
 
@@ -80,12 +85,12 @@ def view(rrd: Path) -> None:
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise BadInput("there is no screen to show a timeline on; use --screenshot FILE.png")
-    with TemporaryDirectory(prefix="fuselog-viewer-") as name:
-        command = [*RERUN, str(rrd), "--port", str(_free_port()), "--bind", "127.0.0.1"]
-        environment = _private_environment(Path(name))
-        done = subprocess.run(command, env=environment, stderr=subprocess.PIPE, text=True, check=False)
-    if done.returncode != 0:
-        raise _why_ended(done.stderr)
+    options = [str(rrd), "--port", str(_free_port()), "--bind", "127.0.0.1"]
+    with scratch_folder("fuselog-viewer") as folder:
+        with _running(folder, options, _private_environment(folder)) as process:
+            process.wait()
+        if process.returncode != 0:
+            raise _why_ended(folder)
 
 
 @contextmanager
@@ -95,27 +100,39 @@ def listen(folder: Path, *options: str) -> Iterator[Listener]:
     Raises BadInput where it does not come up, or ends while it is still needed.
     """
     port = _free_port()
-    log = folder / "rerun.log"
-    with log.open("wb") as output:
+    address = ["--port", str(port), "--bind", "127.0.0.1"]
+    environment = _private_environment(folder) | {"HOME": str(folder)}
+    with _running(folder, [*options, *address], environment) as process:
+        try:
+            _await_port(process, port)
+            yield Listener(f"rerun+http://127.0.0.1:{port}/proxy", process)
+        except BadInput:
+            raise
+        except Exception as error:
+            if _ended(process):
+                raise _why_ended(folder) from error
+            raise
+
+
+@contextmanager
+def _running(
+    folder: Path, options: Sequence[str], environment: Mapping[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `rerun OPTIONS`, which says what it has to say in a file of the folder."""
+    with (folder / _SAID).open("wb") as said:
         process = subprocess.Popen(
-            [*RERUN, *options, "--port", str(port), "--bind", "127.0.0.1"],
-            env=_private_environment(folder) | {"HOME": str(folder)},
-            stdout=output,
-            stderr=output,
-            start_new_session=True,
+            [*RERUN, *options],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,  # an interrupt from the terminal is ours to handle
         )
+    assert process.stdin is not None
     try:
-        _await_port(process, port)
-        yield Listener(f"rerun+http://127.0.0.1:{port}/proxy", process)
-    except BadInput:
-        raise
-    except Exception as error:
-        if _ended(process):
-            raise _why_ended(log.read_text()) from error
-        raise
+        yield process
     finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGTERM)
+        process.stdin.close()  # which ends it
         process.wait()
 
 
@@ -126,8 +143,10 @@ def _private_environment(folder: Path) -> dict[str, str]:
         environment[f"XDG_{kind}_HOME"] = str(folder / kind.lower())
     for kind in ("HTTP", "HTTPS", "ALL"):
         environment[f"{kind}_PROXY"] = "http://127.0.0.1:9"
-    command = [*RERUN, "analytics", "disable"]
-    subprocess.run(command, env=environment, capture_output=True, check=True)
+    with _running(folder, ["analytics", "disable"], environment) as process:
+        process.wait()
+    if process.returncode != 0:
+        raise _why_ended(folder)
     return environment
 
 
@@ -160,7 +179,8 @@ def _ended(process: subprocess.Popen[bytes]) -> bool:
     return process.poll() is not None
 
 
-def _why_ended(log: str) -> BadInput:
+def _why_ended(folder: Path) -> BadInput:
+    log = (folder / _SAID).read_text(encoding="utf-8", errors="replace")
     if "render context" in log or "graphics adapter" in log:
         return BadInput(
             f"the viewer found no Vulkan driver; on Debian and Ubuntu: apt-get install {PACKAGES}"
@@ -180,7 +200,7 @@ def _require_timeline(rrd: Path) -> None:
 
 
 def _load(client: ViewerClient, rrd: Path) -> None:
-    client.open(str(rrd.resolve()))
+    client.open(rerun_path(rrd.resolve()))
     end = time.monotonic() + _LOAD_S
     while client.get_state().loading and time.monotonic() < end:
         time.sleep(0.1)

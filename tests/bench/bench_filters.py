@@ -7,8 +7,6 @@ Needs the extra `bench`. Run it with `make bench`, or `python -m tests.bench fil
 """
 
 import math
-import statistics
-import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from functools import partial
@@ -30,8 +28,8 @@ from stonesoup.updater.kalman import UnscentedKalmanUpdater
 from recorders.recording import record_run
 from replay.engine import bind, collect, replay
 from replay.sources import MemorySource, memory_source
+from tests.bench.timing import cpu_seconds
 
-REPEATS = 3
 TOLERANCE = 1e-6
 SIGMAS = np.array([0.1, 0.02])
 DENSITIES = np.array([0.02, 0.01])
@@ -72,7 +70,7 @@ def main() -> list[Row]:
             if name.endswith(f" {kind}"):
                 apart = np.max(np.abs(results[name] - results[kind]))
                 assert apart < TOLERANCE, f"{name} and ours are {apart} apart"
-    rate = {name: len(messages) / taken for name, taken in seconds(ways).items()}
+    rate = {name: len(messages) / taken for name, taken in cpu_seconds(ways).items()}
     rows = [
         row("UKF, one log; FilterPy", rate["ukf"], rate["filterpy ukf"]),
         row("UKF, one log; Stone Soup", rate["ukf"], rate["stonesoup ukf"]),
@@ -81,7 +79,7 @@ def main() -> list[Row]:
     for runs, duration_s in ((100, 60.0), (1000, 20.0)):
         logs = [record(duration_s, run) for run in range(runs)]
         count = sum(len(log.streams[topic]) for log in logs for topic in ODOMETRY_AND_SIGHTINGS)
-        taken = seconds({kind: partial(ours, kind, logs) for kind in ("ukf", "ekf")})
+        taken = cpu_seconds({kind: partial(ours, kind, logs) for kind in ("ukf", "ekf")})
         for kind in ("ukf", "ekf"):
             name = f"{kind.upper()}, {runs} runs together; FilterPy, one"
             rows.append(row(name, count / taken[kind], rate[f"filterpy {kind}"]))
@@ -90,22 +88,6 @@ def main() -> list[Row]:
 
 def row(name: str, ours: float, theirs: float) -> Row:
     return Row(name, ours, theirs, ours / theirs)
-
-
-def seconds(ways: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """The median CPU time of each way, of all cores together; a busy machine stretches it little.
-
-    The ways take turns of half a second and more, so that a busy spell meets all of them.
-    """
-    taken: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(REPEATS):
-        for name, way in ways.items():
-            calls, begin = 0, time.process_time()
-            while time.process_time() < begin + 0.5:
-                way()
-                calls += 1
-            taken[name].append((time.process_time() - begin) / calls)
-    return {name: statistics.median(each) for name, each in taken.items()}
 
 
 ODOMETRY_AND_SIGHTINGS = ("/robot1/odometry", "/robot1/range_bearing")

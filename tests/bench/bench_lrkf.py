@@ -6,13 +6,9 @@ same linear update in NumPy. Stone Soup takes no samples of one's own. All estim
 the extra `bench`, and a C compiler. Run it with `make bench`, or `python -m tests.bench lrkf`.
 """
 
-import ctypes
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
 from datetime import datetime, timedelta
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,34 +29,13 @@ from pipeline.ensemble import record_ensemble
 from recorders.models.reactor import react
 from replay.engine import bind, collect, replay
 from replay.sampling import Samples, parse_sampling
+from tests.bench.reference.reactor import compiled_c
 
 STEP_S, PROCESS, PRESSURE = 0.1, 1e-5, 0.1
 H = np.array([[1.0, 1.0]])
 MEAN, COVARIANCE = np.array([0.5, 3.5]), 10 * np.eye(2)
 STEPS = 2000
 TOLERANCE = 1e-6
-SOURCE = """
-#include <math.h>
-void filter(int steps, const double *z, int count, const double *s, const double *w, double *out) {
-  double m[2] = {.5, 3.5}, P[4] = {10, 0, 0, 10}, v[count][2];
-  for (int k = 0; k < steps; k++) {
-    double a = sqrt(P[0]), b = P[2] / a, c = sqrt(P[3] - b * b), mm[2] = {0, 0};
-    for (int i = 0; i < count; i++) {
-      double x = m[0] + a * s[2 * i], y = m[1] + b * s[2 * i] + c * s[2 * i + 1], r = .1 * x * x;
-      v[i][0] = x - .32 * r; v[i][1] = y + .16 * r;
-      for (int j = 0; j < 2; j++) mm[j] += w[i] * v[i][j];
-    }
-    P[0] = P[3] = 1e-5; P[1] = 0;
-    for (int i = 0; i < count; i++) {
-      double d = v[i][0] - mm[0], e = v[i][1] - mm[1];
-      P[0] += w[i] * d * d; P[1] += w[i] * d * e; P[3] += w[i] * e * e;
-    }
-    double g = P[0] + P[1], h = P[1] + P[3], S = g + h + .1, n = z[k] - mm[0] - mm[1];
-    m[0] = out[2 * k] = mm[0] + g / S * n; m[1] = out[2 * k + 1] = mm[1] + h / S * n;
-    P[0] -= g * g / S; P[1] -= g * h / S; P[2] = P[1]; P[3] -= h * h / S;
-  }
-}
-"""
 
 
 def main() -> list[tuple[str, str, str, str]]:
@@ -71,7 +46,7 @@ def main() -> list[tuple[str, str, str, str]]:
     rows = []
     for name in ("ukf", "s2kf-50"):
         samples = parse_sampling(name).at(2).draw(np.random.default_rng(), ())
-        peers = {"FilterPy": filterpy, "PyRecEst": pyrecest, "C, gcc -O3": compiled_c()}
+        peers = {"FilterPy": filterpy, "PyRecEst": pyrecest, "C, gcc -O3": c}
         if name == "ukf":
             peers["Stone Soup"] = stonesoup
         mine, wanted = timed(lambda name=name: ours(name, [log]), STEPS)
@@ -179,25 +154,9 @@ def stonesoup(read: np.ndarray, _: Samples) -> np.ndarray:
     return np.array(found)
 
 
-def compiled_c() -> Callable[[np.ndarray, Samples], np.ndarray]:
+def c(read: np.ndarray, samples: Samples) -> np.ndarray:
     """A loop written for this one system, as fast as a C compiler makes it."""
-    with tempfile.TemporaryDirectory() as folder:
-        source, library = Path(folder) / "filter.c", Path(folder) / "filter.so"
-        source.write_text(SOURCE)
-        command = ["cc", "-O3", "-march=native", "-shared", "-fPIC", str(source), "-o", str(library)]
-        subprocess.run([*command, "-lm"], check=True)
-        function = ctypes.CDLL(str(library)).filter
-    array = np.ctypeslib.ndpointer(np.float64, flags="C")
-    function.argtypes = [ctypes.c_int, array, ctypes.c_int, array, array, array]
-
-    def run(read: np.ndarray, samples: Samples) -> np.ndarray:
-        out = np.empty((len(read), 2))
-        function(
-            len(read), np.ascontiguousarray(read), len(samples.weights), *map(np.array, samples), out
-        )
-        return out
-
-    return run
+    return compiled_c()(read, *map(np.array, samples), np.array([0, len(read)]))
 
 
 if __name__ == "__main__":

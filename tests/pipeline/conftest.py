@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -35,11 +36,11 @@ class Said(NamedTuple):
         return json.loads(self.out)
 
 
-def run_here(*arguments: str) -> Said:
+def run_here(*arguments: str | Path) -> Said:
     """The command line in this process: quick, and no warning goes unseen."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
-        code = main(arguments)
+        code = main([str(each) for each in arguments])
     return Said(code, out.getvalue(), err.getvalue())
 
 
@@ -55,9 +56,14 @@ def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
 
     def start(*arguments: str, **options: Any) -> subprocess.Popen[str]:
         command = [str(Path(sys.executable).with_name("fuselog")), *arguments]
-        return subprocess.Popen(
-            command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-        )
+        # a child inherits that Ctrl-C is ignored, as of `nohup` or a script's background job
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            return subprocess.Popen(
+                command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+            )
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     return start
 
@@ -190,6 +196,8 @@ def _write_experiments() -> None:
         "misfit": 'title = "t"\n[record]\nscenario = "landmarks"\n[record.parameters]\n'
         "range_bearing = { rate_hz = 0.0 }\n[estimators.ekf]",
         "scenario": "[parameters]\nduration_s = 1",
+        "deep": "title = " + "[" * 100_000,
+        "digits": "title = " + "1" * 5000,
     }.items():
         Path(f"{name}.toml").write_text(text)
 

@@ -2,10 +2,15 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
+
+from recorders.log import open_log, read_streams, write_log
+from recorders.recording import record_run
 
 REPLAY_EKF = "replay {} -e ekf"
 
@@ -85,6 +90,9 @@ TABLE: dict[str, tuple[str, ...]] = {
     "run los-two-sensors --set options.scenarios=[]": ("options of study los", "the paper's 5"),
     "run lcd-sampling --set options.sizes=[]": ("options of study lcd-sampling", "'sizes'"),
     "run garbled.toml": ("garbled.toml", "TOML"),
+    "run deep.toml": ("deep.toml", "nested more than 50 levels deep"),
+    "record deep.toml": ("deep.toml", "nested more than 50 levels deep"),
+    "run digits.toml": ("digits.toml", "whole number of more than 4300 digits"),
     "run untitled.toml": ("untitled.toml", "'title' is missing"),
     "run unknown.toml": ("unknown.toml", "did you mean 'runs'"),
     "run both.toml": ("both.toml", "either [record] or [import]"),
@@ -245,3 +253,47 @@ def test_a_tracebacks_place_is_shown_on_request(
     monkeypatch.setitem(os.environ, "FUSELOG_TRACEBACK", "1")
     with pytest.raises(Exception, match="No such file"):
         fuselog("info", str(world / "zzz.mcap"))
+
+
+@pytest.mark.parametrize("name", ["$\\foo$", "$\\frac{1}$", "a$b"])
+def test_a_name_with_dollar_signs_is_drawn_as_it_is(
+    name: str, fuselog: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Matplotlib takes what stands between two of them for a formula, which this is none of."""
+    monkeypatch.chdir(tmp_path)
+    recording, run = record_run("landmarks", {"duration_s": 2.0}, 0)
+    streams = [replace(each, topic=each.topic.replace("robot1", name)) for each in recording.streams]
+    write_log("odd.mcap", streams, run)
+    assert fuselog("replay", "odd.mcap", "-e", "ekf").code == 0
+    said = fuselog("evaluate", "odd.estimates.mcap", "--out", "result")
+    assert said.code == 0, said.err
+    assert Path("result/figures").exists()
+    assert fuselog("view", "odd.estimates.mcap", "--save", "odd.rrd").code == 0
+
+
+@pytest.mark.parametrize("name", ["\0", "robot\x1b[31m"])
+def test_a_topic_that_cannot_be_printed_is_refused(
+    name: str, world: Path, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Other writers take any name: it reaches no figure, no file name and no terminal."""
+    monkeypatch.chdir(tmp_path)
+    log = open_log(world / "log.estimates.mcap")
+    with Path("odd.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, stream in read_streams(log, list(log.topics)).items():
+            schema = stream.schema
+            schema_id = writer.register_schema(schema.full_name, "protobuf", schema.descriptor_set)
+            odd = topic.replace("robot1", name)
+            channel = writer.register_channel(odd, "protobuf", schema_id, dict(stream.metadata))
+            for row, time_ns in enumerate(stream.publish_time_ns.tolist()):
+                values = {key: column[row].tolist() for key, column in stream.columns.items()}
+                message = schema.message_class(**values).SerializeToString()
+                writer.add_message(channel, time_ns, message, time_ns)
+        writer.finish()
+    for command in ("evaluate odd.mcap --log LOG --out result", "view odd.mcap --save odd.rrd"):
+        said = fuselog(*command.replace("LOG", str(world / "log.mcap")).split())
+        assert said.code == 2
+        assert said.err.count("\n") == 1
+        assert "its name holds what cannot be printed" in said.err
+        assert name not in said.err

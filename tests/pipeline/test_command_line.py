@@ -1,23 +1,26 @@
 """The command line end to end: record, look, replay, judge, run, report; and what may interrupt it."""
 
-import fcntl
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from recorders.log import open_log, read_streams
+from pipeline.results import result_folder
+from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 
 Fuselog = Callable[..., Any]
+PLACE = {"components": "y_m,x_m", "kinds": "linear,linear"}
 
 
 @pytest.fixture
@@ -131,6 +134,26 @@ def test_a_span_is_replayed_and_judged_alone(world: Path, fuselog: Fuselog) -> N
 
 
 @pytest.mark.usefixtures("here")
+def test_what_the_truth_lacks_is_said_once_and_the_rest_is_judged(world: Path, fuselog: Fuselog) -> None:
+    """A truth without heading: position and its NEES of two components, for every estimator."""
+    log = open_log(world / "log.mcap")
+    streams = read_streams(log, list(log.topics))
+    truth = streams["/robot1/truth"]
+    streams["/robot1/truth"] = replace(
+        truth, columns={**truth.columns, "state": truth["state"][:, 1::-1]}, metadata=PLACE
+    )
+    write_log("log.mcap", list(streams.values()), log.run)
+    said = fuselog("replay", "log.mcap", "-e", "ekf", "-e", "ukf", "--save", "log.rrd", "--json")
+    assert said.code == 0
+    for name in ("ekf", "ukf"):
+        assert said.err.count(f"{name} robot1: heading_rad is not judged: /robot1/truth lacks it") == 1
+        assert said.json["metrics"][f"{name}.heading_rmse_rad.robot1"] is None
+        assert said.json["metrics"][f"{name}.position_rmse_m.robot1"] < 0.1
+        assert 0.2 < said.json["metrics"][f"{name}.nees.robot1"] < 6
+    assert Path("log.rrd").exists()
+
+
+@pytest.mark.usefixtures("here")
 def test_estimates_beside_a_log_and_in_a_folder_find_it_again(world: Path, fuselog: Fuselog) -> None:
     """The log is named relative to its estimates, so that both can be moved together."""
     Path("a").mkdir()
@@ -238,10 +261,10 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(
     assert list(here.iterdir()) == []
 
 
-def _stop_when(part: Path, process: Any, number: int) -> str:
+def _stop_when(pattern: str, process: Any, number: int) -> str:
     """Send a signal once a process has begun to write; what it says on standard error."""
     deadline = time.monotonic() + 60
-    while not part.exists():
+    while not list(Path().glob(pattern)):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -249,18 +272,28 @@ def _stop_when(part: Path, process: Any, number: int) -> str:
     return str(process.communicate()[1])
 
 
+@pytest.fixture
+def parent_that_ignores_interrupts() -> Iterator[None]:
+    """What runs the tests may do so."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("parent_that_ignores_interrupts")
 def test_a_stopped_run_leaves_nothing_and_a_killed_one_a_part(
     here: Path, start_fuselog: Callable[..., Any], fuselog: Fuselog
 ) -> None:
     """What is in the place is whole; what a killed process left is cleared by the next."""
     long = ["run", "landmarks", "--runs", "500", "--out", "r"]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = start_fuselog(*long)
+        assert _stop_when(".r.*.part/new", process, number).strip() == "fuselog: stopped"
+        assert process.returncode == 128 + number
+        assert list(here.iterdir()) == []
     process = start_fuselog(*long)
-    assert _stop_when(here / "r.part", process, signal.SIGINT).strip() == "fuselog: stopped"
-    assert process.returncode == 130
-    assert list(here.iterdir()) == []
-    process = start_fuselog(*long)
-    _stop_when(here / "r.part", process, signal.SIGKILL)
-    assert [path.name for path in here.iterdir()] == ["r.part"]
+    _stop_when(".r.*.part/new", process, signal.SIGKILL)
+    assert [path.name[:3] for path in here.iterdir()] == [".r."]
     assert fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r").code == 0
     assert [path.name for path in here.iterdir()] == ["r"]
 
@@ -270,7 +303,7 @@ def test_a_stopped_recording_or_replay_leaves_nothing(
     command: str, here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object) -> None:
-        assert (here / "new.mcap.part").exists()
+        assert list(here.glob(".new.mcap.*.part/new.mcap"))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("recorders.log.LogWriter.write", stop)
@@ -280,14 +313,68 @@ def test_a_stopped_recording_or_replay_leaves_nothing(
     assert list(here.iterdir()) == []
 
 
-def test_two_runs_into_one_folder_do_not_mix(here: Path, fuselog: Fuselog) -> None:
-    part = here / "r.part"
-    part.mkdir()
-    (part / "theirs").touch()
-    handle = os.open(part, os.O_RDONLY)
-    fcntl.flock(handle, fcntl.LOCK_EX)
-    said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
-    os.close(handle)
+@pytest.mark.usefixtures("here")
+def test_two_runs_into_one_folder_do_not_mix(fuselog: Fuselog) -> None:
+    with result_folder(Path("r")) as theirs:
+        said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
+        assert said.code == 2
+        assert "another fuselog is writing it" in said.err
+        assert theirs.exists()
+
+
+@pytest.mark.usefixtures("here")
+def test_what_is_in_a_log_never_steers_the_terminal(fuselog: Fuselog) -> None:
+    """A topic, a note, a name with escape sequences: they are shown, not obeyed."""
+    evil = "\x1b]0;gone\x07\x1b[2J\u202e\x9b31m"
+    stream = make_stream(
+        f"/{evil}/odometry",
+        schemas.ODOMETRY,
+        [0],
+        forward_mps=[1.0],
+        turn_radps=[0.0],
+        metadata={evil: evil},
+    )
+    write_log("log.mcap", [stream], RunMetadata(evil, {evil: evil}, notes={evil: evil}))
+    for command in (
+        "info log.mcap",
+        "replay log.mcap -e ekf",
+        "record --again log.mcap",
+        "view log.mcap",
+    ):
+        said = fuselog(*command.split())
+        for text in (said.out, said.err):
+            assert text.replace("\n", "").isprintable()
+    assert r"\x1b[2J\u202e" in fuselog("info", "log.mcap").out
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("experiment", ["landmarks", "torus-propagation"])
+def test_runs_without_end_say_what_they_would_take(experiment: str, fuselog: Fuselog) -> None:
+    said = fuselog("run", experiment, "--runs", str(10**12))
     assert said.code == 2
-    assert "another fuselog is writing it" in said.err
-    assert (part / "theirs").exists()
+    assert re.search(r"1000000000000 runs of .* take at least .* GB of memory", said.err)
+    assert list(Path().iterdir()) == []
+
+
+@pytest.mark.usefixtures("here")
+def test_names_beyond_the_locale(world: Path, start_fuselog: Callable[..., Any]) -> None:
+    """In the C locale, a name that is not ASCII reaches Python, Rerun and Arrow in three ways."""
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    log = str(world / "log.mcap")
+    for command in (
+        ["run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "ä"],
+        ["view", log, "--save", "ü.rrd"],
+        ["view", log, "--save", "ü.rrd"],
+    ):
+        process = start_fuselog(*command, env=plain)
+        assert process.communicate()[1] == ""
+        assert process.returncode == 0
+    assert {path.name for path in Path().iterdir()} == {"ä", "ü.rrd"}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full to write to")
+def test_a_full_standard_output_is_said(world: Path, start_fuselog: Callable[..., Any]) -> None:
+    with Path("/dev/full").open("w") as full:
+        process = start_fuselog("info", str(world / "log.mcap"), stdout=full)
+    assert process.communicate()[1] == "fuselog: standard output: No space left on device\n"
+    assert process.returncode == 2

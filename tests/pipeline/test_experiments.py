@@ -13,11 +13,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.ensemble import hash_streams, record_ensemble
+from pipeline.ensemble import hash_streams, judge, record_ensemble
 from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
 from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
-from recorders.log import open_log
+from recorders.log import RunMetadata, make_stream, open_log, schemas
+from recorders.recording import Recording
+from replay.blocks import gather
+from replay.sources import memory_source
 
 Fuselog = Callable[..., Any]
 RUN = ["run", "landmarks", "--set", "duration_s=2", "--runs", "3", "--seed", "5"]
@@ -56,7 +60,10 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     assert "NaN" not in text
     assert "Infinity" not in text
     values = json.loads(text)
-    assert list(values) == ["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims"]
+    assert list(values) == [
+        *["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
+    ]
+    assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"
     assert values["settings"]["seed"] == 5
     assert values["settings"]["record"]["parameters"] == {"duration_s": 2}
@@ -76,8 +83,16 @@ def test_a_run_twice_gives_the_same_bytes(result: Path, fuselog: Fuselog) -> Non
     with chdir(result.parent):
         assert fuselog(*RUN, "--logs", "3", "--out", "second").code == 0
     first, again = _contents(result), _contents(second)
+    said, said_again = (json.loads(each.pop("result.json")) for each in (first, again))
+    assert said.pop("files").items() - said_again.pop("files").items() == {_own_entry(result)}
+    assert said == said_again
     assert {name: again[name] for name in first} == first
     assert len(again) == len(first) + 2
+
+
+def _own_entry(result: Path) -> tuple[str, str]:
+    """What result.json says of itself: of another list of files, another number."""
+    return "result.json", json.loads((result / "result.json").read_text())["files"]["result.json"]
 
 
 def test_the_first_runs_log_is_recorded_again_from_the_seed(result: Path, fuselog: Fuselog) -> None:
@@ -104,7 +119,8 @@ def test_the_report_is_one_page_with_all_numbers(result: Path, tmp_path: Path, f
     text = page.read_text()
     loaded = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?(?!#|data:)([^"\'>)]+)', text)
     assert loaded == []
-    assert text.count("<svg") == 2
+    assert text.count('<img src="data:image/svg+xml;base64,') == 2
+    assert "<svg" not in text
     assert text.count("position_rmse_m") >= 2
     assert "seed 5" in text
 
@@ -162,6 +178,53 @@ def _fail_half_way(folder: Path) -> None:
     with result_folder(folder) as part:
         (part / "half").touch()
         raise ZeroDivisionError
+
+
+def test_no_two_topics_share_a_figure_and_none_runs_in_the_page(
+    tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """What is in an SVG file, and what a topic is called, stays an image and a name."""
+    names = ["a/b", "a-b", "a%2Fb", "../a", "\0$\\frac"]
+    outcome = Outcome(figures={name: matplotlib.figure.Figure(figsize=(1, 1)) for name in names})
+    with result_folder(tmp_path / "r") as part:
+        write_outcome(part, "test", {"title": ""}, outcome)
+    files = list((tmp_path / "r/figures").iterdir())
+    assert len(files) == len(names)
+    files[0].write_text('<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)"><script/></svg>')
+    assert fuselog("report", str(tmp_path / "r"), "-o", str(tmp_path / "page.html")).code == 0
+    text = (tmp_path / "page.html").read_text()
+    assert text.count("<img src=") == len(names)
+    assert "onload" not in text
+    assert "<script" not in text
+
+
+def test_topics_that_look_like_formulas_are_drawn(tmp_path: Path) -> None:
+    """A dollar sign starts no formula, and two cases that differ by a sign have two figures."""
+    time_ns = np.arange(3)
+    state = {"state": np.zeros((3, 2))}
+    pose = {"components": "x_m,y_m", "kinds": "linear,linear"}
+    cases = ["a$\\foo$/b", "a$\\foo$-b"]
+    truths = [
+        make_stream(f"/{case}/truth", schemas.TRUTH_STATE, time_ns, metadata=pose, **state)
+        for case in cases
+    ]
+    estimates = [
+        make_stream(
+            f"/estimates/e/{case}/pose",
+            schemas.GAUSSIAN_ESTIMATE,
+            time_ns,
+            metadata={**pose, "truth": f"/{case}/truth"},
+            mean=np.zeros((3, 2)),
+            covariance=np.tile(np.eye(2).ravel(), (3, 1)),
+        )
+        for case in cases
+    ]
+    source = memory_source(Recording(truths), RunMetadata("test", epoch_ns=0))
+    outputs = {stream.topic: gather([stream]) for stream in estimates}
+    outcome = summarise(judge([source], outputs, 1.0))
+    with result_folder(tmp_path / "r") as part:
+        write_outcome(part, "test", {"title": ""}, outcome)
+    assert len(list((tmp_path / "r/figures").iterdir())) == 2
 
 
 def test_real_data_run_as_an_experiment(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:

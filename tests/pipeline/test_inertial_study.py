@@ -43,4 +43,7 @@ def test_an_estimator_without_estimates_is_told():
     )
     source = memory_source(Recording([samples]), RunMetadata("broad"))
     replayed = replay_ensemble([source], {"bingham-inertial": {}}, gap_limit_s=1)
-    assert replayed.failures == [f"{source.name}: bingham-inertial trial gave no estimates"]
+    at_s = f"{SIMULATION_EPOCH_NS * 1e-9:.3f} s"
+    assert replayed.failures == [
+        f"{source.name}: bingham-inertial trial failed at {at_s}: it gave no estimate"
+    ]

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, open_log, read_streams, write_log
 from recorders.models.geodesy import into_tangent_plane, out_of_tangent_plane
 from recorders.recording import Recording, import_run
 
@@ -60,6 +60,24 @@ def test_a_small_table_row_by_row(tmp_path: Path):
         "(MMSI 235070762), kept",
         "gaps": "1 over 600 s, the longest 1800 s",
     }
+
+
+def test_equal_stamps_stay_in_the_order_of_the_file(tmp_path: Path):
+    """Receivers stamp by the second: who was heard first stays first, in every stream and in the log."""
+    vessels = [1 + place * 7 % 100 for place in range(100)]
+    rows = [
+        f"2016-01-12 13:02:{place // 25:02},{mmsi},50.77,-1.09,90,10"
+        for place, mmsi in enumerate(vessels)
+    ]
+    # one vessel twice within a second: both are kept, and no gap or leap is counted between them
+    rows.append("2016-01-12 13:02:03,1,50.77001,-1.09,90,10")
+    recording, streams = imported(table(tmp_path, rows))
+    assert streams["/identity"]["thing_id"].tolist() == [*vessels, 1]
+    assert set(recording.notes) == {"vessels"}
+    write_log(tmp_path / "ais.mcap", recording.streams)
+    read = read_streams(open_log(tmp_path / "ais.mcap"), ["/identity", "/reports"])
+    assert read["/identity"]["thing_id"].tolist() == [*vessels, 1]
+    assert_array_equal(read["/reports"]["position_m"], streams["/reports"]["position_m"])
 
 
 def test_the_plane_is_where_the_earth_is():

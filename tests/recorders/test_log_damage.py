@@ -1,10 +1,14 @@
 """A damaged log is refused with one sentence, or read exactly as far as it is whole; never wrongly."""
 
+import re
 import struct
+import tracemalloc
 from collections import Counter
 from io import BytesIO
 
+import lz4.frame
 import pytest
+import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
@@ -12,7 +16,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, open_log, read_streams, schemas
+from recorders.log import LogWriter, RunMetadata, open_log, read_streams, schemas, write_log
 from tests.recorders.log_samples import assert_same, some_streams
 
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
@@ -214,6 +218,17 @@ def test_what_does_not_fit_together_is_told_without_a_checksum(tmp_path):
         assert sum(map(len, found.values())) == 0
 
 
+def test_a_chunk_that_states_less_than_it_holds_is_told(tmp_path):
+    """Bytes behind its data would be read, or left out, in silence."""
+    path = tmp_path / "run.mcap"
+    raw = without_checksums(path)
+    place = raw.index(b"\x06", 40) + 41  # the length of the chunk's data
+    (length,) = struct.unpack_from("<Q", raw, place)
+    struct.pack_into("<Q", raw, place, length - 1)
+    path.write_bytes(raw)
+    assert "its length is wrong" in refusal(path, everything)
+
+
 def test_a_number_that_means_two_channels_is_told(tmp_path):
     """Two logs in one file, say; without a summary nothing else would tell."""
     path = tmp_path / "run.mcap"
@@ -236,3 +251,184 @@ def test_a_tail_of_zeros_is_lost_and_counted(tmp_path):
     assert "it was cut off: its last 5000 bytes hold no whole record; 2 whole chunks are" in refusal(
         path
     )
+
+
+def with_chunk(path, size: int, packed: bytes, compression: bytes = b"lz4") -> None:
+    """A log of one chunk that states its uncompressed size as `size`, without a summary."""
+    head = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
+    body = head + struct.pack("<Q", len(packed)) + packed
+    end = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0)
+    magic = b"\x89MCAP0\r\n"
+    path.write_bytes(magic + struct.pack("<BQ", 6, len(body)) + body + end + magic)
+
+
+@pytest.mark.parametrize("compression", [b"lz4", b"zstd"])
+def test_a_chunk_gets_no_more_memory_than_it_states(tmp_path, compression):
+    """Half a megabyte of either unpacks to a hundred."""
+    pack = {b"lz4": lz4.frame.compress, b"zstd": zstandard.compress}[compression]
+    with_chunk(tmp_path / "bomb.mcap", 1000, pack(bytes(100 << 20)), compression)
+    tracemalloc.start()
+    try:
+        assert "its size is wrong" in refusal(tmp_path / "bomb.mcap")
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compression", [b"lz4", b"zstd", b""])
+def test_a_chunk_that_states_more_than_its_bytes_can_be_is_not_given_the_memory(tmp_path, compression):
+    pack = {
+        b"lz4": lz4.frame.compress,
+        b"zstd": zstandard.ZstdCompressor(write_content_size=False).compress,
+    }
+    for size in (1 << 30, 1 << 62):
+        with_chunk(tmp_path / "giant.mcap", size, pack.get(compression, bytes)(b"abc"), compression)
+        tracemalloc.start()
+        try:
+            assert "its size is wrong" in refusal(tmp_path / "giant.mcap")
+            assert tracemalloc.get_traced_memory()[1] < 4 << 20
+        finally:
+            tracemalloc.stop()
+
+
+def test_a_chunk_that_does_not_fit_into_memory_is_told_as_such(tmp_path, monkeypatch):
+    """A lack of memory is no damage of the file, and its exception says nothing of itself."""
+    path = tmp_path / "run.mcap"
+    with_chunk(path, 3, lz4.frame.compress(b"abc"))
+
+    def lack(_):
+        raise MemoryError
+
+    monkeypatch.setattr("recorders.log.chunks.scan", lack)
+    assert "the chunk at byte 8 does not fit into memory: it states 3 bytes" in refusal(path)
+    assert "does not fit into memory" in open_log(path, recover=True).loss_statement
+
+
+@pytest.mark.parametrize("second", ["the same", "another", "without a summary", "cut off", "text"])
+@pytest.mark.parametrize("first", ["ours", "without a summary"])
+def test_what_is_joined_to_a_log_is_refused_or_named(tmp_path, first, second):
+    """`cat a b > c` reads as a alone, which is said; none of b is taken for a part of a."""
+    ours = written(tmp_path, "zstd").read_bytes()
+    with_chunk(tmp_path / "bare.mcap", 0, b"", b"")
+    bare = (tmp_path / "bare.mcap").read_bytes()
+    end, begin = (ours.index(b"\x0f" + struct.pack("<Q", 4)) + 13, len(ours) - 37)
+    unindexed = ours[:end] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + ours[-8:]
+    assert begin > end
+    write_log(tmp_path / "another.mcap", some_streams(9))
+    one = ours if first == "ours" else unindexed
+    two = {
+        "the same": one,
+        "another": (tmp_path / "another.mcap").read_bytes(),
+        "without a summary": bare,
+        "cut off": ours[: len(ours) // 2],
+        "text": b"any other bytes",
+    }[second]
+    path = tmp_path / "joined.mcap"
+    path.write_bytes(one)
+    honest = everything(path)[2]
+    path.write_bytes(one + two)
+    left_out = f"it ends at byte {len(one)}, and the {len(two)} bytes behind that"
+    assert left_out in refusal(path)
+    log, _, found = everything(path, recover=True)
+    assert left_out in log.loss_statement
+    for topic, stream in found.items():
+        assert_same(stream, honest[topic])
+
+
+def test_bytes_between_data_and_summary_are_not_left_out_in_silence(tmp_path):
+    """A chunk behind the end of the data is in no index, and no walk through the data meets it."""
+    raw = bytearray(written(tmp_path, "zstd").read_bytes())
+    (start,) = struct.unpack_from("<Q", raw, len(raw) - 28)
+    body = raw[start : len(raw) - 37]
+    footer = struct.pack("<BQQQI", 2, 20, start + 50, 0, 0)
+    path = tmp_path / "gap.mcap"
+    path.write_bytes(raw[:start] + struct.pack("<BQ", 6, 41) + bytes(41) + body + footer + raw[-8:])
+    assert f"its data end at byte {start} and its summary begins at byte {start + 50}" in refusal(path)
+    assert "is left out" in open_log(path, recover=True).loss_statement
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_messages_of_a_channel_that_nothing_declares_are_counted(tmp_path, summary):
+    """They are of no topic; a reader that goes by topics does not see them."""
+    path = tmp_path / "run.mcap"
+    raw = without_checksums(path)
+    last = raw.rindex(struct.pack("<QQ", 3, 3)) - 6
+    struct.pack_into("<H", raw, last, 7)
+    if not summary:
+        end = raw.index(b"\x0f" + struct.pack("<Q", 4)) + 13
+        raw = raw[:end] + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + raw[-8:]
+    path.write_bytes(raw)
+    assert "channel 7" in refusal(path, everything)
+    log, _, found = everything(path, recover=True)
+    assert "1 messages of channel 7, which it does not declare, are left out" in log.loss_statement
+    assert ("1 of 3 of /scan: " in log.loss_statement) == summary
+    assert found["/scan"]["scan_id"].tolist() == [1, 2]
+
+
+def test_recover_goes_on_behind_a_broken_head_and_names_what_it_left_out(whole):
+    """A whole summary says where the next chunk is: the damage of one head costs one chunk, no more."""
+    raw, honest, path = whole
+    ends = messages_by_chunk(raw)
+    entries = make_reader(BytesIO(raw)).get_summary().chunk_indexes
+    before = Counter()
+    for entry, (_, counts) in zip(entries, ends, strict=True):
+        own, before = counts - before, counts
+        for byte in (0, 1, 3, 8):
+            damaged = bytearray(raw)
+            damaged[entry.chunk_start_offset + byte] ^= 0x81
+            path.write_bytes(damaged)
+            refusal(path, everything)
+            log, run, found = everything(path, recover=True)
+            assert run == RUN
+            for topic, count in own.items():
+                assert len(found[topic]) == len(honest[topic]) - count
+                assert f"{count} of {len(honest[topic])} of {topic}" in log.loss_statement
+            for topic, stream in found.items():
+                kept = [
+                    row
+                    for row, stamp in enumerate(honest[topic].log_time_ns)
+                    if stamp in stream.log_time_ns
+                ]
+                assert_same(stream, honest[topic], kept)
+
+
+def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
+    """Behind a broken head nothing can be found then; `info` and `replay` print the sentence."""
+    path = written(tmp_path, "zstd")
+    raw = bytearray(path.read_bytes())
+    second = make_reader(BytesIO(raw)).get_summary().chunk_indexes[1].chunk_start_offset
+    raw[second + 8] ^= 0x80
+    raw[-8:] = bytes(8)
+    path.write_bytes(raw)
+    statement = open_log(path, recover=True).loss_statement
+    assert statement.endswith(f"its last {len(raw) - second} bytes hold no whole record")
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"parameters": "[1]"}, "parameters is [1], expected an object"),
+        ({"parameters": "[" * 100_000}, "it is nested more than 50 levels deep"),
+        ({"parameters": '{"a":' * 60 + "1" + "}" * 60}, "it is nested more than 50 levels deep"),
+        ({"parameters": '{"a": 1e999}'}, "it holds 1e999, which is no number of JSON"),
+        ({"parameters": '{"a": NaN}'}, "it holds NaN, which is no number of JSON"),
+        ({"seed": '"x"'}, 'seed is "x", expected a whole number or null'),
+        ({"seed": "true"}, "seed is true, expected a whole number or null"),
+        ({"seed": "-3"}, "seed is negative"),
+        ({"seed": "1" * 5000}, "it holds a whole number of more than 4300 digits"),
+        ({"run": "0.5"}, "run is 0.5, expected a whole number"),
+        ({"epoch_ns": str(2**63)}, "epoch_ns is past the year 2262"),
+        ({"notes": "3"}, "notes is 3, expected an object"),
+        ({"notes": '{"a": 3}'}, "notes are not all texts"),
+        ({"notes": "{"}, "Expecting property name"),
+    ],
+)
+def test_run_metadata_of_wrong_types_are_told(changes, sentence):
+    """They are sealed with a checksum, which says nothing of who wrote them."""
+    record = RUN.to_record()
+    assert RunMetadata.from_record(record, "run.mcap") == RUN
+    with pytest.raises(BadInput, match=re.escape(sentence)):
+        RunMetadata.from_record({**record, **changes}, "run.mcap")
+    del record["notes"]
+    with pytest.raises(BadInput, match="'notes' is missing"):
+        RunMetadata.from_record(record, "run.mcap")

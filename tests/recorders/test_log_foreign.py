@@ -20,7 +20,7 @@ from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log, read_blocks, read_streams, schemas
 from recorders.log.schemas import message_class
 from recorders.log.streams import concatenate
-from tests.recorders.log_samples import assert_same, some_streams
+from tests.recorders.log_samples import assert_same, rows_read, some_streams
 
 FIELD = descriptor_pb2.FieldDescriptorProto
 DOUBLE, FLOAT, SFIXED64, FIXED32 = (
@@ -561,6 +561,16 @@ LIES = [
     forget_a_schema,
 ]
 
+# What is read right without them: no chunk is stepped over that the walk through the file has not seen.
+HARMLESS = [
+    leave_out_a_chunk,
+    state_a_wrong_length,
+    step_over_the_next_chunk,
+    step_out_of_the_file,
+    count_no_messages,
+    forget_a_schema,
+]
+
 
 def assert_reads_as(log, honest, clock: str) -> None:
     """Whole, alone, block by block and second by second, a log gives what the honest one gave."""
@@ -587,8 +597,34 @@ def test_an_index_that_lies_is_found_out(tmp_path, lie, clock):
     assert_reads_as(open_log(path), honest, clock)
     path.write_bytes(with_summary(path.read_bytes(), lie))
     assert_reads_as(open_log(path, recover=True), honest, clock)
-    if lie in (leave_out_a_chunk, state_a_wrong_length, count_no_messages, forget_a_schema):
+    if lie in HARMLESS:
         assert_reads_as(open_log(path), honest, clock)
     else:
         with pytest.raises(BadInput, match="--recover"):
             assert_reads_as(open_log(path), honest, clock)
+
+
+def test_a_chunk_that_an_index_leaves_out_and_steps_over_is_not_lost(tmp_path):
+    """Index and statistics agree that there is none: only a walk through the file can tell."""
+    path = tmp_path / "run.mcap"
+    streams = some_streams(2)
+    with LogWriter(path, chunk_bytes=2500) as log:
+        log.write(streams)
+    raw = path.read_bytes()
+    topics = [stream.topic for stream in streams]
+
+    def lie(summary):
+        step_over_the_next_chunk(summary)
+        left_out = chunk_indexes(summary)[1]
+        leave_out_a_chunk(summary)
+        for channel, offset in left_out.message_index_offsets.items():
+            (entry_bytes,) = struct.unpack_from("<I", raw, offset + 11)
+            statistics(summary).channel_message_counts[channel] -= entry_bytes // 16
+            statistics(summary).message_count -= entry_bytes // 16
+
+    path.write_bytes(with_summary(raw, lie))
+    with pytest.raises(BadInput, match=r"topic /bearing has \d+ messages by the file's statistics"):
+        read_streams(open_log(path), topics)
+    found = read_streams(open_log(path, recover=True), topics)
+    for stream in streams:
+        assert_same(found[stream.topic], stream, rows_read(stream))

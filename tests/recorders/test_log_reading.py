@@ -15,6 +15,7 @@ from recorders.log import (
     open_log,
     read_blocks,
     read_streams,
+    reader,
     schemas,
     write_log,
 )
@@ -142,6 +143,27 @@ def test_memory_is_bounded_by_the_block_and_not_by_the_log(path):
     sizes = [len(block["/a"]) for block in read_blocks(open_log(path), ["/a"], block_messages=200)]
     assert sum(sizes) == count
     assert max(sizes) < 500
+
+
+def test_messages_that_wait_are_not_sorted_again_for_every_chunk(path, monkeypatch):
+    """Where all chunks overlap everything waits for the last: the work must not grow with its square."""
+    zeros = [0] * 400
+    stream = make_stream(
+        "/b", schemas.SCAN, zeros, log_time_ns=range(400), scan_id=zeros, detections=zeros
+    )
+    with LogWriter(path, chunk_bytes=500) as log:
+        log.write([stream])
+    sorted_at_once = []
+
+    def counting(stream, clock):
+        sorted_at_once.append(len(stream))
+        return in_order(stream, clock)
+
+    in_order = reader._in_order
+    monkeypatch.setattr(reader, "_in_order", counting)
+    (block,) = read_blocks(open_log(path), ["/b"], block_messages=1)
+    assert len(block["/b"]) == 400
+    assert sum(sorted_at_once) < 4 * 400
 
 
 def test_threads_work_a_few_items_ahead_and_no_more():

@@ -58,6 +58,15 @@ def test_a_small_set_number_by_number(small: Path):
     assert prior.publish_time_ns[0] == 1248444175 * second + 115_000_000
 
 
+def test_equal_stamps_stay_in_the_order_of_the_file(small: Path):
+    """A look at many landmarks has one stamp; short arrays are sorted stably by accident."""
+    rows = [(1248444176 + place * 7 % 3, place / 8) for place in range(120)]
+    text = "".join(f"{time}.000 72 {range_m} 0\n" for time, range_m in rows)
+    (small / "Robot1_Measurement.dat").write_text(text)
+    seen = imported(small)[1]["/robot1/range_bearing"]
+    assert seen["range_m"].tolist() == [range_m for _, range_m in sorted(rows, key=lambda row: row[0])]
+
+
 @pytest.mark.parametrize("name", sorted(SMALL))
 @pytest.mark.parametrize(
     ("damage", "words"),

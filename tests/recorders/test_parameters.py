@@ -1,5 +1,7 @@
 """Parameters: what is refused is named; settings nest; descriptions tell what is accepted."""
 
+import re
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -9,6 +11,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge, parse_settings
+from recorders.parsing import read_toml
 
 
 class Inner(Parameters):
@@ -101,3 +104,36 @@ def test_the_nearest_name_is_offered_else_all() -> None:
     assert choices("gate", ["gate_probability", "kappa"]) == "did you mean 'gate_probability'?"
     assert choices("zzz", ["ekf", "ukf"]) == "there are: ekf, ukf"
     assert choices("zzz", []) == "there are: none"
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        (
+            "a=" + "[" * 100_000,
+            "--set a: the value cannot be used: it is nested more than 50 levels deep",
+        ),
+        ("a=" + "{b=" * 100_000, "it is nested more than 50 levels deep"),
+        ("a={" + ".".join("b" * 100_000) + "=1}", "it is nested more than 50 levels deep"),
+        (
+            "a=" + "1" * 5000,
+            "--set a: the value cannot be used: it holds a whole number of more than 4300",
+        ),
+        (".".join("a" * 100_000) + "=1", "...: names more than 50 tables, one in another"),
+    ],
+    ids=["brackets", "tables", "dotted key", "digits", "name"],
+)
+def test_settings_that_no_parser_stands_are_told(setting: str, sentence: str) -> None:
+    """Standard parsers run out of stack, memory or digits there."""
+    with pytest.raises(BadInput, match=re.escape(sentence)):
+        parse_settings([setting])
+
+
+def test_a_file_that_no_parser_stands_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "deep.toml"
+    for text in ("a = " + "[" * 100_000, "a = " + "1" * 5000, ".".join("a" * 100_000) + " = 1"):
+        path.write_text(text)
+        with pytest.raises(BadInput, match=r"deep\.toml: is not readable as TOML \(it "):
+            read_toml(path)
+    path.write_text("a = " + "[" * 49 + "]" * 49 + '\nb = "' + "many words. " * 100 + '"')
+    assert read_toml(path)["b"].startswith("many words. ")

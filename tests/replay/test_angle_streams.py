@@ -10,6 +10,7 @@ from replay.engine import bind, collect, replay
 from replay.estimators import optical
 from replay.estimators.optical import Scene
 from replay.evaluation import errors_of
+from replay.failures import sentences_of
 from replay.sources import MemorySource, memory_source
 
 
@@ -24,9 +25,7 @@ def solve(sources: list[MemorySource], name: str, **settings: object) -> dict[st
 
 
 def failures(outputs: dict[str, Ragged], run: int) -> list[str]:
-    stream = outputs["failure"].of_run(run)
-    reasons = stream.metadata["reasons"].split("; ")
-    return [reasons[reason] for reason in stream["reason"]]
+    return sentences_of(outputs["failure"].of_run(run))
 
 
 BIAS = [(1.0, 1.0, 1.0)] * 3

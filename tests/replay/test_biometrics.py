@@ -296,4 +296,5 @@ def test_a_fusion_of_two_runs_is_that_of_each():
     together = replay_ensemble(sources, estimators, gap_limit_s=1).outputs
     for run, source in enumerate(sources):
         for topic, alone in replay_ensemble([source], estimators, gap_limit_s=1).outputs.items():
-            np.testing.assert_array_equal(together[topic].of_run(run)["scores"], alone["scores"])
+            for name, column in alone.stream.columns.items():
+                np.testing.assert_array_equal(together[topic].of_run(run)[name], column)

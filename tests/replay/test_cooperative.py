@@ -36,6 +36,7 @@ def two_robots(seen=SEEN):
                 f"/robot{robot}/prior",
                 schemas.GAUSSIAN_ESTIMATE,
                 [0],
+                metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
                 mean=POSES[robot - 1 : robot],
                 covariance=COVARIANCES[robot - 1].reshape(1, 9),
             ),

@@ -23,6 +23,7 @@ from replay.evaluation import (
     innovations_of,
     step_table,
     truth_at,
+    unjudged,
 )
 from replay.metrics import accuracy, consistency, innovation
 from replay.sources import MemorySource, memory_source
@@ -156,13 +157,16 @@ def test_estimates_without_truth_are_counted_not_judged():
     assert accuracy(errors)["position_rmse_m"] == 1
 
 
-def test_no_truth_at_all_is_no_error_but_a_truth_of_something_else_is():
+def test_without_truth_or_with_that_of_something_else_nothing_is_judged():
     stream = gather([estimates([1], [[0, 0, 0]], np.eye(3))])
     elsewhere = source(replace(truth([1], [[0, 0, 0]]), topic="/other"))
     assert errors_of(stream, [elsewhere]) is None
-    partial = truth([1], [[0, 0, 0]], components="x_m,y_m,z_m")
-    with pytest.raises(BadInput, match=r"has no component heading_rad .* it has x_m, y_m, z_m"):
-        errors_of(stream, [source(partial)])
+    nothing = truth([1], [[0, 0, 0]], components="a,b,heading_deg")
+    assert errors_of(stream, [source(nothing)]) is None
+    assert unjudged(stream, [source(nothing)]) == ("x_m", "y_m", "heading_rad")
+    turned = truth([1], [[0, 0, 0]], kinds="linear,angle,angle")
+    with pytest.raises(BadInput, match="component y_m is stated as angle; it must be linear"):
+        errors_of(stream, [source(turned)])
     nameless = gather([estimates([1], [[0, 0, 0]], np.eye(3), kinds="linear,linear,quaternions")])
     with pytest.raises(BadInput, match="must name components and, for each, a kind"):
         errors_of(nameless, [source(truth([1], [[0, 0, 0]]))])
@@ -170,10 +174,70 @@ def test_no_truth_at_all_is_no_error_but_a_truth_of_something_else_is():
 
 def test_components_are_matched_by_name():
     """The truth may have more components, in another order."""
-    mixed = truth([1], [[9, 3, 1, 2]], components="speed_mps,heading_rad,x_m,y_m")
+    mixed = truth(
+        [1],
+        [[9, 3, 1, 2]],
+        components="speed_mps,heading_rad,x_m,y_m",
+        kinds="linear,angle,linear,linear",
+    )
     errors = errors_of(gather([estimates([1], [[1, 2, 3]], np.eye(3))]), [source(mixed)])
     assert errors is not None
     assert_array_equal(errors.error, [[0, 0, 0]])
+
+
+def test_a_component_without_truth_is_left_out_of_errors_and_nees():
+    """The common ones are judged by their block of the covariance, whatever the others say."""
+    covariance = np.array([[2.0, 0.5, 0.9], [0.5, 3.0, 0.2], [0.9, 0.2, 0.01]])
+    stream = gather([estimates([1], [[2, 9, 1]], covariance)])
+    place = truth([1], [[7, 1]], components="y_m,x_m", kinds="linear,linear")
+    errors = errors_of(stream, [source(place)])
+    assert errors is not None
+    assert errors.components == ("x_m", "y_m")
+    assert errors.unjudged == unjudged(stream, [source(place)]) == ("heading_rad",)
+    assert_array_equal(errors.error, [[1, 2]])
+    assert_array_equal(errors.covariance, [covariance[:2, :2]])
+    expected = np.array([1, 2]) @ np.linalg.inv(covariance[:2, :2]) @ [1, 2]
+    assert_allclose(errors.nees, expected, rtol=1e-12)
+    judged = accuracy(errors)
+    assert np.isnan(judged.pop("heading_rmse_rad"))
+    assert judged == pytest.approx({"position_rmse_m": np.sqrt(5), "estimates_without_truth": 0})
+
+
+def test_of_an_ensemble_only_what_all_truths_have_is_judged():
+    stream = estimates([1], [[2, 9, 1]], np.eye(3))
+    whole = truth([1], [[0, 0, 0]])
+    partial = truth([1], [[7, 1]], components="y_m,x_m", kinds="linear,linear")
+    errors = errors_of(gather([stream, stream]), [source(whole), source(partial)])
+    assert errors is not None
+    assert_array_equal(errors.error, [[2, 9], [1, 2]])
+
+
+def test_an_orientation_is_judged_whole_or_not_at_all():
+    """Three of a quaternion's four components are none; what stands after it keeps its variance."""
+    body = {
+        "components": "q_w,q_x,q_y,q_z,x_m",
+        "kinds": "quaternion,quaternion,quaternion,quaternion,linear",
+    }
+    stream = gather([estimates([1], [[1, 0, 0, 0, 5]], np.diag([1, 2, 3, 4.0]), **body)])
+    partial = truth(
+        [1], [[0, 0, 0, 3]], components="q_x,q_y,q_z,x_m", kinds="linear,linear,linear,linear"
+    )
+    errors = errors_of(stream, [source(partial)])
+    assert errors is not None
+    assert errors.unjudged == ("q_w", "q_x", "q_y", "q_z")
+    assert_array_equal(errors.covariance, [[[4]]])
+    assert_array_equal(errors.nees, [1])
+
+
+def test_an_indefinite_position_block_counts_for_nothing():
+    """Of three estimates one has a covariance of the position that is none: the others are the mean."""
+    good, bad = np.diag([4.0, 1.0, 0.01]), np.array([[1, 2, 0], [2, 1, 0], [0, 0, 0.01]])
+    stream = estimates([1, 2, 3], [[2, 0, 0], [2, 2, 0], [0, 3, 0]], good)
+    stream.columns["covariance"][1] = bad.ravel()
+    errors = errors_of(gather([stream]), [source(truth([1, 2, 3], [[0, 0, 0]] * 3))])
+    assert errors is not None
+    assert consistency(errors)["position_nees"] == pytest.approx((1 + 9) / 2)
+    assert np.isnan(errors.nees[1])
 
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))

@@ -106,13 +106,13 @@ class Linear(NamedTuple):
         def motion(x: Floats, u: Floats, duration: float) -> tuple[float, ...]:
             return tuple(self.transition @ x + duration * self.control @ u)
 
-        def motion_jacobians(x: Floats, u: Floats, duration: float, f: Floats, g: Floats) -> None:  # noqa: ARG001
+        def motion_jacobians(x: Floats, u: Floats, duration: float, f: Floats, g: Floats) -> None:
             f[:], g[:] = self.transition, duration * self.control
 
         def sensor(x: Floats, target: Floats) -> tuple[float, ...]:
             return tuple(self.look @ (x - target))
 
-        def sensor_jacobian(x: Floats, target: Floats, rows: Floats) -> None:  # noqa: ARG001
+        def sensor_jacobian(x: Floats, target: Floats, rows: Floats) -> None:
             rows[:] = self.look
 
         angular = tuple(row == len(self.look) - 1 for row in range(len(self.look)))

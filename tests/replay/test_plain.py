@@ -13,6 +13,7 @@ from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.blocks import Block, Ragged, gather, merge_events
 from replay.engine import Estimator, collect, replay
+from replay.failures import sentences_of
 from replay.plain import (
     Estimates,
     Floats,
@@ -46,7 +47,7 @@ class State(NamedTuple):
 
 
 def start(given: Given[MeanParameters]) -> tuple[tuple[float], State]:
-    _, mean, covariance = given.prior("prior", 1)
+    _, mean, covariance = given.prior("prior")
     settings = (given.stated("heading", "sigma_rad"),)
     return settings, State(mean, 1 / covariance[:, :, 0], np.zeros(len(mean), np.int64))
 
@@ -125,6 +126,7 @@ def make_run(
                 f"{name}/prior",
                 schemas.GAUSSIAN_ESTIMATE,
                 np.zeros(priors, np.int64),
+                metadata={"components": "heading_rad", "kinds": "angle"},
                 mean=np.zeros((priors, 1)),
                 covariance=np.ones((priors, 1)),
             ),
@@ -223,6 +225,6 @@ def test_a_batch_tells_of_its_solutions_and_of_runs_without_one() -> None:
     assert out["/estimates/m/a/solution"]["converged"].tolist() == [1, 1]
     failure = out["/estimates/m/a/failure"]
     assert failure.offsets.tolist() == [0, 0, 1, 1]
-    assert failure.stream.metadata["reasons"] == "no headings"
+    assert sentences_of(failure.stream) == ["no headings"]
     with pytest.raises(BadInput, match="no messages on /a/heading"):
         run(MEAN_OF_ALL, [make_run([])])

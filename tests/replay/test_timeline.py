@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 import warnings
@@ -19,16 +20,17 @@ import rerun as rr
 import rerun.chunk as rc
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
+from recorders.log import make_stream, open_log, schemas
 from recorders.recording import record_run
 from replay.blocks import Ragged, gather
 from replay.engine import bind, collect
 from replay.engine import replay as replayed
 from replay.evaluation import Errors, chi_square_interval, errors_of, gaussian_estimates
-from replay.sources import MemorySource, memory_source
+from replay.sources import LogSource, MemorySource, memory_source
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
@@ -201,7 +203,7 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
         "/estimates/ekf:2/robot1/failure",
         schemas.FAILURE,
         [source.streams["/robot1/truth"].publish_time_ns[9]],
-        metadata={"reasons": "one; another"},
+        metadata={"reasons": '["one; two", "another"]'},
         reason=[1],
     )
     show(
@@ -272,13 +274,73 @@ def test_a_scenario_without_a_timeline_gets_every_component(ensemble: Replayed, 
     unknown = replace(source, run=replace(source.run, scenario="unheard-of"))
     show(unknown, ensemble.outputs, ensemble.errors, save=tmp_path / "generic.rrd")
     found = read(tmp_path / "generic.rrd")
-    assert not [entity for entity in found if entity.startswith("/map")]
+    assert {"/map/robot1/truth/path", "/map/robot1/ekf/pose"} <= found.keys()
     truth = source.streams["/robot1/truth"]["state"]
     drawn = np.ravel(found["/plots/robot1/heading_rad/truth"]["Scalars:scalars"])
     np.testing.assert_allclose(drawn, np.degrees(truth[:, 2]), rtol=1e-12)
     assert {f"/plots/robot1/{plot}/ekf" for plot in ("x_m", "error_x_m", "nees_3", "nis_2")} <= set(
         found
     )
+
+
+def test_a_log_that_no_family_draws_is_drawn_by_schema(tmp_path: Path) -> None:
+    """Fixes and landmarks on the plane, numbers as plots, and what is no numbers among the events."""
+    time_ns = np.arange(5 * 10**9, 6 * 10**9, 10**8)
+    places, pressure = np.stack([np.arange(10.0), np.arange(10.0) ** 2], axis=1), np.ones((10, 2))
+    streams = [
+        make_stream("/landmarks", schemas.LANDMARK, [2 * 10**9], landmark_id=[7], position_m=[[1, 2]]),
+        make_stream(
+            "/gps/fix",
+            schemas.POSITION_FIX,
+            time_ns,
+            position_m=places,
+            covariance_m2=np.full((10, 4), np.nan),
+        ),
+        make_stream(
+            "/beacon", schemas.BEARING, time_ns, target_id=np.ones(10), bearing_rad=np.full(10, np.pi)
+        ),
+        make_stream("/air", schemas.VECTOR_MEASUREMENT, time_ns, value=pressure),
+    ]
+    path = tmp_path / "bare.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        said = writer.register_schema("Said", "jsonschema", b"{}")
+        channel = writer.register_channel("/said", "json", said)
+        writer.add_message(channel, 5 * 10**9, b"{}", 5 * 10**9)
+        for stream in streams:
+            schema = stream.schema
+            number = writer.register_schema(schema.full_name, "protobuf", schema.descriptor_set)
+            channel = writer.register_channel(stream.topic, "protobuf", number)
+            for row, stamp_ns in enumerate(stream.publish_time_ns.tolist()):
+                values = {name: column[row].tolist() for name, column in stream.columns.items()}
+                data = schema.message_class(**values).SerializeToString()
+                writer.add_message(channel, stamp_ns, data, stamp_ns)
+        writer.finish()
+    show(LogSource(open_log(path)), {}, [], save=tmp_path / "bare.rrd")
+    found = read(tmp_path / "bare.rrd")
+    assert found["/map/gps/fix"]["Points2D:positions"] == [[row] for row in places.tolist()]
+    assert found["/plots/beacon/bearing_rad/bearing_rad"]["Scalars:scalars"] == [[180.0]] * 10
+    assert {"/plots/air/value/0", "/plots/air/value/1", "/plots/gps/fix/position_m/1"} <= found.keys()
+    assert found["/plots/air/value/0"]["sim_time"][0] == 3 * 10**9  # since the first stamp, the map's
+    (event,) = found["/events/log"]["TextLog:text"]
+    assert "/said is not drawn" in event[0]
+    assert "/map/landmarks" in read(tmp_path / "bare.rrd", static=True)
+
+
+def test_a_log_with_nothing_to_draw_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "said.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(
+            "/said", "json", writer.register_schema("Said", "jsonschema", b"{}")
+        )
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(BadInput, match=r"nothing to draw: .* it holds /said \(json\)"):
+        show(LogSource(open_log(path)), {}, [], save=tmp_path / "said.rrd")
+    assert not (tmp_path / "said.rrd").exists()
 
 
 def test_a_log_without_estimates_and_one_of_estimates_alone_are_shown(
@@ -426,10 +488,29 @@ def test_the_picture_shows_the_estimators_and_no_view_complains(rrd: Path, tmp_p
 
 
 def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
-    try:
-        with pytest.raises(BadInput, match="--at 99: the run goes from 0 to 20 s"):
-            screenshot(rrd, tmp_path / "a.png", at_s=99.0)
-    except BadInput as error:
-        if "Vulkan driver" in str(error):
-            pytest.skip(str(error))
-        raise
+    with pytest.raises(BadInput) as refused:
+        screenshot(rrd, tmp_path / "a.png", at_s=99.0)
+    if "Vulkan driver" in str(refused.value):
+        pytest.skip(str(refused.value))
+    refused.match("--at 99: the run goes from 0 to 20 s")
+
+
+def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:
+    """Nobody is left to end it: it notices that the pipe from its parent has closed."""
+    program = (
+        "import sys, time; from pathlib import Path; from replay.timeline.viewer import listen\n"
+        "with listen(Path(sys.argv[1]), '--headless') as listener:\n"
+        "    print(listener.url, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        port = int(parent.stdout.readline().rpartition(":")[2].partition("/")[0])
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)):
+                return
+        time.sleep(0.05)
+    raise AssertionError("the viewer still answers")

@@ -1,4 +1,4 @@
-"""The test problem of the reference sheet's section 5: an attitude and a gyro's bias from three sensors."""
+"""The reference sheet's problem of section 5: attitude and a gyro's bias from three sensors."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def product(p: Any, q: Any) -> Any:
 
 
 def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
-    """q exp((g - b) dt): cos and sinc of the half angle as functions that are smooth at zero."""
+    """Q exp((g - b) dt): cos and sinc of the half angle as functions that are smooth at zero."""
     x = 0.5 * duration_s * (control[0] - state[4])
     y = 0.5 * duration_s * (control[1] - state[5])
     z = 0.5 * duration_s * (control[2] - state[6])

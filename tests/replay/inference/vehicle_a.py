@@ -1,4 +1,4 @@
-"""The test problem "model A" of the reference sheet: a vehicle among three beacons, with a speedometer."""
+"""The reference sheet's "model A": a vehicle among three beacons, with a speedometer."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,6 +11,7 @@ from recorders.log.run import RunMetadata
 from recorders.models.planar import range_bearing
 from recorders.recording import Recording
 from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.measurements import PLANE
 from replay.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
@@ -92,7 +93,7 @@ RANGE_BEARING = Sensor(
     {"range_m": "linear", "bearing_rad": "angle"},
     see,
     see_noise,
-    about=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", 2),
+    about=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE),
 )
 SPEED = Sensor(
     "speed",
@@ -114,7 +115,11 @@ def wrap(angle: float) -> float:
 
 def messages() -> Iterator[tuple[float, str, int]]:
     """Stamp, sensor and beacon of every message, in file order."""
-    found = [(round(0.25 * k, 2), 0, "rb", b) for k in range(1, 81) for b in ([0, 1, 2] if k % 4 == 0 else [k % 3])]
+    found = [
+        (round(0.25 * k, 2), 0, "rb", b)
+        for k in range(1, 81)
+        for b in ([0, 1, 2] if k % 4 == 0 else [k % 3])
+    ]
     found += [(round(0.2 * k, 2), 1, "speed", 0) for k in range(1, 101)]
     for time_s, _, sensor, beacon in sorted(found, key=lambda each: (each[0], each[1])):
         yield time_s, sensor, beacon

@@ -1,0 +1,108 @@
+"""Which runs an estimator could not follow to the end, when and why: one place that states and reads it.
+
+A failure is a message whose number stands for a sentence; the channel's metadata lists the sentences as
+JSON. Streams that differ only in their lists are one stream when they are joined.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from textwrap import shorten
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream, make_stream, schemas
+from recorders.log.streams import concatenate
+
+REASONS = "reasons"
+UNSTATED = "no reason given"
+
+
+class Failure(NamedTuple):
+    """When and why a run failed."""
+
+    time_ns: int
+    reason: str
+
+
+def reason_of(error: Exception) -> str:
+    """What an exception says: the sentence itself where it is one of ours."""
+    if isinstance(error, BadInput) and error.__cause__ is None:
+        return str(error)
+    raised = error.__cause__ if isinstance(error, BadInput) else error
+    return shorten(f"{type(raised).__name__}: {raised}", 200)
+
+
+def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
+    """One message for each failure, on `topic`."""
+    reasons = list(dict.fromkeys(failure.reason for failure in failures))
+    return reason_stream(
+        topic,
+        schemas.FAILURE,
+        np.array([failure.time_ns for failure in failures], np.int64),
+        np.array([reasons.index(failure.reason) for failure in failures], np.int64),
+        reasons,
+    )
+
+
+def reason_stream(
+    topic: str,
+    schema: Schema,
+    time_ns: NDArray[np.int64],
+    reason: NDArray[np.int64],
+    reasons: Iterable[str],
+) -> Stream:
+    """Messages (n,) of a schema whose only field, `reason`, counts in a list of sentences."""
+    return make_stream(
+        topic, schema, time_ns, metadata={REASONS: json.dumps(list(reasons))}, reason=reason
+    )
+
+
+def sentences_of(stream: Stream) -> list[str]:
+    """The reason of every message of a stream of `reason_stream`.
+
+    Raises BadInput where the channel's list is not one of sentences in JSON, as in logs before 0.1.0.
+    """
+    reasons = _reasons(stream)
+    return [
+        reasons[number] if number < len(reasons) else UNSTATED for number in stream["reason"].tolist()
+    ]
+
+
+def join_streams(parts: Sequence[Stream]) -> Stream:
+    """Join parts of one topic in the order given; lists of reasons that differ become one.
+
+    Raises BadInput as `concatenate` and `sentences_of` do.
+    """
+    stated = {part.metadata.get(REASONS) for part in parts}
+    if len(stated) == 1:
+        return concatenate(parts)
+    lists = [_reasons(part) for part in parts]
+    merged = list(dict.fromkeys(reason for each in lists for reason in each))
+    told = {REASONS: json.dumps(merged)}
+    return concatenate([_renumbered(part, merged, told) for part in parts])
+
+
+def _renumbered(part: Stream, merged: list[str], told: Mapping[str, str]) -> Stream:
+    """The part with numbers that count in the merged list; what its own list lacks stays beyond it."""
+    places = np.array([*map(merged.index, _reasons(part)), len(merged)])
+    numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
+    columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}
+    return replace(part, columns=columns, metadata={**part.metadata, **told})
+
+
+def _reasons(stream: Stream) -> list[str]:
+    text = stream.metadata.get(REASONS, "[]")
+    try:
+        reasons = json.loads(text)
+    except (ValueError, RecursionError):
+        reasons = None
+    if not isinstance(reasons, list) or not all(isinstance(reason, str) for reason in reasons):
+        raise BadInput(
+            f"topic {stream.topic}: its reasons are no JSON list of sentences; replay the log again "
+            "with this version of fuselog"
+        )
+    return reasons

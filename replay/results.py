@@ -1,0 +1,91 @@
+"""What estimators say, as streams: states, innovations, what was passed over, and who failed."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.planar import wrap_angle
+from replay.blocks import Ragged
+from replay.components import Components
+from replay.failures import reason_stream
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+ALL_WELL = -1  # of a run; what is not negative counts in a list of reasons
+
+
+def named(components: Mapping[str, str]) -> dict[str, str]:
+    """Components and their kinds as a channel states them."""
+    return {"components": ",".join(components), "kinds": ",".join(components.values())}
+
+
+def state_stream(
+    topic: str, time_ns: Integers, components: Components, truth: str, mean: Floats, covariance: Floats
+) -> Stream:
+    """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space."""
+    wrapped = np.array(mean, dtype=float)
+    angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
+    wrapped[:, angular] = wrap_angle(wrapped[:, angular])
+    return make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        time_ns,
+        metadata={**named(components), "truth": truth},
+        mean=wrapped,
+        covariance=_flat(covariance),
+    )
+
+
+def innovation_stream(
+    topic: str,
+    time_ns: Integers,
+    components: Mapping[str, str],
+    truth: str,
+    *,
+    target_id: Any,
+    accepted: Any,
+    innovation: Floats,
+    covariance: Floats,
+    squared: Floats,
+    log_likelihood: Floats | None = None,
+) -> Stream:
+    """Innovations (n, m) with their covariances (n, m, m), NIS (n,) and, where known, log-likelihood."""
+    unknown = np.full(len(time_ns), np.nan)
+    return make_stream(
+        topic,
+        schemas.INNOVATION,
+        time_ns,
+        metadata={**named(components), "truth": truth},
+        target_id=target_id,
+        accepted=accepted,
+        innovation=innovation,
+        covariance=_flat(covariance),
+        normalised_innovation_squared=squared,
+        log_likelihood=unknown if log_likelihood is None else log_likelihood,
+    )
+
+
+def _flat(covariance: Floats) -> Floats:
+    """Matrices (n, m, m) as rows (n, m m)."""
+    return covariance.reshape(len(covariance), covariance.shape[1] * covariance.shape[2])
+
+
+def failures_of(
+    topic: str, before: Integers, after: Integers, time_ns: Integers, reasons: Sequence[str]
+) -> Ragged:
+    """The runs that failed in a block, on `topic`/failure; one message each, at its own time.
+
+    Args:
+        topic: the estimator's, /estimates/NAME and its case.
+        before: ALL_WELL or an index of `reasons` for every run up to the block, (runs,).
+        after: the same with the block.
+        time_ns: when, (runs,).
+        reasons: a sentence for each index.
+    """
+    failed = np.flatnonzero((after >= 0) & (before == ALL_WELL))
+    stream = reason_stream(f"{topic}/failure", schemas.FAILURE, time_ns[failed], after[failed], reasons)
+    return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))

@@ -1,0 +1,25 @@
+"""Runs `rerun ARGUMENTS` for as long as somebody holds the other end of standard input.
+
+A pipe closes with the process that holds it, however that ends, so no viewer outlives its fuselog.
+"""
+
+import os
+import sys
+import threading
+import time
+
+import psutil
+import rerun_cli.__main__ as rerun
+
+
+def _end_with_the_holder() -> None:
+    os.read(0, 1)  # not sys.stdin, which cannot be closed while a thread reads it
+    while True:  # it may be about to start
+        for child in psutil.Process().children(recursive=True):
+            child.terminate()
+        time.sleep(0.1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_the_holder, daemon=True).start()
+    sys.exit(rerun.main())

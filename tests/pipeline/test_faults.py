@@ -1,0 +1,13 @@
+"""A slice of `make faults`: outputs at random places, and commands that are killed."""
+
+import numpy as np
+import pytest
+
+from tests.faults import kills, outputs
+
+
+@pytest.mark.parametrize(("part", "most"), [(outputs, 40), (kills, 4)])
+def test_a_slice_of_the_faults_holds(part, most):
+    tally = part.run(60.0, np.random.default_rng(1), most)
+    assert tally.notes == []
+    assert tally.held == tally.tried > 0

@@ -1,0 +1,210 @@
+"""Files and folders appear whole or not at all, and nothing that somebody else made is touched."""
+
+import errno
+import logging
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from recorders import atomic
+from recorders.atomic import scratch_folder, whole_file, whole_folder
+from recorders.errors import BadInput
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """All files and links below a folder, and what they say."""
+    return {
+        str(path.relative_to(folder)): str(path.readlink()) if path.is_symlink() else path.read_text()
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def refuse(_: Path) -> None:
+    raise BadInput("it stays")
+
+
+def accept(_: Path) -> None:
+    pass
+
+
+def fill(place: Path, check=accept) -> None:
+    with whole_folder(place, check) as new:
+        (new / "a").write_text("new")
+
+
+def test_what_a_user_calls_part_or_old_is_left_alone(tmp_path):
+    """Not emptied, not deleted, not followed where it is a link."""
+    target = tmp_path / "thesis"
+    target.write_text("years")
+    for name in ("r.old", "r.part"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "notes").write_text("mine")
+    (tmp_path / "f.part").symlink_to(target)
+    (tmp_path / "r").mkdir()
+    before = contents(tmp_path)
+    fill(tmp_path / "r")
+    with whole_file(tmp_path / "f") as new:
+        new.write_text("new")
+    assert contents(tmp_path) == {**before, "r/a": "new", "f": "new"}
+
+
+def test_the_last_whole_one_of_two_writers_wins(tmp_path):
+    place = tmp_path / "f"
+    with whole_file(place) as first:
+        with whole_file(place) as second:
+            assert first != second
+            second.write_text("second")
+            first.write_text("first")
+        assert place.read_text() == "second"
+    assert contents(tmp_path) == {"f": "first"}
+    with (
+        pytest.raises(BadInput, match="another fuselog is writing it"),
+        whole_folder(tmp_path / "r", refuse),
+    ):
+        fill(tmp_path / "r")
+    assert contents(tmp_path) == {"f": "first"}
+
+
+def test_a_folder_that_must_stay_stays_whenever_that_is_found(tmp_path):
+    """At the beginning, and also when it is so only at the end."""
+    place = tmp_path / "r"
+    fill(place)
+    (place / "a").write_text("old")
+    with pytest.raises(BadInput, match="it stays"):
+        fill(place, refuse)
+
+    def refuse_at_the_end(found: Path) -> None:
+        if found != place:
+            refuse(found)
+
+    with pytest.raises(BadInput, match="it stays"):
+        fill(place, refuse_at_the_end)
+    assert contents(tmp_path) == {"r/a": "old"}
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+KILLED = """
+    import os, signal, sys
+    from pathlib import Path
+    from recorders import atomic
+    from recorders.atomic import whole_file, whole_folder
+    place, moment = Path(sys.argv[1]), int(sys.argv[2])
+    def trace(frame, event, argument):
+        global moment
+        if event == "line" and frame.f_code.co_filename == atomic.__file__:
+            moment -= 1
+            if moment < 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return trace
+    sys.settrace(trace)
+    if place.suffix:
+        with whole_file(place) as new:
+            new.write_text("new")
+    else:
+        with whole_folder(place, lambda found: None) as new:
+            (new / "a").write_text("new")
+    sys.settrace(None)
+    print("done")
+"""
+
+
+@pytest.mark.parametrize(("name", "inside"), [("f.txt", "f.txt"), ("r", "r/a")])
+def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, name, inside):
+    """SIGKILL before every third line: the place holds the old or the new, or gets it back."""
+    for moment in range(0, 200, 3):
+        folder = tmp_path / str(moment)
+        (folder / inside).parent.mkdir(parents=True)
+        (folder / inside).write_text("old")
+        (folder / "mine").write_text("mine")
+        command = [sys.executable, "-c", textwrap.dedent(KILLED), str(folder / name), str(moment)]
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert said.returncode in (0, -9), said.stderr
+        found = [
+            path.read_text()
+            for path in (folder / inside, *folder.glob(".*.part/old/a"))
+            if path.exists()
+        ]
+        assert found[0] in ("old", "new")
+        if name == "r":
+            fill(folder / name)
+        else:
+            with whole_file(folder / name) as new:
+                new.write_text("new")
+        assert contents(folder) == {inside: "new", "mine": "mine"}
+        assert len(list(folder.iterdir())) == 2
+        if said.returncode == 0:
+            return
+    raise AssertionError("never came to the end")
+
+
+def test_places_whose_names_go_on_are_others(tmp_path):
+    """`r` is not `r.v2`: neither its writer nor what one left is taken for that of the other."""
+    with whole_folder(tmp_path / "r.v2", refuse):
+        fill(tmp_path / "r")
+    left = tmp_path / ".r.v2.leftover.part"
+    for name in ("old", "new"):
+        (left / name).mkdir(parents=True)
+        (left / name / "a").write_text(name)
+    (left / "fuselog.lock").touch()
+    fill(tmp_path / "r")
+    assert contents(tmp_path / "r") == {"a": "new"}
+    assert left.exists()
+    with pytest.raises(BadInput, match="it stays"):
+        fill(tmp_path / "r.v2", refuse)
+    assert contents(tmp_path) == {"r/a": "new", "r.v2/a": "old"}
+
+
+def test_a_leftover_is_known_by_more_than_its_name(tmp_path, caplog):
+    """What only looks like one stays, and that is said."""
+    place = tmp_path / "f"
+    user = tmp_path / ".f.user.part"
+    user.mkdir()
+    (user / "fuselog.lock").touch()
+    (user / "notes").write_text("mine")
+    (tmp_path / ".f.text.part").write_text("mine")
+    link = tmp_path / ".f.link.part"
+    link.symlink_to(user)
+    before = contents(tmp_path)
+    with caplog.at_level(logging.WARNING), whole_file(place) as new:
+        new.write_text("new")
+    assert contents(tmp_path) == {**before, "f": "new"}
+    assert len(caplog.messages) == 3
+    assert all("it stays as it is" in message for message in caplog.messages)
+
+
+def test_errors_of_the_disk_say_where_and_others_go_through(tmp_path):
+    place = tmp_path / "new" / "f"
+
+    def fail(error: Exception) -> None:
+        with whole_file(place) as new:
+            new.write_text("half")
+            raise error
+
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(BadInput, match=r"new/f: cannot be written \(No space left on device\)"):
+        fail(full)
+    with pytest.raises(FileNotFoundError):
+        fail(FileNotFoundError(errno.ENOENT, "No such file", "/elsewhere"))
+    with pytest.raises(OSError, match="the caller's"):
+        fail(OSError("the caller's"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scratch_folder_of_a_killed_process_is_cleared(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
+    program = (
+        "import os, sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
+        "from recorders.atomic import scratch_folder\n"
+        "with scratch_folder('work') as folder: os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    with scratch_folder("work") as folder:
+        assert list(tmp_path.iterdir()) == [folder]
+        assert folder.stat().st_mode & 0o777 == 0o700
+    assert list(tmp_path.iterdir()) == []

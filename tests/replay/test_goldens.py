@@ -1,0 +1,93 @@
+"""What the estimators give is what they gave: all experiments' first logs against stored replays."""
+
+from pathlib import Path
+
+import pytest
+
+from recorders.registry import available
+from tests.goldens import store
+from tests.goldens.recipes import RECIPES, covered, index, unpack
+from tests.goldens.store import ALLOWED, Allowed, Golden, differences
+
+SIMULATED = [name for name, recipe in RECIPES.items() if not recipe.importer]
+IMPORTED = [name for name, recipe in RECIPES.items() if recipe.importer]
+
+
+def assert_is_golden(name: str, places: dict[str, Path]) -> None:
+    found = list(differences(name, store.read(name), store.make(RECIPES[name], places)))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_simulated(name: str) -> None:
+    assert_is_golden(name, {})
+
+
+@pytest.mark.parametrize("name", IMPORTED)
+def test_imported(name: str, real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scratch = tmp_path_factory.getbasetemp() / "goldens"
+    assert_is_golden(name, unpack(real_data, [RECIPES[name].importer], scratch))
+
+
+def test_every_estimator_has_a_golden() -> None:
+    """Of each at least one variant; and the page that says which is of today."""
+    assert {kind.partition(":")[0] for kind in covered()} == set(available("estimators"))
+    assert {path.name for path in store.FOLDER.iterdir()} == {store.path_of(n).name for n in RECIPES}
+    assert (store.FOLDER.parent / "README.md").read_text(encoding="utf-8") == index()
+
+
+@pytest.fixture(scope="module")
+def golden() -> Golden:
+    return store.read("landmarks")
+
+
+POSE = "/estimates/ekf/robot1/pose"
+
+
+@pytest.mark.parametrize("part", ["kept", "sum", "sum_of_squares"])
+def test_a_small_change_is_found(golden: Golden, part: str) -> None:
+    """In a row that is kept, and in the sums over those that are not; unless the table allows it."""
+    found = store.read("landmarks")
+    mean = found["streams"][POSE]["columns"]["mean"]
+    numbers = mean["kept"][7] if part == "kept" else mean[part]
+    numbers[0] *= 1 + 1e-9
+    [sentence] = differences("landmarks", golden, found)
+    assert sentence.startswith(f"landmarks {POSE} mean: ")
+    assert not [*differences("landmarks", golden, found, {f"* {POSE} mean": Allowed(1e-8, "")})]
+    assert [*differences("landmarks", golden, found, {"* covariance": Allowed(1e-8, "")})]
+
+
+def test_an_angle_is_compared_around_the_circle(golden: Golden) -> None:
+    found = store.read("landmarks")
+    mean = found["streams"][POSE]["columns"]["mean"]
+    mean["kept"][3][2] += 6.283185307179586
+    assert not list(differences("landmarks", golden, found))
+    mean["kept"][3][1] += 6.283185307179586
+    assert len(list(differences("landmarks", golden, found))) == 1
+
+
+def test_what_is_missing_or_new_or_late_is_found(golden: Golden) -> None:
+    found = store.read("landmarks")
+    found["streams"]["/estimates/ekf/robot9/pose"] = found["streams"].pop(POSE)
+    pose = found["streams"]["/estimates/ukf/robot1/pose"]
+    pose["publish_times"], pose["metadata"] = "0", {**pose["metadata"], "frame": "elsewhere"}
+    pose["columns"]["mean"]["missing"][0] = 1
+    sentences = list(differences("landmarks", golden, found))
+    parts = [sentence.split(":")[0].split()[2] for sentence in sentences]
+    assert parts == ["as", "as", "publish_times", "metadata", "mean"]
+
+
+def test_another_cpu_gets_more_but_the_same_input_is_asked_for(golden: Golden) -> None:
+    found = store.read("landmarks")
+    found["input"] = "another"
+    [sentence] = differences("landmarks", golden, found)
+    assert "recorded or imported has changed" in sentence
+    found["arithmetic"] = "another"
+    found["streams"][POSE]["columns"]["mean"]["kept"][7][0] *= 1 + 1e-9
+    assert not list(differences("landmarks", golden, found))
+    found["streams"][POSE]["columns"]["mean"]["kept"][7][0] *= 1 + 1e-4
+    assert list(differences("landmarks", golden, found))
+
+
+def test_every_known_difference_has_its_reason() -> None:
+    assert all(known.reason and known.relative > store.TOLERANCE for known in ALLOWED.values())
