@@ -6,14 +6,16 @@ compiled loops, parallel over runs.
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.models.orientation import require_unit
+from replay.compile import compile_over_runs
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import compose, framed, predict, turn_columns, update
@@ -74,6 +76,11 @@ class GaussianNoise(NamedTuple):
     measurement: NDArray[np.float64]
 
 
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once)
+
+
 def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tuple[Bingham, Bingham]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
@@ -90,7 +97,8 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
     identity = np.eye(d)[0]
     state = Bingham(state.axes.copy(), state.concentrations.copy())
     estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
-    _bingham_filter(
+    _over_runs(_bingham_run)(
+        len(steps.offsets) - 1,
         steps,
         bingham.covariance(noise.system),
         bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
@@ -100,17 +108,8 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
     return state, estimates
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _bingham_filter(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
-) -> None:
-    for run in prange(len(steps.offsets) - 1):
-        _bingham_run(steps, system, inverse_noise, state, estimates, run)
-
-
-@njit(cache=True, error_model="numpy")
 def _bingham_run(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham, run: int
+    run: int, steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -146,21 +145,12 @@ def run_kalman_filter(
     state = Gaussian(state.mean.copy(), state.covariance.copy())
     estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
-    _kalman_filter(steps, noise, rotated, state, estimates)
+    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates)
     return state, estimates
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _kalman_filter(
-    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
-) -> None:
-    for run in prange(len(steps.offsets) - 1):
-        _kalman_run(steps, noise, rotated, state, estimates, run)
-
-
-@njit(cache=True, error_model="numpy")
 def _kalman_run(
-    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian, run: int
+    run: int, steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -179,7 +169,6 @@ def _kalman_run(
         estimates.covariance[row] = p
 
 
-@njit(cache=True, error_model="numpy")
 def _frame(state: NDArray, rotated: bool) -> NDArray:
     """The state scaled to unit length where `rotated`, else the identity."""
     frame = np.zeros(len(state))
