@@ -277,7 +277,8 @@ class Watch:
                 continue
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
             self._failed[run] = Failure(
-                int(last_ns[run]), f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
+                int(last_ns[run]),
+                f"it gave no estimate in the last {silent_s:.1f} s of its measurements",
             )
 
 
