@@ -121,8 +121,9 @@ class Inlined(Compiler):
     def define_pipelines(self) -> Any:
         """The usual passes, into a library of another kind."""
         codegen = self.state.targetctx.codegen()
-        self.state.library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)
-        return super().define_pipelines()
+        library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        self.state.library = library
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
