@@ -5,6 +5,9 @@ file has changed, and stops on a damaged file. So the sources of a kernel and of
 become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
 model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
 which also run uncompiled.
+
+For finding a fault: with FUSELOG_UNCOMPILED=1 all kernels are plain Python, and an index beyond an array
+is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
 """
 
 import ast
@@ -50,6 +53,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
+        if _is_asked_for("FUSELOG_UNCOMPILED"):
+            return np.errstate(all="ignore")(function)
         bundle = _Bundle()
         name = bundle.add(function.__name__, function)
         names = ", ".join(inspect.signature(function).parameters)
@@ -76,11 +81,8 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
-
-    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
-    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if is_uncompiled():
+    if _is_asked_for("FUSELOG_UNCOMPILED"):
         return uncompiled_over_runs(run_once)
     bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
@@ -92,16 +94,6 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         f"        {kernel}(run, {names})",
     )
     return partial(_over_runs, name=run_once.__name__, loop=loop)
-
-
-def is_uncompiled() -> bool:
-    """Whether kernels are to run as plain Python, to find a fault."""
-    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
-
-
-def is_checked() -> bool:
-    """Whether an index beyond an array is to raise in compiled kernels."""
-    return os.environ.get("FUSELOG_BOUNDSCHECK") == "1"
 
 
 class _InlinedLibrary(JITCodeLibrary):
@@ -167,6 +159,10 @@ def _over_runs(
         ) from error
 
 
+def _is_asked_for(switch: str) -> bool:
+    return os.environ.get(switch) == "1"
+
+
 class _Bundle:
     """Sources in the order they are needed, and the imports above them.
 
@@ -174,7 +170,7 @@ class _Bundle:
     """
 
     def __init__(self, allocates: bool = True) -> None:
-        self.options = f"_nrt={allocates}, boundscheck={is_checked()}"
+        self.options = f"_nrt={allocates}, boundscheck={_is_asked_for('FUSELOG_BOUNDSCHECK')}"
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
         self.imports = {"import numba", "import numpy"}
