@@ -141,8 +141,11 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     """
     estimator, parameters = configure(label, settings)
     first = sources[0]
-    with foreign_code(f"estimator {label}"):
-        bound = estimator.bind(label, first.topics, parameters)
+    try:
+        with foreign_code(f"estimator {label}"):
+            bound = estimator.bind(label, first.topics, parameters)
+    except BadInput as error:
+        raise BadInput(f"{first.name}: {error}") from error
     if not bound:
         raise BadInput(
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
