@@ -103,9 +103,10 @@ def _parts(model: Model, topics: Mapping[str, Topic], prefix: str) -> list[_Part
             words += f", which is {topics[place].schema_name} here"
         return _Part(words, found is not None and found.metadata.get("system", system) == system)
 
-    prior = _topic(topics, prefix, model.prior, schemas.GAUSSIAN_ESTIMATE)
-    words = f"{prefix}/{model.prior} of {', '.join(model.state)}"
-    parts = [_Part(words, prior is not None and names_state(prior, model))]
+    words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
+    if is_here:
+        is_here = names_state(topics[f"{prefix}/{model.prior}"], model)
+    parts = [_Part(f"{words} of {', '.join(model.state)}", is_here)]
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
     maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
