@@ -138,7 +138,8 @@ def recursive(
     measured: Components | None = None,
     vectors: Mapping[str, Vectors] | None = None,
     start: Callable[[Given[ParametersType]], tuple[Any, Any]],
-    follow: Callable[[int, Any, Messages, Any, Results], None],
+    follow: Callable[[int, Any, Messages, Any, Results], None] | None = None,
+    follow_all: Callable[[Any, Messages, Any, Results], None] | None = None,
     compiled: bool = True,
 ) -> Estimator[ParametersType]:
     """An estimator that follows its messages in time.
@@ -158,12 +159,20 @@ def recursive(
             runs. A run has failed where its row in the first of them is not finite.
         follow: follow(run, settings, messages, state, results) takes one run through a block of its
             messages: it changes that run's rows of `state`, and fills `results`, in place.
+        follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
+            at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
         compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
     """
 
     @cache
-    def loop() -> Callable[..., None]:
-        return compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
+    def following() -> Callable[[Any, Messages, Any, Results], None]:
+        if follow_all is not None:
+            return follow_all
+        assert follow is not None
+        loop = compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
+        return lambda settings, messages, state, results: loop(
+            len(messages.offsets) - 1, settings, messages, state, results
+        )
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         outputs = _Outputs(name, _resolved(truth, prefix), components, measured or {})
@@ -182,7 +191,7 @@ def recursive(
             state = type(before)(*(array.copy() for array in before))
             messages, skipped = _messages(block, wanted, values)
             results = outputs.blank(len(messages.time_ns))
-            loop()(len(told), settings, messages, state, results)
+            following()(settings, messages, state, results)
             is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
             failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
             made = outputs.of_block(messages, results, np.flatnonzero(failing))

@@ -16,7 +16,17 @@ from recorders.errors import BadInput
 from recorders.models.orientation import require_unit
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
-from replay.distributions.bingham_kernels import compose, framed, predict, turn_columns, update
+from replay.distributions.bingham_kernels import (
+    compose,
+    compose_columns,
+    framed,
+    integrate,
+    inverse,
+    predict,
+    turn_columns,
+    update,
+    weighted_outer,
+)
 from replay.distributions.gaussian_kernels import condition
 
 
@@ -74,7 +84,38 @@ class GaussianNoise(NamedTuple):
     measurement: NDArray[np.float64]
 
 
-def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tuple[Bingham, Bingham]:
+class BinghamEstimates(NamedTuple):
+    """The distribution after every row, and what a replay says of it.
+
+    Attributes:
+        axes, concentrations: see `Bingham`, batch axis (rows,).
+        covariance: of small rotations about the mode, (rows, t, t), t = 1 or 3; see `replay.tangent`.
+    """
+
+    axes: NDArray[np.float64]
+    concentrations: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @property
+    def mode(self) -> NDArray[np.float64]:
+        """The most probable axes (rows, d)."""
+        return self.axes[..., -1]
+
+
+class GaussianEstimates(NamedTuple):
+    """The Gaussian after every row, (rows, d) and (rows, d, d), and its covariance of small rotations.
+
+    The latter, `tangent` (rows, t, t), is as in `BinghamEstimates`.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+
+
+def run_bingham_filter(
+    noise: BinghamNoise, state: Bingham, steps: Steps
+) -> tuple[Bingham, BinghamEstimates]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
     Args:
@@ -83,13 +124,15 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
         steps: see there.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
-        fit does not converge, the run is NaN from there on and the others go on.
+        The state after the last row, and the estimates of all rows. Where a moment fit does not
+        converge, the run is NaN from there on and the others go on.
     """
     rows, d = steps.measurement.shape
     identity = np.eye(d)[0]
     state = Bingham(state.axes.copy(), state.concentrations.copy())
-    estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
+    estimates = BinghamEstimates(
+        np.empty((rows, d, d)), np.empty((rows, d)), np.empty((rows, d - 1, d - 1))
+    )
     _bingham_filter(
         steps,
         bingham.covariance(noise.system),
@@ -102,7 +145,7 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _bingham_filter(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
+    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: BinghamEstimates
 ) -> None:
     for run in prange(len(steps.offsets) - 1):
         _bingham_run(steps, system, inverse_noise, state, estimates, run)
@@ -110,9 +153,16 @@ def _bingham_filter(
 
 @njit(cache=True, error_model="numpy")
 def _bingham_run(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham, run: int
+    steps: Steps,
+    system: NDArray,
+    inverse_noise: NDArray,
+    state: Bingham,
+    estimates: BinghamEstimates,
+    run: int,
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
+    d = len(z)
+    moments, local, work = np.empty(d), np.empty((d, d)), np.empty((d, d))
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):
             turn_columns(axes, steps.increment[row])
@@ -125,11 +175,16 @@ def _bingham_run(
             axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
+        # in the frame of the mode small moments keep their digits next to large ones
+        integrate(z, moments, work)
+        compose_columns(inverse(axes[:, d - 1]), axes, local)
+        weighted_outer(local, moments, work)
+        _rotations(work, estimates.covariance[row])
 
 
 def run_kalman_filter(
     noise: GaussianNoise, state: Gaussian, steps: Steps, *, rotated: bool
-) -> tuple[Gaussian, Gaussian]:
+) -> tuple[Gaussian, GaussianEstimates]:
     """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
 
     Args:
@@ -139,12 +194,14 @@ def run_kalman_filter(
         rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
-        covariance loses its definiteness is NaN from there on.
+        The state after the last row, and the estimates of all rows; a run whose covariance loses its
+        definiteness is NaN from there on.
     """
     rows, d = steps.measurement.shape
     state = Gaussian(state.mean.copy(), state.covariance.copy())
-    estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
+    estimates = GaussianEstimates(
+        np.empty((rows, d)), np.empty((rows, d, d)), np.empty((rows, d - 1, d - 1))
+    )
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
     _kalman_filter(steps, noise, rotated, state, estimates)
     return state, estimates
@@ -152,7 +209,7 @@ def run_kalman_filter(
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _kalman_filter(
-    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
+    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: GaussianEstimates
 ) -> None:
     for run in prange(len(steps.offsets) - 1):
         _kalman_run(steps, noise, rotated, state, estimates, run)
@@ -160,7 +217,12 @@ def _kalman_filter(
 
 @njit(cache=True, error_model="numpy")
 def _kalman_run(
-    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian, run: int
+    steps: Steps,
+    noise: GaussianNoise,
+    rotated: bool,
+    state: Gaussian,
+    estimates: GaussianEstimates,
+    run: int,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -177,6 +239,19 @@ def _kalman_run(
             x /= math.sqrt((x * x).sum())
         estimates.mean[row] = x
         estimates.covariance[row] = p
+        _rotations(framed(p, inverse(x)), estimates.tangent[row])
+
+
+@njit(cache=True, error_model="numpy")
+def _rotations(local: NDArray, covariance: NDArray) -> None:
+    """Fill the covariance of small rotations, from the second moment about the identity.
+
+    See `replay.tangent.vector_part_covariance`.
+    """
+    t = len(covariance)
+    for i in range(t):
+        for j in range(t):
+            covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
 
 
 @njit(cache=True, error_model="numpy")
