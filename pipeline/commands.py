@@ -50,7 +50,8 @@ def replay_logs(
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    check_files([*((path, ESTIMATES) for path in paths), *timelines], {"log": logs})
+    inputs = {"log": logs, "start": [Path(origin) for origin in origins]}
+    check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     estimators = _settings_of_estimators(names, parse_settings(settings))
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]

@@ -1,42 +1,70 @@
 """Compiles a kernel together with the model functions it is made of, once per source text.
 
-numba finds a kernel in its disk cache only if it is a module-level function, and does not notice that a
-function from another file has changed. So the sources of a kernel and of everything it calls are written
-as one module into the user's cache folder, named by their hash: a changed model is a new file, a known
-one loads in a fraction of a second. Kernels stay plain Python functions that also run uncompiled.
+numba's own disk cache finds module-level functions only, does not notice that a function from another
+file has changed, and stops on a damaged file. So the sources of a kernel and of everything it calls
+become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
+model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
+which also run uncompiled.
+
+For finding a fault: with FUSELOG_UNCOMPILED=1 all kernels are plain Python, and an index beyond an array
+is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
 """
 
 import ast
-import hashlib
-import importlib.util
 import inspect
 import os
+import pickle
 import sys
-import tempfile
 import textwrap
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial, wraps
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
+from numba.core import types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.errors import NumbaError
 from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
 
 from recorders.errors import BadInput
+from replay.cache import cache_folder, is_private, read_checked, say_once, write_checked
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+# What a version names, which is part of every key; of any other module the sources are needed.
+_VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}
 
 
-def cache_folder() -> Path:
-    """Where fuselog keeps what it can make again: FUSELOG_CACHE, or the user's cache folder."""
-    stated = os.environ.get("FUSELOG_CACHE")
-    if stated:
-        return Path(stated)
-    home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(home) if home else Path.home() / ".cache") / "fuselog"
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a function of arrays and numbers, with all that it calls, when it is first called.
+
+    For what Python calls as it stands; inside another kernel it is compiled with the rest. Its arguments
+    are given by position. Raises BadInput, when called, where a source is not at hand.
+    """
+
+    @cache
+    def kernel() -> Callable[Parameters, Result]:
+        if _is_asked_for("FUSELOG_UNCOMPILED"):
+            return np.errstate(all="ignore")(function)
+        bundle = _Bundle()
+        name = bundle.add(function.__name__, function)
+        names = ", ".join(inspect.signature(function).parameters)
+        return _compile(bundle, f"def kernel({names}):\n    return {name}({names})")
+
+    @wraps(function)
+    def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        return kernel()(*arguments, **named)
+
+    return call
 
 
 def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) -> Callable[..., None]:
@@ -53,32 +81,41 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
-
-    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
-    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if os.environ.get("FUSELOG_UNCOMPILED") == "1":
+    if _is_asked_for("FUSELOG_UNCOMPILED"):
         return uncompiled_over_runs(run_once)
-    bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
-    # a division by zero gives infinity, which is a failure of its run, and no exception
-    inner = "error_model='numpy', forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True"
-    bundle = _Bundle(f"@numba.njit({inner}, _nrt={allocates}{bounds})")
+    bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
-    text = "\n".join(
-        [
-            "from __future__ import annotations",
-            "import numba",
-            *sorted(bundle.imports),
-            *bundle.definitions,
-            f"@numba.njit(cache=True, nogil=True, _nrt={allocates}{bounds})",
-            f"def loop(first, end, {names}):",
-            "    for run in range(first, end):",
-            f"        {kernel}(run, {names})",
-            "",
-        ]
+    loop = _compile(
+        bundle,
+        f"def kernel(first, end, {names}):\n"
+        "    for run in range(first, end):\n"
+        f"        {kernel}(run, {names})",
     )
-    return partial(_over_runs, name=run_once.__name__, loop=_load(text).loop)
+    return partial(_over_runs, name=run_once.__name__, loop=loop)
+
+
+class _InlinedLibrary(JITCodeLibrary):
+    """The code of one function that is inlined where it is called.
+
+    It is optimised there, once; numba would optimise it at every level of calls above it, which takes
+    half of the time that a kernel of many small functions needs to compile.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+
+class Inlined(Compiler):
+    """The compiler of functions that end up within another one, see `numba.njit(pipeline_class=...)`."""
+
+    def define_pipelines(self) -> Any:
+        """The usual passes, into a library of another kind."""
+        codegen = self.state.targetctx.codegen()
+        library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        self.state.library = library
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -122,21 +159,31 @@ def _over_runs(
         ) from error
 
 
+def _is_asked_for(switch: str) -> bool:
+    return os.environ.get(switch) == "1"
+
+
 class _Bundle:
     """Sources in the order they are needed, and the imports above them.
 
     Everything gets a name of its own: two closures of one function, over different models, are two.
     """
 
-    def __init__(self, decorator: str) -> None:
-        self._decorator = decorator
-        self.imports: set[str] = set()
+    def __init__(self, allocates: bool = True) -> None:
+        self.options = f"_nrt={allocates}, boundscheck={_is_asked_for('FUSELOG_BOUNDSCHECK')}"
+        # a division by zero gives infinity, which is a failure of its run, and no exception
+        inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
+        self.imports = {"import numba", "import numpy"}
+        if not allocates:  # one piece is faster where no counting of references stands in the way
+            inner += ", forceinline=True, pipeline_class=Inlined"
+            self.imports.add("from replay.compile import Inlined")
+        self._decorator = f"@numba.njit({inner}, {self.options})"
         self.definitions: list[str] = []
         self._names: dict[Any, str] = {}
 
     def add(self, name: str, value: Any) -> str:
         """Define a value, called `name` where it is used, and before it what it needs; its own name."""
-        value = getattr(value, "py_func", value)  # what numba has compiled is compiled with the rest
+        value = inspect.unwrap(value)  # what has been compiled already is compiled with the rest
         literal = _literal(value)
         origin = getattr(value, "__qualname__", "<locals>")
         if literal is None and "<locals>" in origin and not isinstance(value, FunctionType | ModuleType):
@@ -151,15 +198,19 @@ class _Bundle:
         if isinstance(value, FunctionType) and not _is_known_to_numba(value):
             self.definitions.append(f"{self._decorator}\n{self._source(own, value)}")
         elif isinstance(value, ModuleType):
-            self.imports.add(f"import {value.__name__} as {own}{_source_hash(value.__name__)}")
+            if value.__name__.partition(".")[0] not in _VERSIONED:
+                raise BadInput(
+                    f"a kernel uses the module {value.__name__}: import what it needs of it by name, "
+                    "so that a change there is noticed"
+                )
+            self.imports.add(f"import {value.__name__} as {own}")
         elif literal is not None:
             self.definitions.append(f"{own} = {literal}")
         elif _is_made_here(value):
             self.imports.add("import collections")
             self.definitions.append(f"{own} = collections.namedtuple({own!r}, {value._fields})")
         else:
-            module = value.__module__
-            self.imports.add(f"from {module} import {origin} as {own}{_source_hash(module)}")
+            self.imports.add(f"from {value.__module__} import {origin} as {own}  # {_stamp(value)}")
         return own
 
     def _source(self, own: str, function: FunctionType) -> str:
@@ -191,22 +242,31 @@ def _is_known_to_numba(function: FunctionType) -> bool:
     return True
 
 
-def _source_hash(module: str) -> str:
-    """A comment that changes with the source of an imported module, and so makes another kernel."""
+def _stamp(value: Any) -> str:
+    """What changes with a thing that is imported by name, and so makes another kernel.
+
+    Of a NamedTuple the order of its fields; of what numba has an implementation of, the module's source.
+    """
+    if hasattr(value, "_fields"):
+        return " ".join(value._fields)
+    if value.__module__.partition(".")[0] in _VERSIONED:
+        return ""
     try:
-        source = inspect.getsource(sys.modules[module])
+        return sha256(inspect.getsource(sys.modules[value.__module__]).encode()).hexdigest()
     except (OSError, TypeError):  # written in C
         return ""
-    return f"  # {hashlib.sha256(source.encode()).hexdigest()}"
 
 
 def _literal(value: Any) -> str | None:
-    """A number, text or tuple of these as source; None for anything else."""
+    """A number, text, tuple of these or read-only array as source; None for anything else."""
     if isinstance(value, float):
         return f"float('{float(value)!r}')"  # infinity and NaN too
     if isinstance(value, tuple):
         entries = [_literal(entry) for entry in value]
         return None if None in entries else f"({''.join(f'{entry}, ' for entry in entries)})"
+    if isinstance(value, np.ndarray) and not value.flags.writeable and not value.dtype.hasobject:
+        content = f"bytes.fromhex('{value.tobytes().hex()}'), '{value.dtype.str}'"
+        return f"numpy.frombuffer({content}).reshape({value.shape})"
     return repr(value) if isinstance(value, bool | int | str) else None
 
 
@@ -228,33 +288,86 @@ def _definition(function: FunctionType) -> ast.FunctionDef:
     return definition
 
 
+def _compile(bundle: _Bundle, definition: str) -> Callable[..., Any]:
+    """The function `kernel` that is defined over what a bundle holds."""
+    return _load(
+        "\n".join(
+            [
+                "from __future__ import annotations",
+                *sorted(bundle.imports),
+                *bundle.definitions,
+                f"@numba.njit(nogil=True, {bundle.options})",
+                definition,
+                "",
+            ]
+        )
+    )
+
+
 @lru_cache(maxsize=64)
-def _load(text: str) -> ModuleType:
-    stamp = f"{numba.__version__} {version('numpy')}"
-    name = f"kernel_{hashlib.sha256((stamp + text).encode()).hexdigest()[:24]}"
-    try:
-        return _imported(name, text, cache_folder() / "kernels")
-    except (OSError, RuntimeError):  # numba raises the latter where it finds no folder to write to
-        return _imported(name, text, Path(_own_folder().name))
+def _load(text: str) -> Callable[..., Any]:
+    """The function `kernel` of a module with this text."""
+    versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
+    name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
+    module = ModuleType(name)
+    sys.modules[name] = module  # compiled code that was kept looks for it there
+    exec(compile(text, name, "exec"), module.__dict__)
+    module.kernel._cache = _CompiledCode(name)
+    return module.kernel
 
 
-@lru_cache(maxsize=1)
-def _own_folder() -> tempfile.TemporaryDirectory[str]:
-    """Where this process compiles, for itself alone, if the cache folder cannot be written."""
-    return tempfile.TemporaryDirectory(prefix="fuselog-")
+class _CompiledCode:
+    """Keeps the compiled code of one kernel, in the place of numba's own cache.
+
+    A file is checked before it is executed. Nothing about the disk stops the work: what cannot be loaded
+    is compiled anew and replaced.
+    """
+
+    cache_path = None
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
+        target.refresh()  # numba's own cache says: "to ensure it is initialized"
+        path = self._path(signature, target)
+        if path is None or not is_private(path.parent):
+            return None
+        content = read_checked(path)
+        if content is None:
+            return None
+        try:
+            name, parts = pickle.loads(content)
+            return CompileResult._rebuild(target, *parts) if name == path.name else None
+        except Exception:  # whatever a file of other versions, or of a class that has moved, leads to
+            return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        path = self._path(signature, result.target_context)
+        # an address in the code is worth nothing in another process
+        if path is None or result.library.has_dynamic_globals or not is_private(path.parent):
+            return
+        try:
+            write_checked(path, dumps((path.name, result._reduce())), "a kernel that fuselog compiled")
+        except OSError as error:
+            say_once(
+                f"the cache {path.parent} cannot be written ({error.strerror}): "
+                "what is compiled now is not kept"
+            )
+
+    def _path(self, signature: Any, target: Any) -> Path | None:
+        """The file for one processor and these types of arguments."""
+        key = "\n".join([*map(str, target.codegen().magic_tuple()), *map(_described, signature)])
+        try:
+            folder = cache_folder()
+        except RuntimeError:  # a user without a home
+            return None
+        return folder / "kernels" / f"{self._name}-{sha256(key.encode()).hexdigest()[:24]}.bin"
 
 
-def _imported(name: str, text: str, folder: Path) -> ModuleType:
-    path = folder / f"{name}.py"
-    if not path.exists() or path.read_text() != text:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as part:
-            part.write(text)
-        Path(part.name).replace(path)
-    specification = importlib.util.spec_from_file_location(name, path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # numba's cache looks for it there
-    specification.loader.exec_module(module)
-    return module
+def _described(kind: Any) -> str:
+    """The name of a type, and the fields of a named tuple, which numba knows by its class alone."""
+    if not isinstance(kind, types.BaseTuple):
+        return str(kind)
+    entries = ", ".join(map(_described, kind.types))  # type: ignore[attr-defined]
+    return f"{getattr(kind, 'instance_class', tuple)} {getattr(kind, 'fields', '')} ({entries})"

@@ -27,15 +27,16 @@ def state_stream(
     topic: str, time_ns: Integers, components: Components, truth: str, mean: Floats, covariance: Floats
 ) -> Stream:
     """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space."""
-    wrapped = np.array(mean, dtype=float)
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
-    wrapped[:, angular] = wrap_angle(wrapped[:, angular])
+    if angular:
+        mean = mean.copy()
+        mean[:, angular] = wrap_angle(mean[:, angular])
     return make_stream(
         topic,
         schemas.GAUSSIAN_ESTIMATE,
         time_ns,
         metadata={**named(components), "truth": truth},
-        mean=wrapped,
+        mean=mean,
         covariance=_flat(covariance),
     )
 

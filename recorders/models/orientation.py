@@ -13,6 +13,7 @@ from recorders.errors import BadInput
 SIGNS = np.array(
     [[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]
 )
+SIGNS.setflags(write=False)
 XOR = np.bitwise_xor.outer(np.arange(4), np.arange(4))
 
 

@@ -1,4 +1,4 @@
-"""Compiled scalar kernels of the Bingham distribution, d = 2 and 4.
+"""Scalar kernels of the Bingham distribution, d = 2 and 4.
 
 The normalisation constant is an inverse Laplace transform at 1, from which the saddlepoint approximation
 of Kume and Wood (Biometrika 92, 2005) starts too:
@@ -14,10 +14,10 @@ import cmath
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recorders.models.orientation import SIGNS
+from replay.compile import compiled
 from replay.distributions.gaussian_kernels import solve_in_place
 
 NODES = 28
@@ -30,6 +30,8 @@ WEIGHTS = (
     * np.exp(CONTOUR)
     * (0.5017 * _cotangent - 0.5017 * 0.6407 * _theta * (1.0 + _cotangent**2) + 0.2645j)
 )
+CONTOUR.setflags(write=False)
+WEIGHTS.setflags(write=False)
 
 # Newton's error squares in every step: from here the last step ends below the rounding.
 _LAST_STEP = 1e-8
@@ -37,7 +39,7 @@ _MOST_STEPS = 30
 _MOST_SWEEPS = 30
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     """The moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
 
@@ -74,7 +76,7 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def fit_concentrations(target: NDArray, z: NDArray) -> bool:
     """Concentrations (d,) under which E(x_i^2) is `target`, ascending, sum 1: Newton's method on (14).
 
@@ -108,7 +110,6 @@ def fit_concentrations(target: NDArray, z: NDArray) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
 def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
     """Eigenvalues, ascending, and eigenvectors (columns) of a symmetric (d, d), which is destroyed.
 
@@ -153,7 +154,6 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
                 vectors[k, i], vectors[k, least] = vectors[k, least], vectors[k, i]
 
 
-@njit(cache=True, error_model="numpy")
 def compose(left: NDArray, right: NDArray, out: NDArray) -> None:
     """Write left (+) right to `out`, all (d,); `out` is neither of the others."""
     for i in range(len(out)):
@@ -162,14 +162,12 @@ def compose(left: NDArray, right: NDArray, out: NDArray) -> None:
             out[i] += SIGNS[j, i ^ j] * left[j] * right[i ^ j]
 
 
-@njit(cache=True, error_model="numpy")
 def compose_columns(left: NDArray, columns: NDArray, out: NDArray) -> None:
     """Write left (+) columns[:, k] to out[:, k]."""
     for k in range(out.shape[1]):
         compose(left, columns[:, k], out[:, k])
 
 
-@njit(cache=True, error_model="numpy")
 def turn_columns(columns: NDArray, increment: NDArray) -> None:
     """Make columns[:, k] (+) increment of the columns, in place: axes after a known increment (d,)."""
     before = columns.copy()
@@ -177,7 +175,6 @@ def turn_columns(columns: NDArray, increment: NDArray) -> None:
         compose(before[:, k], increment, columns[:, k])
 
 
-@njit(cache=True, error_model="numpy")
 def framed(matrix: NDArray, frame: NDArray) -> NDArray:
     """L matrix L^T with L y = frame (+) y: a second moment or parameter matrix in another frame (d,)."""
     half, whole = np.empty(matrix.shape), np.empty(matrix.shape)
@@ -186,7 +183,6 @@ def framed(matrix: NDArray, frame: NDArray) -> NDArray:
     return whole
 
 
-@njit(cache=True, error_model="numpy")
 def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
     """Write columns diag(weights) columns^T to `out`."""
     d = len(weights)
@@ -198,7 +194,6 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
             out[j, i] = out[i, j]
 
 
-@njit(cache=True, error_model="numpy")
 def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
     """Write the second moment of x (+) y to `out`, from those of independent x and y: lemmas 2 and 4.
 
@@ -215,7 +210,6 @@ def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
             out[k, i] = out[i, k]
 
 
-@njit(cache=True, error_model="numpy")
 def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
     """One prediction x (+) w in place: algorithm 1, whose second input is Z^w, not the printed Z^v.
 
@@ -241,7 +235,6 @@ def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
     return fit_concentrations(moments, z)
 
 
-@njit(cache=True, error_model="numpy")
 def inverse(x: NDArray) -> NDArray:
     """The inverse of a unit complex number or quaternion (d,)."""
     out = -x
@@ -249,7 +242,6 @@ def inverse(x: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
 def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: NDArray) -> None:
     """One measurement update in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
 
@@ -266,7 +258,7 @@ def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: NDArr
     z -= z[len(z) - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArray:
     """`predict` for every distribution (n, ...) and its noise; returns which converged."""
     converged = np.empty(len(z), np.bool_)
@@ -275,7 +267,7 @@ def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArra
     return converged
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def fit_each(covariance: NDArray, axes: NDArray, z: NDArray) -> NDArray:
     """Fit every covariance (n, d, d), destroying it, into axes and z; returns which converged."""
     converged = np.empty(len(z), np.bool_)

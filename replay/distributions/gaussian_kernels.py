@@ -1,12 +1,10 @@
-"""Compiled kernels of the Gaussian distribution: small definite systems and direct measurements."""
+"""Kernels of the Gaussian distribution: small definite systems and direct measurements."""
 
 import math
 
-from numba import njit
 from numpy.typing import NDArray
 
 
-@njit(cache=True, error_model="numpy")
 def solve_in_place(matrix: NDArray, right: NDArray) -> None:
     """Right = matrix^-1 right, (n, m), by the Cholesky factor of the leading (n, n) block, overwritten.
 
@@ -31,7 +29,6 @@ def solve_in_place(matrix: NDArray, right: NDArray) -> None:
             right[i, column] /= matrix[i, i]
 
 
-@njit(cache=True, error_model="numpy")
 def condition(mean: NDArray, covariance: NDArray, innovation: NDArray, noise: NDArray) -> None:
     """Kalman's update in place for a measurement of the state itself, z = x + v.
 

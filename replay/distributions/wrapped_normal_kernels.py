@@ -1,16 +1,15 @@
-"""Compiled kernels of the bivariate wrapped normal distribution: fits to samples and products.
+"""Kernels of the bivariate wrapped normal distribution: fits to samples and products.
 
-Component-first functions are plain Python, to run on arrays as well; what loops is compiled here. A
-covariance is handed on as c11, c12, c22.
+Component-first functions run on arrays as well. A covariance is handed on as c11, c12, c22.
 """
 
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recorders.models.planar import Component, Components, wrap_angle
+from replay.compile import compiled
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.
@@ -51,24 +50,16 @@ def diracs(c11: Component, c22: Component, correlation: Component, w5: Component
     return a, b, 0.5 * w * (1.0 + correlation), 0.5 * w * (1.0 - correlation)
 
 
-_wrap, _diracs, _correlation, _covariance_of = (
-    njit(cache=True, error_model="numpy")(function)
-    for function in (wrap_angle, diracs, circular_correlation, covariance_of)
-)
-
-
-@njit(cache=True, error_model="numpy")
 def five_samples(mean: NDArray, covariance: NDArray, central_weight: float) -> Components:
     """Positions (5, 2) and weights (5,) of algorithm 1 for a wrapped normal."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
-    a, b, w1, w3 = _diracs(c11, c22, _correlation(c11, c12, c22), central_weight)
+    a, b, w1, w3 = diracs(c11, c22, circular_correlation(c11, c12, c22), central_weight)
     x = np.empty((5, 2))
     for n, (sign1, sign2) in enumerate(DIRAC_SIGNS):
         x[n, 0], x[n, 1] = mean[0] + sign1 * a, mean[1] + sign2 * b
     return x, np.array([w1, w1, w3, w3, central_weight])
 
 
-@njit(cache=True, error_model="numpy")
 def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Components:
     """Circular means, circular variances -2 ln|m|, and r_c of a wrapped Gaussian mixture.
 
@@ -103,7 +94,6 @@ def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Component
     return means[0], means[1], variances[0], variances[1], correlation
 
 
-@njit(cache=True, error_model="numpy")
 def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c22: float) -> float:
     """The c12 that maximises the weighted likelihood of samples (n, 2), the rest given by moments.
 
@@ -112,8 +102,8 @@ def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c2
     """
     deviations = np.empty(x.shape)
     for n in range(len(x)):
-        deviations[n, 0] = _wrap(x[n, 0] - m1) / math.sqrt(c11)
-        deviations[n, 1] = _wrap(x[n, 1] - m2) / math.sqrt(c22)
+        deviations[n, 0] = wrap_angle(x[n, 0] - m1) / math.sqrt(c11)
+        deviations[n, 1] = wrap_angle(x[n, 1] - m2) / math.sqrt(c22)
     turns = TURN / math.sqrt(c11), TURN / math.sqrt(c22)
     # correlation = sin(position): the grid is dense where the likelihood is narrow, at -1 and 1
     spacing = math.pi / (_MLE_GRID + 1)
@@ -139,7 +129,6 @@ def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c2
     return math.sin(0.5 * (low + high)) * math.sqrt(c11 * c22)
 
 
-@njit(cache=True, error_model="numpy")
 def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float, float]) -> float:
     """Of samples (n, 2) in standard deviations, up to a constant; `turns` is 2 pi in these units."""
     scale = 0.5 / (1.0 - rho * rho)
@@ -158,20 +147,19 @@ def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float
     return total
 
 
-@njit(cache=True, error_model="numpy")
 def fit_samples(x: NDArray, weights: NDArray) -> Components:
     """Mean and covariance (m1, m2, c11, c12, c22) with the circular moments and r_c of samples (n, 2).
 
     Where no positive definite covariance has them, c12 is the mixed maximum-likelihood estimate.
     """
     m1, m2, c11, c22, correlation = circular_moments(x, weights, np.zeros((2, 2)))
-    c12 = _covariance_of(correlation, c11, c22)
+    c12 = covariance_of(correlation, c11, c22)
     if not c12 * c12 < c11 * c22:
         c12 = mixed_mle(x, weights, m1, m2, c11, c22)
     return m1, m2, c11, c12, c22
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def product_mixture(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray
 ) -> Components:
@@ -192,8 +180,8 @@ def product_mixture(
     means = np.empty(((2 * turns0 + 1) * wide, 2))
     exponents = np.empty(len(means))
     for n in range(len(means)):
-        innovation0 = _wrap(other_mean[0] - mean[0]) + (n // wide - turns0) * TURN
-        innovation1 = _wrap(other_mean[1] - mean[1]) + (n % wide - turns1) * TURN
+        innovation0 = wrap_angle(other_mean[0] - mean[0]) + (n // wide - turns0) * TURN
+        innovation1 = wrap_angle(other_mean[1] - mean[1]) + (n % wide - turns1) * TURN
         exponents[n] = -0.5 * (
             inverse[0, 0] * innovation0**2
             + 2.0 * inverse[0, 1] * innovation0 * innovation1
@@ -205,7 +193,6 @@ def product_mixture(
     return means, weights / weights.sum(), gain @ second
 
 
-@njit(cache=True, error_model="numpy")
 def _limited(covariance: NDArray) -> NDArray:
     """The covariance, or where it stands for a uniform distribution, the least one that does."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -213,13 +200,11 @@ def _limited(covariance: NDArray) -> NDArray:
     return UNIFORM * np.eye(2) if least > UNIFORM else covariance
 
 
-@njit(cache=True, error_model="numpy")
 def _turns(variance: float) -> int:
     """How many turns either way a normal density reaches to the last digit of its wrapped sum."""
     return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
 
 
-@njit(cache=True, error_model="numpy")
 def fit_product(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> Components:
     """The wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
@@ -227,13 +212,12 @@ def fit_product(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: 
     """
     means, weights, spread = product_mixture(mean, covariance, other_mean, other)
     m1, m2, c11, c22, correlation = circular_moments(means, weights, spread)
-    c12 = _covariance_of(correlation, c11, c22)
+    c12 = covariance_of(correlation, c11, c22)
     if not c12 * c12 < c11 * c22:
         c12 = spread[0, 1] * math.sqrt(c11 * c22 / (spread[0, 0] * spread[1, 1]))
     return m1, m2, c11, c12, c22
 
 
-@njit(cache=True, error_model="numpy")
 def density(x1: float, x2: float, covariance: NDArray) -> float:
     """The density at a deviation (rad) from the mean: the wrapped sum, or Fourier's where shorter."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -248,7 +232,7 @@ def density(x1: float, x2: float, covariance: NDArray) -> float:
         return max(total, 0.0) / TURN**2
     determinant = c11 * c22 - c12 * c12
     turns1, turns2 = _turns(c11), _turns(c22)
-    x1, x2 = _wrap(x1), _wrap(x2)
+    x1, x2 = wrap_angle(x1), wrap_angle(x2)
     for j in range(-turns1, turns1 + 1):
         first = x1 + j * TURN
         for k in range(-turns2, turns2 + 1):
@@ -258,7 +242,7 @@ def density(x1: float, x2: float, covariance: NDArray) -> float:
     return total / (TURN * math.sqrt(determinant))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
     """`density` (n,) at every deviation (n, 2) under its covariance (n, 2, 2)."""
     out = np.empty(len(deviation))
@@ -267,7 +251,7 @@ def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
     """`circular_moments` (n, 5) of sample sets (n, samples, 2) with weights (n, samples)."""
     out = np.empty((len(x), 5))
@@ -276,7 +260,7 @@ def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
     """Moments and `mixed_mle` (n, 5) as m1, m2, c11, c12, c22 of sample sets (n, samples, 2)."""
     out = np.empty((len(x), 5))
@@ -286,7 +270,7 @@ def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def fit_product_each(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> NDArray:
     """`fit_product` (n, 5) of pairs (n, ...)."""
     out = np.empty((len(mean), 5))

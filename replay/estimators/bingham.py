@@ -6,14 +6,16 @@ compiled loops, parallel over runs.
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.models.orientation import require_unit
+from replay.compile import compile_over_runs
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import (
@@ -84,6 +86,11 @@ class GaussianNoise(NamedTuple):
     measurement: NDArray[np.float64]
 
 
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once)
+
+
 class BinghamEstimates(NamedTuple):
     """The distribution after every row, and what a replay says of it.
 
@@ -133,7 +140,8 @@ def run_bingham_filter(
     estimates = BinghamEstimates(
         np.empty((rows, d, d)), np.empty((rows, d)), np.empty((rows, d - 1, d - 1))
     )
-    _bingham_filter(
+    _over_runs(_bingham_run)(
+        len(steps.offsets) - 1,
         steps,
         bingham.covariance(noise.system),
         bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
@@ -143,22 +151,13 @@ def run_bingham_filter(
     return state, estimates
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _bingham_filter(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: BinghamEstimates
-) -> None:
-    for run in prange(len(steps.offsets) - 1):
-        _bingham_run(steps, system, inverse_noise, state, estimates, run)
-
-
-@njit(cache=True, error_model="numpy")
 def _bingham_run(
+    run: int,
     steps: Steps,
     system: NDArray,
     inverse_noise: NDArray,
     state: Bingham,
     estimates: BinghamEstimates,
-    run: int,
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
     d = len(z)
@@ -179,7 +178,7 @@ def _bingham_run(
         integrate(z, moments, work)
         compose_columns(inverse(axes[:, d - 1]), axes, local)
         weighted_outer(local, moments, work)
-        _rotations(work, estimates.covariance[row])
+        _store_rotations(work, estimates.covariance[row])
 
 
 def run_kalman_filter(
@@ -203,26 +202,17 @@ def run_kalman_filter(
         np.empty((rows, d)), np.empty((rows, d, d)), np.empty((rows, d - 1, d - 1))
     )
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
-    _kalman_filter(steps, noise, rotated, state, estimates)
+    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates)
     return state, estimates
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _kalman_filter(
-    steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: GaussianEstimates
-) -> None:
-    for run in prange(len(steps.offsets) - 1):
-        _kalman_run(steps, noise, rotated, state, estimates, run)
-
-
-@njit(cache=True, error_model="numpy")
 def _kalman_run(
+    run: int,
     steps: Steps,
     noise: GaussianNoise,
     rotated: bool,
     state: Gaussian,
     estimates: GaussianEstimates,
-    run: int,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -239,12 +229,11 @@ def _kalman_run(
             x /= math.sqrt((x * x).sum())
         estimates.mean[row] = x
         estimates.covariance[row] = p
-        _rotations(framed(p, inverse(x)), estimates.tangent[row])
+        _store_rotations(framed(p, inverse(x)), estimates.tangent[row])
 
 
-@njit(cache=True, error_model="numpy")
-def _rotations(local: NDArray, covariance: NDArray) -> None:
-    """Fill the covariance of small rotations, from the second moment about the identity.
+def _store_rotations(local: NDArray, covariance: NDArray) -> None:
+    """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
 
     See `replay.tangent.vector_part_covariance`.
     """
@@ -254,7 +243,6 @@ def _rotations(local: NDArray, covariance: NDArray) -> None:
             covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
 
 
-@njit(cache=True, error_model="numpy")
 def _frame(state: NDArray, rotated: bool) -> NDArray:
     """The state scaled to unit length where `rotated`, else the identity."""
     frame = np.zeros(len(state))

@@ -9,13 +9,15 @@ averages is a quaternion measurement for the filter. Quaternions turn body vecto
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from replay.compile import compile_over_runs, compiled
 from replay.distributions.bingham_kernels import (
     compose,
     compose_columns,
@@ -141,6 +143,11 @@ def start_inertial_filter(runs: int) -> InertialState:
     )
 
 
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once)
+
+
 def run_inertial_filter(
     model: InertialModel, state: InertialState, samples: InertialSamples
 ) -> tuple[InertialState, OrientationEstimates]:
@@ -150,7 +157,7 @@ def run_inertial_filter(
     """
     samples, estimates = _prepared(model, samples)
     state = InertialState._make(part.copy() for part in state)
-    _inertial_filter(model, state, samples, estimates)
+    _over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
     return state, estimates
 
 
@@ -164,14 +171,14 @@ def run_dead_reckoning(
     """
     samples, estimates = _prepared(model, samples)
     state = ReckoningState._make(part.copy() for part in state)
-    _dead_reckoning(model, unbiased, state, samples, estimates)
+    _over_runs(_reckoning_run)(len(samples.offsets) - 1, model, unbiased, state, samples, estimates)
     return state, estimates
 
 
 def attitudes(model: InertialModel, samples: InertialSamples) -> OrientationEstimates:
     """The TRIAD attitude of every sample alone: gravity is taken for all that is felt."""
     samples, estimates = _prepared(model, samples)
-    _attitudes(samples, estimates.orientation)
+    _attitudes(samples.force, samples.field, estimates.orientation)
     estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
     return estimates
 
@@ -189,26 +196,24 @@ def _prepared(
     return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
 
 
-@njit(cache=True, error_model="numpy")
-def _attitudes(samples: InertialSamples, orientation: NDArray) -> None:
+@compiled
+def _attitudes(force: NDArray, field: NDArray, orientation: NDArray) -> None:
     for row in range(len(orientation)):
-        orientation[row] = _triad(samples.force[row], samples.field[row])
+        orientation[row] = _triad(force[row], field[row])
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _dead_reckoning(
+def _reckoning_run(
+    run: int,
     model: InertialModel,
     unbiased: bool,
     state: ReckoningState,
     samples: InertialSamples,
     estimates: OrientationEstimates,
 ) -> None:
-    for run in prange(len(samples.offsets) - 1):
-        for row in range(samples.offsets[run], samples.offsets[run + 1]):
-            _reckon(model, unbiased, state, run, samples, estimates, row)
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        _reckon(model, unbiased, state, run, samples, estimates, row)
 
 
-@njit(cache=True, error_model="numpy")
 def _reckon(
     model: InertialModel,
     unbiased: bool,
@@ -245,24 +250,22 @@ def _reckon(
     estimates.covariance[row] = variance * np.eye(3)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _inertial_filter(
+def _inertial_run(
+    run: int,
     model: InertialModel,
     state: InertialState,
     samples: InertialSamples,
     estimates: OrientationEstimates,
 ) -> None:
-    for run in prange(len(samples.offsets) - 1):
-        for row in range(samples.offsets[run], samples.offsets[run + 1]):
-            elapsed_s = _accumulate(model, state, run, samples, row)
-            if elapsed_s >= model.block_s:
-                _end_block(model, state, run, elapsed_s)
-                elapsed_s = 0.0
-            if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
-                _dead_reckon(model, state, run, elapsed_s, estimates, row)
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        elapsed_s = _accumulate(model, state, run, samples, row)
+        if elapsed_s >= model.block_s:
+            _end_block(model, state, run, elapsed_s)
+            elapsed_s = 0.0
+        if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
+            _dead_reckon(model, state, run, elapsed_s, estimates, row)
 
 
-@njit(cache=True, error_model="numpy")
 def _accumulate(
     model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
 ) -> float:
@@ -301,7 +304,6 @@ def _accumulate(
     return (time_ns - times[2]) * _NS
 
 
-@njit(cache=True, error_model="numpy")
 def _start_block(state: InertialState, run: int, time_ns: int) -> None:
     state.time_ns[run, 2] = time_ns
     state.increment[run] = 0.0
@@ -310,7 +312,6 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
     state.field[run] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
     """One prediction over the block and one update with its attitude, in place."""
     axes, z = state.axes[run], state.concentrations[run]
@@ -331,7 +332,6 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
     _start_block(state, run, state.time_ns[run, 1])
 
 
-@njit(cache=True, error_model="numpy")
 def _dead_reckon(
     model: InertialModel,
     state: InertialState,
@@ -353,7 +353,6 @@ def _dead_reckon(
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
 
 
-@njit(cache=True, error_model="numpy")
 def _isotropic(sigma_rad: float) -> NDArray:
     """Concentrations about the identity, in the order of a quaternion's components."""
     z = np.full(4, -2.0 / sigma_rad**2)
@@ -361,7 +360,6 @@ def _isotropic(sigma_rad: float) -> NDArray:
     return z
 
 
-@njit(cache=True, error_model="numpy")
 def _increment(rotation_rad: NDArray) -> NDArray:
     """The quaternion of a rotation vector (3,)."""
     x, y, z = 0.5 * rotation_rad
@@ -370,7 +368,6 @@ def _increment(rotation_rad: NDArray) -> NDArray:
     return np.array([math.cos(angle), scale * x, scale * y, scale * z])
 
 
-@njit(cache=True, error_model="numpy")
 def _carry(turned: NDArray, vector: NDArray) -> None:
     """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
@@ -381,7 +378,6 @@ def _carry(turned: NDArray, vector: NDArray) -> None:
     vector[2] = c + w * f + x * e - y * d
 
 
-@njit(cache=True, error_model="numpy")
 def _triad(force: NDArray, field: NDArray) -> NDArray:
     """The orientation (4,) under which force points up and field north; NaN where they are parallel."""
     up = force / math.sqrt((force**2).sum())
@@ -405,12 +401,10 @@ def _triad(force: NDArray, field: NDArray) -> NDArray:
     return column / math.sqrt((column**2).sum())
 
 
-@njit(cache=True, error_model="numpy")
 def _cross(a: NDArray, b: NDArray) -> NDArray:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True, error_model="numpy")
 def _diagonal(values: NDArray) -> NDArray:
     out = np.zeros((len(values), len(values)))
     for i in range(len(values)):

@@ -6,7 +6,7 @@ as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is l
 
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,6 +87,7 @@ def needs_of(model: Model) -> str:
     return "; ".join(parts)
 
 
+@cache
 def number_fields(parameters: type[ModelParameters]) -> tuple[str, ...]:
     """The parameters that model functions may read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]

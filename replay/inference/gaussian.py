@@ -174,31 +174,3 @@ def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covarian
     for i in range(len(covariance)):
         for j in range(len(covariance)):
             to_covariance[i, j] = covariance[i, j]
-
-
-def weighted_sum(weights: Floats, values: Floats) -> float:
-    """Sum of products, by four partial sums: one addition need not wait for the one before."""
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    whole = len(weights) - len(weights) % 4
-    for k in range(0, whole, 4):
-        a += weights[k] * values[k]
-        b += weights[k + 1] * values[k + 1]
-        c += weights[k + 2] * values[k + 2]
-        d += weights[k + 3] * values[k + 3]
-    for k in range(whole, len(weights)):
-        a += weights[k] * values[k]
-    return (a + b) + (c + d)
-
-
-def weighted_product(weights: Floats, first: Floats, second: Floats) -> float:
-    """Sum of products of three; see `weighted_sum`."""
-    a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    whole = len(weights) - len(weights) % 4
-    for k in range(0, whole, 4):
-        a += weights[k] * first[k] * second[k]
-        b += weights[k + 1] * first[k + 1] * second[k + 1]
-        c += weights[k + 2] * first[k + 2] * second[k + 2]
-        d += weights[k + 3] * first[k + 3] * second[k + 3]
-    for k in range(whole, len(weights)):
-        a += weights[k] * first[k] * second[k]
-    return (a + b) + (c + d)

@@ -122,22 +122,22 @@ def retraction(kinds: tuple[str, ...]) -> Function:
 
 @lru_cache(maxsize=64)
 def differencing(kinds: tuple[str, ...]) -> Function:
-    """`subtract(a, b, d, k)`: column k of d (t, ...) becomes the vector from b to a, both (n,)."""
+    """`subtract(a, b, d, k)`: row k of d (..., t) becomes the tangent vector from b to a, both (n,)."""
     lines = ["def subtract(a, b, d, k):"]
     for kind, c, t, _ in things(kinds):
         if kind == "linear":
-            lines.append(f"    d[{t}, k] = a[{c}] - b[{c}]")
+            lines.append(f"    d[k, {t}] = a[{c}] - b[{c}]")
         elif kind == "angle":
             lines += [
                 f"    change = a[{c}] - b[{c}]",
-                f"    d[{t}, k] = change if abs(change) < np.pi else wrap_angle(change)",
+                f"    d[k, {t}] = change if abs(change) < np.pi else wrap_angle(change)",
             ]
         elif kind == "axis":
             lines += [
                 f"    cosine = b[{c}] * a[{c}] + b[{c + 1}] * a[{c + 1}]",
                 f"    sine = b[{c}] * a[{c + 1}] - b[{c + 1}] * a[{c}]",
                 "    sign = -1.0 if cosine < 0.0 else 1.0",
-                f"    d[{t}, k] = np.arctan2(sign * sine, sign * cosine)",
+                f"    d[k, {t}] = np.arctan2(sign * sine, sign * cosine)",
             ]
         else:
             lines += [
@@ -148,7 +148,7 @@ def differencing(kinds: tuple[str, ...]) -> Function:
                 "    length = np.sqrt(i * i + j * j + z * z)",
                 "    angle = np.arctan2(length, sign * w)",
                 "    scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)",
-                f"    d[{t}, k], d[{t + 1}, k], d[{t + 2}, k] = scale * i, scale * j, scale * z",
+                f"    d[k, {t}], d[k, {t + 1}], d[k, {t + 2}] = scale * i, scale * j, scale * z",
             ]
     return function_of("\n".join([*lines, ""]), wrap_angle=wrap_angle)
 
@@ -297,8 +297,67 @@ def adding_noise(size: int) -> Function:
 
 
 @lru_cache(maxsize=64)
+def lower_of(size: int) -> Function:
+    """`read(factor)`: the rows of a lower triangle as one tuple."""
+    entries = [f"factor[{row}, {column}]" for row in range(size) for column in range(row + 1)]
+    return function_of(f"def read(factor):\n    return {_listed(entries)}\n")
+
+
+@lru_cache(maxsize=64)
+def offset_of(size: int) -> Function:
+    """`offset(lower, points, index)`: a triangle, as `lower_of` reads it, times one row of points."""
+    entries, first = [], 0
+    for row in range(size):
+        terms = [f"lower[{first + k}] * points[index, {k}]" for k in range(row + 1)]
+        entries.append(" + ".join(terms))
+        first += row + 1
+    return function_of(f"def offset(lower, points, index):\n    return {_listed(entries)}\n")
+
+
+@lru_cache(maxsize=64)
+def moments_of(states: int, values: int) -> Function:
+    """`moments(weights, offsets, found, shift, spread, cross)`: weighted covariances, in one loop.
+
+    Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t). The
+    sums stay in registers: arrays might overlap for all that the compiler knows.
+    """
+    pairs = [(i, j) for i in range(values) for j in range(i + 1)]
+    mixed = [(row, i) for row in range(states) for i in range(values)]
+    lines = ["def moments(weights, offsets, found, shift, spread, cross):"]
+    lines += [f"    s{i} = shift[{i}]" for i in range(values)]
+    lines += [f"    a{i}_{j} = 0.0" for i, j in pairs] + [f"    c{row}_{i} = 0.0" for row, i in mixed]
+    lines.append("    for k in range(len(weights)):")
+    for i in range(values):
+        lines += [f"        y{i} = found[k, {i}] - s{i}", f"        w{i} = weights[k] * y{i}"]
+    lines += [f"        a{i}_{j} += w{i} * y{j}" for i, j in pairs]
+    for row in range(states):
+        lines.append(f"        x = offsets[k, {row}]")
+        lines += [f"        c{row}_{i} += x * w{i}" for i in range(values)]
+    lines += [f"    spread[{i}, {j}] = spread[{j}, {i}] = a{i}_{j}" for i, j in pairs]
+    lines += [f"    cross[{row}, {i}] = c{row}_{i}" for row, i in mixed]
+    return function_of("\n".join([*lines, ""]))
+
+
+@lru_cache(maxsize=64)
+def weighted_mean_of(values: int) -> Function:
+    """`fill(weights, found, mean)`: the weighted sums (v,) of values (L, v)."""
+    lines = ["def fill(weights, found, mean):", *(f"    m{i} = 0.0" for i in range(values))]
+    lines.append("    for k in range(len(weights)):")
+    lines += [f"        m{i} += weights[k] * found[k, {i}]" for i in range(values)]
+    lines += [f"    mean[{i}] = m{i}" for i in range(values)]
+    return function_of("\n".join([*lines, ""]))
+
+
+@lru_cache(maxsize=64)
+def sum_of(size: int) -> Function:
+    """`add(a, b)`: the sum of the first entries of two tuples, as a tuple."""
+    entries = _listed([f"a[{index}] + b[{index}]" for index in range(size)])
+    return function_of(f"def add(a, b):\n    return {entries}\n")
+
+
+@lru_cache(maxsize=64)
 def recentring(kinds: tuple[str, ...]) -> Function:
-    """`recentre(values, shift)`: tangent vectors (t, L) from a centre become those from centre + shift.
+    """`recentre(values, shift)`: tangent vectors (L, t) from a centre become those from centre + shift.
 
     Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a
     rotation is not yet settled.
@@ -307,26 +366,26 @@ def recentring(kinds: tuple[str, ...]) -> Function:
     for kind, _, t, _ in things(kinds):
         if kind == "linear":
             lines += [
-                "    for index in range(values.shape[1]):",
-                f"        values[{t}, index] -= shift[{t}]",
+                "    for index in range(len(values)):",
+                f"        values[index, {t}] -= shift[{t}]",
             ]
         elif kind == "angle":
             lines += [
-                "    for index in range(values.shape[1]):",
-                f"        change = values[{t}, index] - shift[{t}]",
+                "    for index in range(len(values)):",
+                f"        change = values[index, {t}] - shift[{t}]",
                 "        if not abs(change) < np.pi:",
                 "            change = wrap_angle(change)",
                 "            again = True",
-                f"        values[{t}, index] = change",
+                f"        values[index, {t}] = change",
             ]
         elif kind == "axis":
             lines += [
-                "    for index in range(values.shape[1]):",
-                f"        change = values[{t}, index] - shift[{t}]",
+                "    for index in range(len(values)):",
+                f"        change = values[index, {t}] - shift[{t}]",
                 "        if not abs(change) < 0.5 * np.pi:",
                 "            change = (change + 0.5 * np.pi) % np.pi - 0.5 * np.pi",
                 "            again = True",
-                f"        values[{t}, index] = change",
+                f"        values[index, {t}] = change",
             ]
         else:
             d = [f"shift[{t + index}]" for index in range(3)]
@@ -334,16 +393,16 @@ def recentring(kinds: tuple[str, ...]) -> Function:
                 f"    if max(abs({d[0]}), abs({d[1]}), abs({d[2]})) > 1e-15:",
                 "        again = True",
                 f"    p = from_vector({', '.join(d)})",
-                "    for index in range(values.shape[1]):",
-                f"        q = from_vector({', '.join(f'values[{t + row}, index]' for row in range(3))})",
+                "    for index in range(len(values)):",
+                f"        q = from_vector({', '.join(f'values[index, {t + row}]' for row in range(3))})",
                 f"        w, i, j, z = {', '.join(_terms('p', 'q', row, True) for row in range(4))}",
                 "        sign = -1.0 if w < 0.0 else 1.0",
                 "        length = np.sqrt(i * i + j * j + z * z)",
                 "        angle = np.arctan2(length, sign * w)",
                 "        scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)",
-                f"        values[{t}, index] = scale * i",
-                f"        values[{t + 1}, index] = scale * j",
-                f"        values[{t + 2}, index] = scale * z",
+                f"        values[index, {t}] = scale * i",
+                f"        values[index, {t + 1}] = scale * j",
+                f"        values[index, {t + 2}] = scale * z",
             ]
     lines.append("    return again")
     return function_of("\n".join([*lines, ""]), wrap_angle=wrap_angle, from_vector=from_vector)

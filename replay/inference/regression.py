@@ -11,14 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.inference.gaussian import cholesky, weighted_product, weighted_sum, wrap
+from replay.inference.gaussian import cholesky, wrap
 from replay.inference.generate import (
     differencing,
     filling,
+    is_flat,
+    lower_of,
+    moments_of,
+    offset_of,
     recentring,
     retraction,
+    sum_of,
     tangent_size,
     tuple_of,
+    weighted_mean_of,
 )
 from replay.inference.model import Motion, Sensor
 from replay.inference.steps import (
@@ -42,10 +48,10 @@ class SampleMemory(NamedTuple):
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
         factor: (N, N) lower factor of the covariance of state (t) and noise.
-        offsets: (N, L) the samples' tangent vectors from the mean.
-        point, noise: (n,), (noises,), one sample.
-        values: (v, L), the function's values as tangent vectors from their mean.
-        centre, shift: (n of the values,), (v,), their mean and its last correction.
+        offsets: (L, N) the samples' tangent vectors from the mean.
+        point, noise: (n,), one sample, and (noises,), the variances.
+        values: (L, v), the function's values as tangent vectors from a centre.
+        centre, shift: (n of the values,), (v,), their mean, and what the values are away from it.
         cross: (t, v), for a covariance that is not needed.
     """
 
@@ -72,10 +78,10 @@ def sample_memory(
     return SampleMemory(
         *sets,
         factor=np.zeros((dimension, dimension)),
-        offsets=np.empty((dimension, count)),
+        offsets=np.empty((count, dimension)),
         point=np.empty(len(kinds)),
         noise=np.empty(noises),
-        values=np.empty((values, count)),
+        values=np.empty((count, values)),
         centre=np.empty(len(outputs)),
         shift=np.empty(values),
         cross=np.empty((dimension - noises, values)),
@@ -94,60 +100,44 @@ def regression(
     """
     t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
     size = t + noises
-    read_state, read_noise = tuple_of(components), tuple_of(noises)
-    add, subtract, fill = retraction(kinds), differencing(outputs), filling(len(outputs))
-    add_value, recentre = retraction(outputs), recentring(outputs)
-    fill_noise = filling(noises)
-    flat_states, no_noise = all(kind in ("linear", "angle") for kind in kinds), (0.0,) * noises
+    read_state, read_noise = tuple_of(components), tuple_of(noises, t)
+    add, add_flat, subtract = retraction(kinds), sum_of(components), differencing(outputs)
+    fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
+    lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
+    add_value, recentre, weighted_mean = retraction(outputs), recentring(outputs), weighted_mean_of(v)
+    flat_states, no_noise = is_flat(kinds), (0.0,) * noises
     straight = set(outputs) <= {"linear"}
 
-    def spread_out(
-        covariance: Floats, variances: tuple[float, ...], points: Floats, memory: SampleMemory
-    ) -> bool:
-        factor, offsets = memory.factor, memory.offsets
-        if not cholesky(factor, covariance, t):
-            return False
-        fill_noise(memory.noise, variances)
-        for k in range(noises):
-            factor[t + k, t + k] = np.sqrt(memory.noise[k])
-        for row in range(size):
-            for index in range(len(points)):
-                entry = 0.0
-                for k in range(row + 1):
-                    entry += factor[row, k] * points[index, k]
-                offsets[row, index] = entry
-        return True
-
-    def evaluate(mean: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
-        point, offsets = memory.point, memory.offsets
-        centre = function(read_state(mean), no_noise, arguments)
+    def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
+        """Fill the offsets of all samples, and the function's values as differences from the centre."""
+        triangle, state, offsets = lower(memory.factor), read_state(mean), memory.offsets
+        centre = function(state, no_noise, arguments)
         fill(memory.centre, centre)
-        for index in range(offsets.shape[1]):
+        for index in range(len(points)):
+            away = offset(triangle, points, index)
+            fill_offset(offsets[index], away)
             if flat_states:
-                for row in range(components):
-                    point[row] = mean[row] + offsets[row, index]
+                point = add_flat(state, away)
             else:
                 for row in range(components):
-                    point[row] = mean[row]
-                add(point, offsets[:, index])
-            for k in range(noises):
-                memory.noise[k] = offsets[t + k, index]
-            value = function(read_state(point), read_noise(memory.noise), arguments)
+                    memory.point[row] = mean[row]
+                add(memory.point, away)
+                point = read_state(memory.point)
+            value = function(point, read_noise(away), arguments)
             subtract(value, centre, memory.values, index)
 
     def settle(weights: Floats, memory: SampleMemory) -> None:
-        """Move the centre to the intrinsic mean, and the values with it."""
+        """Move the centre to the intrinsic mean; `shift` is what the values still are away from it."""
         values, shift = memory.values, memory.shift
         for _ in range(MEANS):
-            for i in range(v):
-                shift[i] = weighted_sum(weights, values[i])
+            weighted_mean(weights, values, shift)
             add_value(memory.centre, shift)
             if straight:
-                for i in range(v):
-                    for index in range(len(weights)):
-                        values[i, index] -= shift[i]
                 return
-            if not recentre(values, shift):
+            again = recentre(values, shift)
+            for i in range(v):
+                shift[i] = 0.0
+            if not again:
                 return
 
     def regress(
@@ -161,17 +151,15 @@ def regression(
         memory: SampleMemory,
     ) -> bool:
         chosen = (use - memory.first) * memory.stride
-        weights = memory.weights[chosen]
-        if not spread_out(covariance, variances, memory.points[chosen], memory):
+        weights, factor = memory.weights[chosen], memory.factor
+        if not cholesky(factor, covariance, t):
             return False
-        evaluate(mean, arguments, memory)
+        fill_noise(memory.noise, variances)
+        for k in range(noises):
+            factor[t + k, t + k] = np.sqrt(memory.noise[k])
+        evaluate(mean, memory.points[chosen], arguments, memory)
         settle(weights, memory)
-        values, offsets = memory.values, memory.offsets
-        for i in range(v):
-            for j in range(i + 1):
-                spread[i, j] = spread[j, i] = weighted_product(weights, values[i], values[j])
-            for row in range(t):
-                cross[row, i] = weighted_product(weights, offsets[row], values[i])
+        moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
         return True
 
     return regress

@@ -1,23 +1,19 @@
 """The sample cache: LCD sets are computed once, kept on disk, and never trusted when damaged.
 
-A file is one line of text, which begins with the SHA-256 of all that follows it and says what made the
-file, and a NumPy npz archive whose members are named after their sets. Common sets ship with the package
-(see `replay.sampling.ship`); others are kept in $FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else
-~/.cache/fuselog.
+A file (see `replay.cache`) holds a NumPy npz archive whose members are named after their sets. Common
+sets ship with the package (see `replay.sampling.ship`); others are kept in the user's cache.
 """
 
 import io
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 
+from replay.cache import cache_folder, is_private, read_checked, write_checked
 from replay.sampling.distance import Array
 from replay.sampling.lcd import Report, check_count, lcd_samples, moment_corrected, silent
 
@@ -39,15 +35,6 @@ class SetName:
         return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
 
 
-def cache_folder() -> Path:
-    """Where this user's computed results are kept."""
-    chosen = os.environ.get("FUSELOG_CACHE")
-    if chosen:
-        return Path(chosen)
-    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (base if base.is_absolute() else Path.home() / ".cache") / "fuselog"
-
-
 def cached_set(name: SetName, report: Report = silent) -> Array:
     """Return one set (count, dimension), from the shipped file, the user's cache, or computed now.
 
@@ -60,10 +47,14 @@ def cached_set(name: SetName, report: Report = silent) -> Array:
     """
     check_count(name.dimension, name.count, name.symmetric)
     path = cache_folder() / "samples" / f"{name}.bin"
-    for source in (SHIPPED, path):
-        points = read_set(source, name)
-        if points is not None:
-            return points
+    points = read_set(SHIPPED, name)
+    if points is not None:
+        return points
+    if not is_private(path.parent):
+        return compute_set(name, report)
+    points = read_set(path, name)
+    if points is not None:
+        return points
     if path.exists():
         report(f"{path} is damaged or not ours; its samples are computed again")
     points = compute_set(name, report)
@@ -84,11 +75,8 @@ def compute_set(name: SetName, report: Report = silent) -> Array:
 
 def read_set(source: Path | Traversable, name: SetName) -> Array | None:
     """Return one set of a file, or None where the file is damaged or one of them is not there."""
-    try:
-        header, _, archive = source.read_bytes().partition(b"\n")
-    except OSError:
-        return None
-    if not header.startswith(_digest(archive)):
+    archive = read_checked(source)
+    if archive is None:
         return None
     with np.load(io.BytesIO(archive)) as sets:
         return sets.get(str(name))
@@ -99,17 +87,4 @@ def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:
     archive = io.BytesIO()
     members = {str(name): points for name, points in sets.items()}
     np.savez(archive, **members)  # type: ignore[arg-type]
-    content = archive.getvalue()
-    header = _digest(content) + f" LCD samples of N(0, I), made by {made_by}\n".encode()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{uuid4().hex}.part")
-    try:
-        part.write_bytes(header + content)
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-
-
-def _digest(content: bytes) -> bytes:
-    return sha256(content).hexdigest().encode()
+    write_checked(path, archive.getvalue(), f"LCD samples of N(0, I), made by {made_by}")

@@ -15,10 +15,10 @@ from math import exp, factorial, log
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from replay.compile import compiled
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def _quadrature(dimension: int) -> _Quadrature:
 # instructions without reordering. With fastmath the bytes depended on whether numba's cache was warm.
 
 
-@njit(cache=True)
+@compiled
 def _pair_sum(coordinates: Array, weights: Array) -> tuple[float, Array]:
     """Sum B^2/2 w_i w_j (E2 - 1) over all i, j, and its gradient (N, L), for coordinates (N, L)."""
     dimension, count = coordinates.shape
@@ -117,7 +117,6 @@ def _pair_sum(coordinates: Array, weights: Array) -> tuple[float, Array]:
     return B_MAX**2 * total, gradient
 
 
-@njit(cache=True)
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
     """Fill e1 with E1(u) and e2 with E2(u) - 1: the series for all, then what lies beyond it."""
     for j in range(len(u)):
@@ -135,7 +134,6 @@ def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
             e1[j], e2[j] = _exponential_integrals_beyond_one(u[j])
 
 
-@njit(cache=True)
 def _exponential_integrals_beyond_one(u: float) -> tuple[float, float]:
     """E1(u) and E2(u) - 1 for u > 1, by the continued fraction of E1 from its tail."""
     tail = 0.0

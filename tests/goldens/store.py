@@ -65,13 +65,21 @@ def make(recipe: Recipe, places: Mapping[str, Path]) -> Golden:
             result = run_experiment(recipe.experiment, recipe.loaded, Path(folder) / "out")
         return {"arithmetic": arithmetic(), "input": "", "streams": {}, "metrics": result.metrics}
     source = first_log(recipe, places)
-    outputs = replay_in_memory([source], recipe.settings)
-    columns = [column for each in outputs.values() for column in each.stream.columns.values()]
+    replayed = replay_in_memory([source], recipe.settings)
+    outputs = {topic: each.stream for topic, each in replayed.items() if _is_estimated(each.stream)}
+    columns = [column for stream in outputs.values() for column in stream.columns.values()]
     width = sum(math.prod(column.shape[1:]) for column in columns)
     rows = min(max(NUMBERS // width, FEWEST_ROWS), MOST_ROWS)
-    streams = {topic: _stream(each.stream, rows) for topic, each in outputs.items()}
+    streams = {topic: _stream(stream, rows) for topic, stream in outputs.items()}
     found = {"arithmetic": arithmetic(), "input": hash_streams([source])}
     return {**found, "streams": streams, "metrics": {}}
+
+
+def _is_estimated(stream: Stream) -> bool:
+    """Whether an output is an estimator's; how much was estimated, and that none failed, is not."""
+    if stream.schema.full_name == schemas.FAILURE.full_name:
+        return len(stream) > 0
+    return stream.schema.full_name != schemas.COVERAGE.full_name
 
 
 def _stream(stream: Stream, rows: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.commands import _hash_files
 from pipeline.ensemble import hash_streams, judge, record_ensemble
 from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
 from pipeline.results import Claim, Outcome, result_folder, write_outcome
@@ -266,6 +268,33 @@ def test_recording_on_an_executor_gives_the_same_runs() -> None:
     assert hash_streams(there) == hash_streams(here)
     first, second = (source.streams["/robot1/truth"]["state"] for source in here[:2])
     assert not np.array_equal(first, second)
+
+
+def test_the_hash_of_the_data_is_of_all_of_them(tmp_path: Path) -> None:
+    """Another stamp, number or run, or another file: another hash. The same: the same."""
+    [source] = record_ensemble("landmarks", {"duration_s": 1.0}, 3, 1)
+    stream = source.streams["/robot1/odometry"]
+    later = stream.publish_time_ns + np.arange(len(stream)) // (len(stream) - 1)
+    changed = {
+        "publish time": replace(stream, publish_time_ns=later),
+        "log time": replace(stream, log_time_ns=later),
+        "column": replace(
+            stream, columns={**stream.columns, "turn_radps": stream["turn_radps"] + 1e-15}
+        ),
+    }
+    sources = [
+        replace(source, streams={**source.streams, stream.topic: each}) for each in changed.values()
+    ]
+    hashes = [hash_streams([each]) for each in (*sources, source)]
+    hashes += [hash_streams([source, source]), hash_streams(record_ensemble("landmarks", {}, 3, 1))]
+    paths = [tmp_path / name for name in "ab"]
+    for path in paths:
+        path.write_bytes(path.name.encode())
+    hashes += [_hash_files(each) for each in ([paths[0]], [paths[1]], paths, paths[::-1])]
+    assert len(set(hashes)) == len(hashes)
+    assert hash_streams([source]) == hash_streams(
+        record_ensemble("landmarks", {"duration_s": 1.0}, 3, 1)
+    )
 
 
 def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(

@@ -8,7 +8,7 @@ from recorders.importers.biometrics import Matchers, ScoreMatricesParameters, re
 from recorders.models.scores import comparisons_of
 from recorders.parameters import build
 from recorders.recording import record_run
-from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, R
+from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
 from replay.verification import identified
 
 TWO = Matchers.model_validate(
@@ -99,6 +99,16 @@ def test_simulated_scores_identify_as_many_users_as_the_real_ones():
         compared = comparisons_of(recording.streams[0])
         found = [identified(compared.scores[:, :, matcher]) for matcher in range(4)]
         assert np.all(np.abs(np.subtract(found, (450, 429, 446, 480))) <= 4 * np.array([8, 10, 8, 5]))
+
+
+def test_a_user_is_another_as_a_probe_than_as_a_gallery_entry():
+    """Of matcher G the two effects correlate by .13; every mean over 300 others is one of them."""
+    settings = {"users": 300, "low_galleries": 0, "broken_probes": 0}
+    scores = comparisons_of(record_run("biometric-scores", settings, 2)[0].streams[0]).scores[:, :, G]
+    others = np.where(np.eye(300, dtype=bool), np.nan, scores)
+    as_probe, as_gallery = np.nanmean(others, axis=1), np.nanmean(others, axis=0)
+    assert abs(np.corrcoef(as_probe, as_gallery)[0, 1] - 0.13) < 4 / np.sqrt(300)
+    assert as_probe.std() > 1.3 * as_gallery.std()
 
 
 def test_simulated_special_users_and_marginals():

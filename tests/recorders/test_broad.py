@@ -10,6 +10,11 @@ from recorders.errors import BadInput
 from recorders.importers.broad import BROAD, BroadParameters
 
 ROWS = 400
+SENSORS = {
+    "imu_acc": "specific_force_mps2",
+    "imu_gyr": "turn_rate_radps",
+    "imu_mag": "magnetic_field_ut",
+}
 
 
 def write(path: Path, **changes: np.ndarray | None) -> Path:
@@ -46,6 +51,16 @@ def test_a_folder_is_one_run_with_topics_for_every_trial(tmp_path):
     np.testing.assert_array_equal(streams["/a/movement"]["value"].ravel(), [0.0, 1.0])
     assert streams["/a/movement"].publish_time_ns[1] - recording.epoch_ns == 3_000_000_000
     assert not recording.notes
+
+
+def test_every_sensor_goes_to_its_own_field(tmp_path):
+    """Nine numbers of which no two are alike."""
+    sensors = {
+        name: np.random.default_rng(row).normal(size=(ROWS, 3)) for row, name in enumerate(SENSORS)
+    }
+    inertial = read(write(tmp_path / "a.hdf5", **sensors))[0]["/a/inertial"]
+    for name, field in SENSORS.items():
+        np.testing.assert_array_equal(inertial[field], sensors[name])
 
 
 def test_what_is_not_finite_is_dropped_and_its_gaps_are_told(tmp_path):

@@ -11,6 +11,7 @@ from recorders.models.directional_noise import (
     sample_bingham,
     sample_projected_gaussian,
 )
+from recorders.recording import record_run
 
 
 def units(count: int, d: int, seed: int = 0) -> np.ndarray:
@@ -109,6 +110,19 @@ def test_projected_gaussians_are_unit_vectors_about_the_mean():
     )
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-15)
     assert x[:, 1].std() == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize(("scenario", "field"), [("axis", "axis"), ("orientation", "quaternion")])
+def test_turns_and_measurement_errors_are_each_runs_own(scenario, field):
+    """Neither is the same in two runs, nor is one of them drawn from the other's random stream."""
+    drawn = []
+    for run in range(2):
+        truth, measured = record_run(scenario, {}, 4, run)[0].streams
+        state, seen = truth["state"], measured[field]
+        drawn.append(orientation.compose(orientation.conjugate(state[:-1]), state[1:])[:, 1])
+        drawn.append(orientation.compose(orientation.conjugate(state), seen)[1:, 1])
+    correlation = np.corrcoef(drawn)[np.triu_indices(4, 1)]
+    assert np.abs(correlation).max() < 4 / np.sqrt(99)
 
 
 def test_infinite_concentrations_are_refused():

@@ -73,6 +73,15 @@ def test_drive_jacobians_are_the_derivatives_of_drive(heading, forward, turn, du
     np.testing.assert_allclose(ours, exact, rtol=0, atol=2e-11)
 
 
+@given(st.floats(-9e-5, 9e-5))
+def test_drive_jacobians_of_small_turns_are_those_of_their_series(half_turn):
+    """Where the quotient loses digits: by differences, which are good to about 1e-12."""
+    at = np.array([1.0, 3.0, half_turn])
+    by_heading, by_forward, by_turn = drive_jacobians((0.0, 0.0, at[0]), at[1:], 2.0)
+    found = central_differences(lambda x: np.array(drive((0.0, 0.0, x[0]), x[1:], 2.0)), at)[:2]
+    np.testing.assert_allclose(np.transpose([by_heading, by_forward, by_turn]), found, atol=1e-9)
+
+
 @given(angles, st.floats(0.5, 5), angles)
 def test_range_bearing_jacobian_is_its_derivative(heading, distance, direction):
     """By the pose, all round the target (arctan2 has no complex step)."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import kstest, norm
 
 from recorders.errors import BadInput
 from recorders.log import Stream
@@ -53,6 +54,63 @@ def test_truth_between_steps_lies_on_the_same_path() -> None:
     shared = np.isin(fine.publish_time_ns, coarse.publish_time_ns)
     assert shared.sum() == len(coarse) == 21
     assert_allclose(fine["state"][shared], coarse["state"], atol=1e-9)
+
+
+def test_starts_are_drawn_from_the_prior_that_is_stated() -> None:
+    """Variances far from 1, another for every component; each run draws its own."""
+    variance = (25.0, 0.04, 9.0, 0.01)
+    errors = []
+    for run in range(40):
+        values = {"stochastic": True, "prior_variance": variance, "duration_s": 1.0}
+        streams = {each.topic: each for each in record_run("vehicles", values, 3, run)[0].streams}
+        for number in range(1, 6):
+            prior, truth = (streams[f"/vehicle{number}/{what}"] for what in ("prior", "truth"))
+            assert_allclose(prior["covariance"].reshape(4, 4), np.diag(variance))
+            errors.append(truth["state"][0] - prior["mean"][0])
+    for error in np.transpose(errors / np.sqrt(variance)):
+        assert kstest(error, norm.cdf).pvalue > 1e-4
+
+
+def test_accelerations_hold_for_a_step() -> None:
+    """On a straight path the mean of both velocities leads from one place to the next."""
+    state = recorded(stochastic=True, step_s=2.0, fix={"rate_hz": 0.5}, infrastructure={"rate_hz": 0.5})[
+        "/vehicle1/truth"
+    ]["state"]
+    place, velocity = state[:, ::2], state[:, 1::2]
+    assert np.abs(np.diff(velocity, axis=0)).min() > 1e-6
+    assert_allclose(np.diff(place, axis=0), velocity[1:] + velocity[:-1], atol=1e-9)
+
+
+def test_another_sensor_changes_no_other_stream() -> None:
+    """Each draws from a random stream of its own; the vehicles drive as they did."""
+    alone = recorded(stochastic=True)
+    crowded = recorded(stochastic=True, fix={"rate_hz": 3.0, "variance_m2": 9.0, "latency_s": 1.0})
+    for topic in ("/infrastructure/scan", "/infrastructure/detection", "/vehicle2/prior"):
+        for name, column in alone[topic].columns.items():
+            np.testing.assert_array_equal(column, crowded[topic][name])
+    assert_allclose(alone["/vehicle2/truth"]["state"][0], crowded["/vehicle2/truth"]["state"][0])
+    other = recorded(stochastic=True, infrastructure={"rate_hz": 2.0, "clutter_per_scan": 4.0})
+    np.testing.assert_array_equal(
+        alone["/vehicle2/fix"]["position_m"], other["/vehicle2/fix"]["position_m"]
+    )
+
+
+def test_noise_has_the_variance_that_is_stated() -> None:
+    """Of fixes and detections, neither of them near 1."""
+    streams = recorded(
+        duration_s=400.0, fix={"variance_m2": 16.0}, infrastructure={"variance_m2": 0.0025}
+    )
+    truth, fix = streams["/vehicle1/truth"], streams["/vehicle1/fix"]
+    at = np.searchsorted(truth.publish_time_ns, fix.publish_time_ns)
+    assert kstest(((fix["position_m"] - truth["state"][at, ::2]) / 4.0).ravel(), norm.cdf).pvalue > 1e-4
+    assert_allclose(fix["covariance_m2"][0], [16.0, 0.0, 0.0, 16.0])
+    states = np.stack(
+        [streams[f"/vehicle{number}/truth"]["state"][1:, ::2] for number in range(1, 6)], 1
+    )
+    places = out_of_frame((60.0, -40.0, 2.0), streams["/infrastructure/detection"]["position_m"].T)
+    apart = np.stack(places, axis=1).reshape(-1, 5, 1, 2) - states[:, None]
+    nearest = np.take_along_axis(apart, np.sum(apart**2, -1, keepdims=True).argmin(2, keepdims=True), 2)
+    assert kstest((nearest / 0.05).ravel(), norm.cdf).pvalue > 1e-4
 
 
 def test_scans_are_the_fixes_without_order_or_identity() -> None:

@@ -15,6 +15,8 @@ from recorders.recording import import_run, record_run
 from replay.estimators.biometrics import (
     RULES,
     ClassifierParameters,
+    all_pairs,
+    cross_validate,
     learn_classifier,
     normalise,
     trimmed_pairs,
@@ -173,6 +175,31 @@ def test_trimmed_pairs_are_one_genuine_and_two_different_impostors_per_user(user
     assert np.all(impostors[:, 0] != impostors[:, 1])
 
 
+@given(st.integers(12, 25), st.integers(2, 5), st.integers(0, 2**32))
+def test_nothing_is_learnt_from_the_users_who_are_judged(users, folds, seed):
+    """Neither as a probe nor as a gallery entry; every comparison is judged, by its gallery's fold."""
+    rng = np.random.default_rng(seed)
+    fold = user_folds(users, folds, rng)
+    pairs = all_pairs(users)._replace(fold=fold)
+    vectors = np.stack([pairs.probe, pairs.gallery], axis=1).astype(float)
+
+    def learner(learnt, genuine, _):
+        known = learnt.astype(int)
+        assert np.array_equal(genuine, known[:, 0] == known[:, 1])
+        assert np.count_nonzero(~genuine) == min(30, (~genuine).sum())
+        assert len(np.unique(known, axis=0)) == len(known)
+
+        def score(judged):
+            (number,) = set(fold[judged[:, 1].astype(int)])
+            assert number not in fold[known]
+            return judged @ [1000.0, 1.0]
+
+        return score
+
+    fused = cross_validate(vectors, pairs, learner, 30, rng)
+    np.testing.assert_array_equal(fused, vectors @ [1000.0, 1.0])
+
+
 def test_column_min_max_makes_a_failed_column_zero_and_every_other_span_the_unit():
     scores = np.random.default_rng(1).normal(size=(6, 6, 1))
     scores[:, 2] = -1
@@ -191,6 +218,7 @@ def test_roc_of_tied_scores_by_hand():
     np.testing.assert_allclose(curve.false_accept, [0, 0, 1 / 3, 2 / 3, 1])
     np.testing.assert_allclose(curve.genuine_accept, [0, 1 / 3, 2 / 3, 1, 1])
     assert genuine_accept_at(curve, 0.5) == pytest.approx(2 / 3)
+    assert genuine_accept_at(curve, curve.false_accept[3]) == 1.0, "a rate that is met is not above"
     assert equal_error_rate(curve) == pytest.approx(1 / 3)
     assert cost_of_ratio(np.zeros(6), genuine) == pytest.approx(1.0)
 
@@ -210,6 +238,8 @@ def test_verification_rate_is_the_mean_of_the_folds():
     score, user = np.array([1.0, -1.0, 1.0]), np.array([0, 1, 2])
     fused = Fused(score, user, user, np.array([0, 0, 1]), 0.0, True)
     assert verification_rate(fused) == pytest.approx(0.75)
+    tied = Fused(np.full(3, 0.5), user, user[::-1], None, 0.5, True)
+    assert verification_rate(tied) == pytest.approx(2 / 3), "at the threshold is not above it"
 
 
 def test_normalisations_and_rules_by_hand():

@@ -108,6 +108,27 @@ def test_a_known_common_part_is_not_counted_twice_by_inverse_ci():
     assert np.trace(fused.covariance) <= np.trace(known.covariance) * (1 + 1e-6)
 
 
+@pytest.mark.parametrize("name", ["inverse-ci", "ci-trace", "split-ci"])
+def test_the_fused_mean_weighs_each_mean_by_what_its_estimate_adds(name):
+    """Means away from the origin: information-weighted, with what inverse CI counts as common taken off.
+
+    Noack, Sijs, Reinhardt, Hanebeck, (11): K_i = P (P_i^-1 - w_i (w_a P_a + w_b P_b)^-1).
+    """
+    means = np.array([[1.0, -2.0], [40.0, 3.0]])
+    fused = fuse(name, means, PAIR)
+    added, shares = np.linalg.inv(PAIR), fused.weights
+    if name != "ci-trace":  # fused one after another: the second weight is that of what was before
+        shares = np.array([fused.weights[1], 1.0 - fused.weights[1]])
+    if name == "inverse-ci":
+        common = np.linalg.inv(np.einsum("i,ijk->jk", shares, PAIR))
+        added = added - shares[:, None, None] * common
+    else:
+        added = shares[:, None, None] * added
+    np.testing.assert_allclose(np.linalg.inv(fused.covariance), added.sum(axis=0), rtol=1e-5)
+    expected = fused.covariance @ np.einsum("ijk,ik->j", added, means)
+    np.testing.assert_allclose(fused.mean, expected, rtol=1e-5)
+
+
 def test_batches_equal_their_members_and_all_rules_keep_equal_estimates():
     rng = np.random.default_rng(6)
     means, covariances = rng.normal(size=(4, 3, 2)), positive(rng, 4, 3, size=2)

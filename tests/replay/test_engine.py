@@ -186,6 +186,13 @@ def test_runs_with_other_topics_are_no_ensemble():
         replayed([first, second])
 
 
+def test_runs_that_state_other_noise_are_no_ensemble():
+    """What the first run's channels state would be taken for all of them."""
+    sensor = {"rate_hz": 5.0, "sigma_range_m": 0.3}
+    with pytest.raises(BadInput, match="topic /robot1/range_bearing is not as in run 0"):
+        replayed([record(0), record(1, range_bearing=sensor)])
+
+
 def test_names_and_variants_are_checked():
     source = record(0)
     for name, words in (("ekv", "did you mean 'ekf'"), ("ekf:fast", "has no variants")):

@@ -101,6 +101,20 @@ def test_single_block_is_the_attitude_of_its_averages():
     np.testing.assert_allclose(sigma, MODEL.attitude_sigma_rad, rtol=0.01)
 
 
+@pytest.mark.parametrize("block_s", [0.5, 2.0, 4.0])
+def test_drift_grows_with_time_however_long_the_blocks(block_s):
+    """No field tells the attitude after the first block: variances grow linearly, within blocks too."""
+    model = InertialModel(REST_S, block_s, attitude_sigma_rad=0.02, drift_sigma_rad=0.01)
+    _, samples = simulate(21.0, 9)
+    first = int(block_s * RATE_HZ)
+    field = samples.field.copy()
+    field[first + 1 :] = 0.0
+    _, estimates = run_inertial_filter(model, start_inertial_filter(1), samples._replace(field=field))
+    for row in (first + 30, 1234, 2050):
+        expected = 0.02**2 + 0.01**2 * (row - first) / RATE_HZ
+        np.testing.assert_allclose(np.diagonal(estimates.covariance[row]), expected, rtol=0.03)
+
+
 def test_a_gap_makes_the_orientation_unknown_until_the_next_block():
     truth, samples = simulate(30.0, 3)
     rows = np.r_[0:2000, 2300:3000]

@@ -1,0 +1,95 @@
+"""The user's cache: what fuselog can make again, kept on disk, never trusted when damaged or foreign.
+
+A file is one line of text, which begins with the SHA-256 of all that follows it and says what made the
+file, and then the content.
+"""
+
+import logging
+import os
+from functools import cache
+from hashlib import sha256
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+_OTHERS_MAY_WRITE = 0o022
+
+
+def cache_folder() -> Path:
+    """Where this user's computed results are kept.
+
+    FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. By XDG's specification a relative
+    path there does not count.
+    """
+    stated = os.environ.get("FUSELOG_CACHE")
+    if stated:
+        return Path(stated)
+    home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (home if home.is_absolute() else Path.home() / ".cache") / "fuselog"
+
+
+def is_private(folder: Path) -> bool:
+    """Whether only this user can have written to a folder of the cache; what speaks against it is said.
+
+    A folder that is not there yet is private: `write_checked` makes it so. Systems without user numbers
+    (Windows) keep a user's folders apart by themselves.
+    """
+    if not hasattr(os, "getuid"):
+        return True
+    for place in (folder.parent, folder):
+        try:
+            status = place.stat()
+        except OSError:
+            continue
+        if status.st_uid != os.getuid():
+            say_once(
+                f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to your own"
+            )
+            return False
+        if status.st_mode & _OTHERS_MAY_WRITE:
+            say_once(
+                f"the cache {place} is not used: other users may write to it; chmod go-w mends that"
+            )
+            return False
+    return True
+
+
+@cache
+def say_once(sentence: str) -> None:
+    """A warning that one process gives once, however often its cause is met."""
+    logging.getLogger("fuselog").warning(sentence)
+
+
+def read_checked(source: Path | Traversable) -> bytes | None:
+    """The content that `write_checked` wrote, or None where the file is damaged or not there."""
+    try:
+        header, _, content = source.read_bytes().partition(b"\n")
+    except OSError:
+        return None
+    return content if header.startswith(_digest(content)) else None
+
+
+def write_checked(path: Path, content: bytes, made_by: str) -> None:
+    """Write a file, which appears whole or not at all, in folders of this user alone; raises OSError."""
+    _make_private(path.parent)
+    with NamedTemporaryFile(
+        dir=path.parent, prefix=f".{path.name}.", suffix=".part", delete=False
+    ) as part:
+        try:
+            part.write(_digest(content) + f" {made_by}\n".encode() + content)
+            part.close()
+            Path(part.name).replace(path)
+        except BaseException:
+            Path(part.name).unlink(missing_ok=True)
+            raise
+
+
+def _make_private(folder: Path) -> None:
+    """Make a folder and those that it lies in, where they are not there, for this user alone."""
+    if not folder.exists():
+        _make_private(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+
+
+def _digest(content: bytes) -> bytes:
+    return sha256(content).hexdigest().encode()

@@ -1,0 +1,519 @@
+"""Faults chosen by hand, over all rooms, and the tests that ought to catch each.
+
+Signs, clocks, swapped arguments, forgotten roots, wrong bounds, leaks, shared random streams.
+"""
+
+from typing import NamedTuple
+
+
+class Fault(NamedTuple):
+    """In the file at `path` the text `old`, which occurs once, is replaced by `new`.
+
+    `tests` are the files, separated by blanks, of which one has to fail.
+    """
+
+    path: str
+    old: str
+    new: str
+    tests: str
+
+
+def faulty(fault: Fault, sound: str) -> str:
+    """The file's text with the fault; raises ValueError where the old text is not there exactly once."""
+    if sound.count(fault.old) != 1:
+        raise ValueError(f"{fault.path} has '{fault.old}' {sound.count(fault.old)} times; state it anew")
+    return sound.replace(fault.old, fault.new)
+
+
+PLANAR = "tests/recorders/test_planar.py"
+LANDMARKS = "tests/recorders/test_landmarks.py"
+VEHICLES = "tests/recorders/test_vehicles.py"
+SCORES = "tests/recorders/test_biometrics.py"
+READING = "tests/recorders/test_log_reading.py"
+WRITING = "tests/recorders/test_log_writing.py"
+ENGINE = "tests/replay/test_engine.py"
+EVALUATION = "tests/replay/test_evaluation.py"
+FUSION = "tests/replay/test_biometrics.py"
+
+FAULTS = [
+    # models of sensors and motion
+    Fault(
+        "recorders/models/planar.py",
+        "direction = pose[2] + half_turn\n    return (",
+        "direction = pose[2]\n    return (",
+        PLANAR,
+    ),
+    Fault(
+        "recorders/models/planar.py",
+        "slope = -half_turn / 3.0 if",
+        "slope = half_turn / 3.0 if",
+        PLANAR,
+    ),
+    Fault(
+        "recorders/models/planar.py",
+        "(dy / squared, -dx / squared, -1.0)",
+        "(dy / squared, -dx / squared, 1.0)",
+        PLANAR,
+    ),
+    Fault(
+        "recorders/models/acoustic.py",
+        "trajectory - side * (0.5 * np.pi + medium",
+        "trajectory + side * (0.5 * np.pi + medium",
+        "tests/recorders/test_acoustic_model.py",
+    ),
+    Fault(
+        "recorders/models/acoustic.py",
+        "delay**2 + lever**2 * angles",
+        "delay**2 + lever * angles",
+        "tests/recorders/test_acoustic_model.py",
+    ),
+    Fault(
+        "recorders/models/optical.py",
+        "return _about_z(yaw, _about_y(pitch, _about_x(roll, x)))",
+        "return _about_x(roll, _about_y(pitch, _about_z(yaw, x)))",
+        "tests/recorders/test_optical_model.py",
+    ),
+    Fault(
+        "recorders/models/optical.py",
+        "by_target[2] * offset[1] - by_target[1] * offset[2]",
+        "by_target[1] * offset[2] - by_target[2] * offset[1]",
+        "tests/recorders/test_optical_model.py",
+    ),
+    # simulators: noise, clocks, priors, random streams
+    Fault(
+        "recorders/simulators/landmarks.py",
+        "noise = rng.normal(size=(steps, 2)) * density / np.sqrt(step_s)",
+        "noise = rng.normal(size=(steps, 2)) * density",
+        LANDMARKS,
+    ),
+    Fault(
+        "recorders/simulators/landmarks.py",
+        "covariance=np.diag(sigma**2).reshape(1, 9)",
+        "covariance=np.diag(sigma).reshape(1, 9)",
+        LANDMARKS,
+    ),
+    Fault(
+        "recorders/simulators/landmarks.py",
+        "prior = truth[0] + rngs[1].normal(size=3) * sigma",
+        "prior = truth[0] + np.random.default_rng(0).normal(size=3) * sigma",
+        LANDMARKS,
+    ),
+    Fault(
+        "recorders/simulators/landmarks.py",
+        '"log_time_ns": simulation_stamps_ns(times_s + delay_s)[look]',
+        '"log_time_ns": simulation_stamps_ns(times_s - delay_s)[look]',
+        LANDMARKS,
+    ),
+    Fault(
+        "recorders/simulators/landmarks.py",
+        "half_view = np.radians(sensor.field_of_view_deg) / 2",
+        "half_view = np.radians(sensor.field_of_view_deg)",
+        LANDMARKS,
+    ),
+    Fault(
+        "recorders/simulators/vehicles.py",
+        "disturbance = rng.normal(size=(count, 4)) * np.sqrt(parameters.prior_variance)",
+        "disturbance = rng.normal(size=(count, 4)) * np.array(parameters.prior_variance)",
+        VEHICLES,
+    ),
+    Fault(
+        "recorders/simulators/vehicles.py",
+        "fixes += np.sqrt(parameters.fix.variance_m2) * fix_rng.normal(size=fixes.shape)",
+        "fixes += parameters.fix.variance_m2 * fix_rng.normal(size=fixes.shape)",
+        VEHICLES,
+    ),
+    Fault(
+        "recorders/simulators/vehicles.py",
+        "seen += np.sqrt(parameters.infrastructure.variance_m2) * sensor_rng.normal(size=seen.shape)",
+        "seen += np.sqrt(parameters.infrastructure.variance_m2) * fix_rng.normal(size=seen.shape)",
+        VEHICLES,
+    ),
+    Fault(
+        "recorders/simulators/vehicles.py",
+        "states[..., 0::2] += 0.5 * span_s[..., None] ** 2 * acceleration",
+        "states[..., 0::2] += span_s[..., None] ** 2 * acceleration",
+        VEHICLES,
+    ),
+    Fault(
+        "recorders/simulators/biometrics.py",
+        "np.sqrt(PROBE_VARIANCE) * users.probe[:, None]",
+        "np.sqrt(PROBE_VARIANCE) * users.gallery[:, None]",
+        SCORES,
+    ),
+    Fault(
+        "recorders/simulators/orientation.py",
+        "system_rng, measurement_rng = rng.spawn(2)",
+        "system_rng = rng.spawn(1)[0]\n    measurement_rng = np.random.default_rng(0)",
+        "tests/recorders/test_orientation.py tests/recorders/test_angle_recorders.py",
+    ),
+    Fault(
+        "recorders/recording.py",
+        "np.random.SeedSequence(seed, spawn_key=(run,))",
+        "np.random.SeedSequence(seed)",
+        LANDMARKS,
+    ),
+    # parameters
+    Fault(
+        "recorders/parameters.py",
+        "merged[key] = merge(old, value)",
+        "merged[key] = value",
+        "tests/recorders/test_parameters.py",
+    ),
+    # importers
+    Fault(
+        "recorders/importers/ais.py",
+        "np.where(speed == NO_SPEED, np.nan, speed * KNOT_MPS)",
+        "np.where(speed == NO_SPEED, np.nan, speed)",
+        "tests/recorders/test_ais.py",
+    ),
+    Fault(
+        "recorders/importers/ais.py",
+        "wrong[1:-1] = leaps[:-1] & leaps[1:]",
+        "wrong[1:-1] = leaps[:-1] | leaps[1:]",
+        "tests/recorders/test_ais.py",
+    ),
+    Fault(
+        "recorders/importers/ais.py",
+        "return reports.take(~repeated)",
+        "return reports",
+        "tests/recorders/test_ais.py",
+    ),
+    Fault(
+        "recorders/importers/mrclam.py",
+        "start_ns = max(odometry_ns[0], truth_ns[0])",
+        "start_ns = min(odometry_ns[0], truth_ns[0])",
+        "tests/recorders/test_mrclam.py",
+    ),
+    Fault(
+        "recorders/importers/mrclam.py",
+        'order = np.argsort(times_ns, kind="stable")',
+        "order = np.arange(len(times_ns))",
+        "tests/recorders/test_mrclam.py",
+    ),
+    Fault(
+        "recorders/importers/broad.py",
+        "turn_rate_radps=samples[:, 3:6]",
+        "turn_rate_radps=samples[:, 6:]",
+        "tests/recorders/test_broad.py",
+    ),
+    # the log
+    Fault(
+        "recorders/log/streams.py",
+        'return self.publish_time_ns if clock == "publish_time" else self.log_time_ns',
+        "return self.publish_time_ns",
+        READING,
+    ),
+    Fault(
+        "recorders/log/reader.py",
+        "else end_ns - 1",
+        "else end_ns",
+        READING,
+    ),
+    Fault(
+        "recorders/log/reader.py",
+        "stream.take(np.lexsort((position, times)))",
+        "stream.take(np.lexsort((-position, times)))",
+        READING,
+    ),
+    Fault(
+        "recorders/log/reader.py",
+        "limit_ns = None if is_last else chosen[number].region.spans[order].first_ns",
+        "limit_ns = None",
+        READING,
+    ),
+    Fault(
+        "recorders/log/chunks.py",
+        "if checksum not in (0, zlib.crc32(data)):",
+        "if checksum and not zlib.crc32(data):",
+        "tests/recorders/test_log_damage.py",
+    ),
+    Fault(
+        "recorders/log/layout.py",
+        'records["mcap publish_time"] = stream.publish_time_ns',
+        'records["mcap publish_time"] = stream.log_time_ns',
+        f"{WRITING} {READING}",
+    ),
+    Fault(
+        "recorders/log/loops.py",
+        "wrong |= (words[offset + places[k]] ^ expected[k]) & mask[k]",
+        "wrong = (words[offset + places[k]] ^ expected[k]) & mask[k]",
+        "tests/recorders/test_log_foreign.py tests/recorders/test_log_damage.py",
+    ),
+    # blocks, engine, sources
+    Fault(
+        "replay/blocks.py",
+        "positions[heads[k]] < positions[heads[first]]",
+        "positions[heads[k]] > positions[heads[first]]",
+        ENGINE,
+    ),
+    Fault(
+        "replay/blocks.py",
+        'clock = "publish_time_ns" if order == "publish_time" else "log_time_ns"',
+        'clock = "publish_time_ns"',
+        ENGINE,
+    ),
+    Fault(
+        "replay/blocks.py",
+        "events.is_last[event - 1] = False",
+        "events.is_last[event - 1] = True",
+        ENGINE,
+    ),
+    Fault(
+        "replay/engine.py",
+        "if there is None or _stated(there) != _stated(here):",
+        "if there is None:",
+        ENGINE,
+    ),
+    Fault(
+        "replay/sources.py",
+        'kind="stable")] = np.arange(len(ranks))',
+        'kind="stable")[::-1]] = np.arange(len(ranks))',
+        ENGINE,
+    ),
+    # the caches
+    Fault(
+        "replay/cache.py",
+        "return content if header.startswith(_digest(content)) else None",
+        "return content",
+        "tests/replay/test_compile.py",
+    ),
+    Fault(
+        "replay/compile.py",
+        "{getattr(kind, 'fields', '')} ",
+        "",
+        "tests/replay/test_compile.py",
+    ),
+    # evaluation, consistency, metrics
+    Fault(
+        "replay/evaluation.py",
+        "(stream.publish_time_ns - epochs[run])[known] * 1e-9",
+        "(stream.publish_time_ns - epochs[0])[known] * 1e-9",
+        EVALUATION,
+    ),
+    Fault(
+        "replay/evaluation.py",
+        "(span <= gap_limit_s * 1e9)",
+        "(span < gap_limit_s * 1e9)",
+        EVALUATION,
+    ),
+    Fault(
+        "replay/evaluation.py",
+        "tail = 0.5 * (1 - probability)",
+        "tail = 1 - probability",
+        EVALUATION,
+    ),
+    Fault(
+        "replay/evaluation.py",
+        "sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))",
+        "sigma = np.diagonal(errors.covariance, axis1=1, axis2=2)",
+        EVALUATION,
+    ),
+    Fault(
+        "replay/consistency.py",
+        "return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)",
+        "return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1) ** 2",
+        "tests/replay/test_consistency.py",
+    ),
+    Fault(
+        "replay/consistency.py",
+        "np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)",
+        "np.pi * stats.chi2.ppf(probability, 2) * squared",
+        "tests/replay/test_consistency.py",
+    ),
+    Fault(
+        "replay/metrics.py",
+        "innovations.squared.sum() / innovations.degrees.sum()",
+        "(innovations.squared / innovations.degrees).mean()",
+        f"{EVALUATION} tests/replay/test_metrics.py",
+    ),
+    Fault(
+        "replay/metrics.py",
+        "float(1 - innovations.accepted.mean())",
+        "float(innovations.accepted.mean())",
+        f"{EVALUATION} tests/replay/test_metrics.py",
+    ),
+    # tracks, sets, verification
+    Fault(
+        "replay/tracks.py",
+        "rows, columns = linear_sum_assignment(counts, maximize=True)",
+        "rows, columns = np.arange(len(thing)), counts.argmax(axis=1)",
+        "tests/replay/test_report_tracker.py tests/replay/test_metrics.py",
+    ),
+    Fault(
+        "replay/tracks.py",
+        'shares = table.loc[table["reports"] > reports, column]',
+        'shares = table.loc[table["reports"] >= reports, column]',
+        "tests/replay/test_report_tracker.py tests/replay/test_metrics.py",
+    ),
+    Fault(
+        "replay/set_distances.py",
+        "costs = np.minimum(cdist(first, second), cutoff) ** order",
+        "costs = np.minimum(cdist(first, second) ** order, cutoff)",
+        "tests/replay/test_set_distances.py",
+    ),
+    Fault(
+        "replay/set_distances.py",
+        "pairs = pairs[pairs < cutoff**order]",
+        "pairs = pairs[pairs <= cutoff**order]",
+        "tests/replay/test_set_distances.py",
+    ),
+    Fault(
+        "replay/set_errors.py",
+        'elements["mean"][end - sizes["elements"][step] : end]',
+        'elements["mean"][end - sizes["elements"][0] : end]',
+        "tests/replay/test_set_errors.py",
+    ),
+    Fault(
+        "replay/verification.py",
+        "last = np.append(falling[1:] != falling[:-1], True)",
+        "last = np.ones(len(falling), bool)",
+        FUSION,
+    ),
+    Fault(
+        "replay/verification.py",
+        'np.searchsorted(curve.false_accept, false_accept, side="right") - 1',
+        'np.searchsorted(curve.false_accept, false_accept, side="left") - 1',
+        FUSION,
+    ),
+    Fault(
+        "replay/verification.py",
+        "right = (fused.score > (fused.threshold or 0.0)) == fused.genuine",
+        "right = (fused.score >= (fused.threshold or 0.0)) == fused.genuine",
+        FUSION,
+    ),
+    Fault(
+        "replay/verification.py",
+        "weight = np.where(genuine, drawn[probe], drawn[probe] * drawn[gallery])",
+        "weight = drawn[probe] * drawn[gallery]",
+        FUSION,
+    ),
+    # the tangent space, distributions, samplings
+    Fault(
+        "replay/tangent.py",
+        "relative = compose(conjugate(truth[:, columns]), estimate[:, columns])",
+        "relative = compose(estimate[:, columns], conjugate(truth[:, columns]))",
+        "tests/replay/test_tangent.py",
+    ),
+    Fault(
+        "replay/tangent.py",
+        "return (1.0 if x.shape[1] == 2 else 4.0) * local[:, 1:, 1:]",
+        "return (1.0 if x.shape[1] == 2 else 2.0) * local[:, 1:, 1:]",
+        "tests/replay/test_tangent.py",
+    ),
+    Fault(
+        "replay/distributions/wrapped_normal_kernels.py",
+        "variances[k] = min(spread[k, k] - 2.0 * math.log1p",
+        "variances[k] = min(spread[k, k] - math.log1p",
+        "tests/replay/test_wrapped_normal.py",
+    ),
+    Fault(
+        "replay/distributions/bingham_kernels.py",
+        "z -= z[len(z) - 1]",
+        "z -= z[0]",
+        "tests/replay/test_bingham_filter.py",
+    ),
+    Fault(
+        "replay/sampling/samplers.py",
+        "weights[0] = kappa / spread",
+        "weights[0] = 1 / (2 * spread)",
+        "tests/replay/test_samplings.py",
+    ),
+    Fault(
+        "replay/sampling/samplers.py",
+        "return q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]",
+        "return q",
+        "tests/replay/test_samplings.py",
+    ),
+    # estimators
+    Fault(
+        "replay/estimators/covariance_intersection.py",
+        "entry = information[i, row, k] - shares[i] * common[row, k]",
+        "entry = information[i, row, k] - shares[1 - i] * common[row, k]",
+        "tests/replay/test_covariance_intersection.py",
+    ),
+    Fault(
+        "replay/estimators/inertial.py",
+        "integrate(_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s)), moments, work)",
+        "integrate(_isotropic(model.drift_sigma_rad * elapsed_s), moments, work)",
+        "tests/replay/test_inertial.py",
+    ),
+    Fault(
+        "replay/estimators/inertial.py",
+        "covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s",
+        "covariance[i, i] += model.drift_sigma_rad**2",
+        "tests/replay/test_inertial.py",
+    ),
+    Fault(
+        "replay/estimators/biometrics.py",
+        "learnt = ~judged & (pairs.fold[pairs.probe] != fold)",
+        "learnt = ~judged",
+        FUSION,
+    ),
+    Fault(
+        "replay/estimators/biometrics.py",
+        "judged = pairs.fold[pairs.gallery] == fold",
+        "judged = pairs.fold[pairs.probe] == fold",
+        FUSION,
+    ),
+    Fault(
+        "replay/estimators/biometrics.py",
+        "prior = np.log(genuine.sum() / (~genuine).sum())",
+        "prior = 0.0",
+        FUSION,
+    ),
+    Fault(
+        "replay/tracks.py",
+        "live_ns = round(live_s * 1e9)",
+        "live_ns = round(live_s * 1e6)",
+        "tests/replay/test_report_tracker.py",
+    ),
+    Fault(
+        "replay/timeline/show.py",
+        "return digest.hexdigest()[:16]",
+        'return "0" * 16',
+        "tests/replay/test_timeline.py",
+    ),
+    # the pipeline
+    Fault(
+        "pipeline/ensemble.py",
+        "return digest.hexdigest()",
+        'return "0" * 64',
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/commands.py",
+        'digest.update(hashlib.file_digest(file, "sha256").digest())',
+        "pass",
+        "tests/pipeline/test_command_line.py",
+    ),
+    Fault(
+        "pipeline/ensemble.py",
+        "record = partial(_record, scenario, dict(parameters), seed)",
+        "record = partial(_record, scenario, dict(parameters), 0)",
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/results.py",
+        'if not re.search(r"\\bnan\\b", claim.ours):',
+        "if True:",
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/results.py",
+        "return float(value) if value is not None and math.isfinite(value) else None",
+        "return float(value) if value is not None and not math.isnan(value) else None",
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/experiment.py",
+        "return path.stem, build(Experiment, {**merge(values, own), **over}, where)",
+        "return path.stem, build(Experiment, {**over, **merge(values, own)}, where)",
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/information.py",
+        "if defaults.get(name) != value}",
+        "if name not in defaults}",
+        "tests/pipeline/test_command_line.py",
+    ),
+]

@@ -1,0 +1,25 @@
+"""The table of faults stays true: a fault that no longer fits its file would be reported as caught."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.mutants.faults import FAULTS, Fault, faulty
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.path}:{fault.old[:40]!r}")
+def test_a_fault_stands_in_its_file_and_is_python(fault: Fault):
+    sound = (ROOT / fault.path).read_text(encoding="utf-8")
+    assert ast.dump(ast.parse(faulty(fault, sound))) != ast.dump(ast.parse(sound))
+    assert all((ROOT / path).is_file() for path in fault.tests.split())
+
+
+def test_faults_are_many_and_in_all_rooms():
+    assert len(set(FAULTS)) == len(FAULTS) >= 60
+    rooms = {fault.path.partition("/")[0] for fault in FAULTS}
+    assert rooms == {"recorders", "replay", "pipeline"}
+    with pytest.raises(ValueError, match=r"README.md has 'no such text' 0 times; state it anew"):
+        faulty(Fault("README.md", "no such text", "", ""), (ROOT / "README.md").read_text("utf-8"))
