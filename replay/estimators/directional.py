@@ -139,9 +139,7 @@ def _start_bingham(topic: str, d: int, given: Given[BinghamParameters]) -> tuple
     stated = distributions(given, topic, d)
     noise = BinghamNoise(as_bingham(stated.system), as_bingham(stated.measurement))
 
-    def advance(
-        state: Bingham, offsets: Integers, measured: Floats
-    ) -> tuple[Bingham, Floats, Floats]:
+    def advance(state: Bingham, offsets: Integers, measured: Floats) -> tuple[Bingham, Floats, Floats]:
         after, found = run_bingham_filter(noise, state, _steps(offsets, measured))
         return after, found.mode, found.covariance
 
@@ -153,9 +151,7 @@ def _start_kalman(topic: str, d: int, given: Given[KalmanParameters]) -> tuple[A
     noise = GaussianNoise(as_covariance(stated.system), as_covariance(stated.measurement))
     mode = np.eye(d)[0] if stated.prior.distribution == "gaussian" else as_bingham(stated.prior).mode
 
-    def advance(
-        state: Gaussian, offsets: Integers, measured: Floats
-    ) -> tuple[Gaussian, Floats, Floats]:
+    def advance(state: Gaussian, offsets: Integers, measured: Floats) -> tuple[Gaussian, Floats, Floats]:
         rotated = given.parameters.rotated
         after, found = run_kalman_filter(noise, state, _steps(offsets, measured), rotated=rotated)
         return after, found.mean, found.tangent
