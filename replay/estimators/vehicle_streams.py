@@ -19,7 +19,7 @@ from recorders.log import Topic, schemas
 from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
-from replay.components import Components
+from replay.components import Components, components_of
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import MISSED, Scanning
 from replay.estimators.vehicle_updates import (
@@ -36,15 +36,14 @@ from replay.estimators.vehicle_updates import (
     where,
 )
 from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
-from replay.failures import reason_stream
+from replay.failures import Failure, reason_stream
 from replay.measurements import PLANE, read_fixes, read_vectors
 from replay.priors import gaussians
-from replay.results import ALL_WELL, failures_of, innovation_stream, state_stream
+from replay.results import failures_by_run, innovation_stream, state_stream
 
 Booleans = NDArray[np.bool_]
 
-STATE: Components = dict.fromkeys(PLANE_MOTION, "linear")
-POSE_COMPONENTS: Components = {**PLANE, "heading_rad": "angle"}
+POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
 FAILED = "the estimate is no longer finite"
 
 
@@ -326,11 +325,11 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     runs, count = frames.time_ns.shape
     said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
 
-    def states(case: str, components: Components, own: slice, told: Booleans) -> Ragged:
+    def gaussians(case: str, names: Sequence[str], own: slice, told: Booleans) -> Ragged:
         stream = state_stream(
             f"/estimates/{setup.name}/{case}/state",
             frames.time_ns[told],
-            components,
+            components_of(names),
             f"/{case}/truth",
             results.mean[told][:, own],
             results.covariance[told][:, own, own],
@@ -341,6 +340,9 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
         """What was associated with a vehicle; the target is the detection's number in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
         told = detection != MISSED
+        squared = np.einsum(
+            "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
+        )
         stream = innovation_stream(
             f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
             frames.time_ns[told],
@@ -350,9 +352,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
             accepted=np.ones(told.sum(), np.int64),
             innovation=innovation[told],
             covariance=spread[told],
-            squared=np.einsum(
-                "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
-            ),
+            squared=squared,
         )
         return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
 
@@ -364,10 +364,13 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
             yield innovations(vehicle)
     if setup.has_pose:
         is_found = results.covariance[:, :, -1, -1] > 0.0
-        yield states("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
-    last_ns = frames.time_ns[np.arange(runs), np.maximum(said.sum(axis=1), 1) - 1]
-    well = np.full(runs, ALL_WELL)
-    yield failures_of(f"/estimates/{setup.name}", well, np.where(failing, 0, well), last_ns, [FAILED])
+        yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
+    last = np.maximum(said.sum(axis=1), 1) - 1
+    failures = {
+        run: Failure(int(frames.time_ns[run, last[run]]), FAILED)
+        for run in np.flatnonzero(failing).tolist()
+    }
+    yield failures_by_run(f"/estimates/{setup.name}", failures, runs)
     if setup.fixes == "known":
         at_run, at_frame, which = np.nonzero(frames.skipped)
         mend = "its fixes lack a covariance; give --set sigma_fix_m=..."
