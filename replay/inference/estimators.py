@@ -43,7 +43,7 @@ from replay.inference.happenings import (
     with_ticks,
 )
 from replay.inference.methods import METHODS, Method
-from replay.inference.model import Model, ModelParameters
+from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.priors import gaussians
