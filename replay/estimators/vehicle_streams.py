@@ -359,7 +359,7 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     vehicles = setup.motion.vehicles
     for vehicle in range(vehicles):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        yield states(f"vehicle{setup.numbers[vehicle]}", STATE, own, said)
+        yield gaussians(f"vehicle{setup.numbers[vehicle]}", PLANE_MOTION, own, said)
         if setup.fixes == "hungarian":
             yield innovations(vehicle)
     if setup.has_pose:
