@@ -328,6 +328,7 @@ def test_innovations_count_the_components_that_were_measured():
         innovation=[[0.1, 0.2], [np.nan, 0.2], [9, 9]],
         covariance=np.full((3, 4), np.nan),
         normalised_innovation_squared=[2.0, 1.5, 50.0],
+        log_likelihood=[-1.0, -0.5, 0.0],
     )
     innovations = innovations_of(gather([stream]))
     assert innovations.degrees.tolist() == [2, 1, 2]
