@@ -54,7 +54,8 @@ def replay_logs(
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    check_files([*((path, ESTIMATES) for path in paths), *timelines], {"log": logs})
+    inputs = {"log": logs, "start": [Path(origin) for origin in origins]}
+    check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     stated = {"model": model, "every_s": every_s}
     chosen = {key: value for key, value in stated.items() if value is not None}
     estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})

@@ -125,6 +125,11 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     bounds = np.stack([ragged.offsets for ragged in everything]) + starts[:, None]
     offsets = sum((ragged.offsets for ragged in everything), np.zeros(1, np.int64))
     count = len(times_ns)
+    if len(everything) == 1:  # in order already
+        is_last = np.ones(count, bool)
+        is_last[:-1] = times_ns[1:] != times_ns[:-1]
+        is_last[offsets[1:][np.diff(offsets) > 0] - 1] = True
+        return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)

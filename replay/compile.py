@@ -50,6 +50,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
+        if _is_uncompiled():
+            return np.errstate(all="ignore")(function)
         bundle = _Bundle()
         name = bundle.add(function.__name__, function)
         names = ", ".join(inspect.signature(function).parameters)
@@ -80,7 +82,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
     array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if is_uncompiled():
+    if _is_uncompiled():
         return uncompiled_over_runs(run_once)
     bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
@@ -92,16 +94,6 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         f"        {kernel}(run, {names})",
     )
     return partial(_over_runs, name=run_once.__name__, loop=loop)
-
-
-def is_uncompiled() -> bool:
-    """Whether kernels are to run as plain Python, to find a fault."""
-    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
-
-
-def is_checked() -> bool:
-    """Whether an index beyond an array is to raise in compiled kernels."""
-    return os.environ.get("FUSELOG_BOUNDSCHECK") == "1"
 
 
 class _InlinedLibrary(JITCodeLibrary):
@@ -121,8 +113,13 @@ class Inlined(Compiler):
     def define_pipelines(self) -> Any:
         """The usual passes, into a library of another kind."""
         codegen = self.state.targetctx.codegen()
-        self.state.library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)
-        return super().define_pipelines()
+        library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        self.state.library = library
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
+
+
+def _is_uncompiled() -> bool:
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -173,9 +170,10 @@ class _Bundle:
     """
 
     def __init__(self, allocates: bool = True) -> None:
-        self.options = f"_nrt={allocates}, boundscheck={is_checked()}"
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt={allocates}{bounds}"
         self.imports = {"import numba", "import numpy"}
         if not allocates:  # one piece is faster where no counting of references stands in the way
             inner += ", forceinline=True, pipeline_class=Inlined"

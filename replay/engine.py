@@ -144,8 +144,11 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     """
     estimator, parameters = configure(label, settings)
     first = sources[0]
-    with foreign_code(f"estimator {label}"):
-        bound = estimator.bind(label, first.topics, parameters)
+    try:
+        with foreign_code(f"estimator {label}"):
+            bound = estimator.bind(label, first.topics, parameters)
+    except BadInput as error:
+        raise BadInput(f"{first.name}: {error}") from error
     if not bound:
         raise BadInput(
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
@@ -281,8 +284,10 @@ def _refuse_old_priors(
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
     for topic in bound.priors.keys() - bound.given.keys():
         for run, source in enumerate(sources):
+            if source.start_ns is None:
+                continue
             times_ns = whole[topic].of_run(run).times(order)[:1]
-            if source.start_ns is not None and len(times_ns) and times_ns[0] < source.start_ns:
+            if len(times_ns) and times_ns[0] < source.start_ns:
                 raise BadInput(
                     f"{source.name}: the replay would start {bound.name} from {topic}, which is "
                     f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "

@@ -6,7 +6,7 @@ that has them, name the outputs, and tell of a run that failed while the others 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Generic, NamedTuple
 
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
-from recorders.models.planar import wrap_angle
 from recorders.parameters import ParametersType
 from replay.blocks import Block, Ragged, ragged_rows
 from replay.compile import compile_over_runs, uncompiled_over_runs
 from replay.components import Components
 from replay.engine import Batch, Bound, Estimator, Recursive
-from replay.failures import Failure, failure_stream, reason_of, reason_stream
+from replay.failures import Failure, reason_of, reason_stream
 from replay.measurements import Vectors, numbers_of
 from replay.priors import gaussians
+from replay.results import failures_by_run, innovation_stream, state_stream
 from replay.tangent import tangent_components
 
 Floats = NDArray[np.float64]
@@ -138,7 +138,8 @@ def recursive(
     measured: Components | None = None,
     vectors: Mapping[str, Vectors] | None = None,
     start: Callable[[Given[ParametersType]], tuple[Any, Any]],
-    follow: Callable[[int, Any, Messages, Any, Results], None],
+    follow: Callable[[int, Any, Messages, Any, Results], None] | None = None,
+    follow_all: Callable[[Any, Messages, Any, Results], None] | None = None,
     compiled: bool = True,
 ) -> Estimator[ParametersType]:
     """An estimator that follows its messages in time.
@@ -158,15 +159,23 @@ def recursive(
             runs. A run has failed where its row in the first of them is not finite.
         follow: follow(run, settings, messages, state, results) takes one run through a block of its
             messages: it changes that run's rows of `state`, and fills `results`, in place.
+        follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
+            at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
         compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
     """
 
     @cache
-    def loop() -> Callable[..., None]:
-        return compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
+    def following() -> Callable[[Any, Messages, Any, Results], None]:
+        if follow_all is not None:
+            return follow_all
+        assert follow is not None
+        loop = compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
+        return lambda settings, messages, state, results: loop(
+            len(messages.offsets) - 1, settings, messages, state, results
+        )
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
-        outputs = _Outputs(name, _resolved(truth, prefix), components, measured or {})
+        outputs = _Outputs(f"/estimates/{name}", _resolved(truth, prefix), components, measured or {})
         wanted = {found[topic].name: each for topic, each in (vectors or {}).items()}
 
         def started(maps: Mapping[str, Ragged], runs: int) -> _Carried:
@@ -182,7 +191,7 @@ def recursive(
             state = type(before)(*(array.copy() for array in before))
             messages, skipped = _messages(block, wanted, values)
             results = outputs.blank(len(messages.time_ns))
-            loop()(len(told), settings, messages, state, results)
+            following()(settings, messages, state, results)
             is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
             failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
             made = outputs.of_block(messages, results, np.flatnonzero(failing))
@@ -212,7 +221,7 @@ def batch(
     """
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
-        outputs = _Outputs(name, _resolved(truth, prefix), components, {})
+        outputs = _Outputs(f"/estimates/{name}", _resolved(truth, prefix), components, {})
 
         def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
             return outputs.of_solved(solve({each: given[found[each].name] for each in found}, values))
@@ -347,39 +356,44 @@ def _messages(
         numbers_of(ragged.stream, vectors.get(topic), parameters)
         for topic, ragged in block.streams.items()
     ]
-    width = max(table.shape[1] for table, _ in read)
-    padded = [
-        np.pad(table, ((0, 0), (0, width - table.shape[1])), constant_values=np.nan) for table, _ in read
-    ]
-    value = np.concatenate(padded)[events.source]
-    skip = np.concatenate([missing for _, missing in read])[events.source]
+    tables, missing = zip(*read, strict=True)
+    skip = np.concatenate(missing)[events.source]
     reasons = [vectors[topic].complaint(topic) if topic in vectors else "" for topic in block.streams]
     skipped = _Skipped(
         ragged_rows(skip, events.offsets), events.time_ns[skip], events.topic[skip], reasons
     )
+    rows = ~skip if skip.any() else slice(None)
     kept = Messages(
-        ragged_rows(~skip, events.offsets), events.time_ns[~skip], events.topic[~skip], value[~skip]
+        ragged_rows(~skip, events.offsets),
+        events.time_ns[rows],
+        events.topic[rows],
+        _side_by_side(tables)[events.source][rows],
     )
     return kept, skipped
+
+
+def _side_by_side(tables: Sequence[Floats]) -> Floats:
+    """Tables one after another, NaN where one has fewer columns than the widest."""
+    width = max(table.shape[1] for table in tables)
+    found = np.full((sum(map(len, tables)), width), np.nan)
+    for begin, table in zip(np.cumsum([0, *map(len, tables)]), tables, strict=False):
+        found[begin : begin + len(table), : table.shape[1]] = table
+    return found
 
 
 @dataclass(frozen=True)
 class _Outputs:
     """The output topics of one bound estimator: state, failures and, where told, innovations."""
 
-    name: str
+    topic: str
     truth: str
     components: Components
     measured: Components
 
-    @property
-    def tangent(self) -> int:
-        """How many components the tangent space has."""
-        return len(tangent_components(list(self.components), list(self.components.values())))
-
     def blank(self, rows: int) -> Results:
         """Results that say nothing."""
-        d, t, m = len(self.components), self.tangent, len(self.measured)
+        d, m = len(self.components), len(self.measured)
+        t = len(tangent_components(list(self.components), list(self.components.values())))
         return Results(
             np.full((rows, d), np.nan),
             np.full((rows, t, t), np.nan),
@@ -393,92 +407,70 @@ class _Outputs:
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
         """The outputs of one block; of several estimates at a stamp the last stands."""
         # what is said of a covariance that is none is for the replay to find
-        said = np.isfinite(results.mean.sum(axis=1))
-        rows = np.flatnonzero(said)
-        run = np.searchsorted(messages.offsets, rows, side="right")
-        is_last = np.ones(len(rows), bool)
-        is_last[:-1] = (np.diff(messages.time_ns[rows]) != 0) | (np.diff(run) != 0)
-        rows = rows[is_last]
-        estimates = Estimates(messages.time_ns[rows], results.mean[rows], results.covariance[rows])
-        ends = np.empty(len(failing), np.int64)
-        for index, run_number in enumerate(failing):
-            begin, end = messages.offsets[run_number : run_number + 2]
+        said = np.isfinite(np.einsum("nd->n", results.mean))
+        rows = _last_of_stamps(messages, np.flatnonzero(said))
+        state = self._state(messages.time_ns[rows], results.mean[rows], results.covariance[rows])
+        failures = {}
+        for run in failing.tolist():
+            begin, end = messages.offsets[run : run + 2]
             last = np.flatnonzero(said[begin:end]).max(initial=-1)
-            ends[index] = min(begin + last + 1, end - 1)
-        failures = [Failure(int(messages.time_ns[row]), DIVERGED) for row in ends]
+            end_ns = messages.time_ns[min(begin + last + 1, end - 1)]
+            failures[run] = Failure(int(end_ns), DIVERGED)
         made = [
-            Ragged(self._state(estimates), np.searchsorted(rows, messages.offsets)),
-            Ragged(self._failure(failures), np.searchsorted(ends, messages.offsets)),
+            Ragged(state, np.searchsorted(rows, messages.offsets)),
+            failures_by_run(self.topic, failures, len(messages.offsets) - 1),
         ]
         return [*made, self._innovations(messages, results)] if self.measured else made
 
     def of_solved(self, solved: Solved) -> list[Ragged]:
         """The outputs of a batch."""
         offsets, estimates, failures = solved
-        failed = sorted(failures)
-        failure = self._failure([failures[run] for run in failed])
+        time_ns, solution = estimates.time_ns, estimates.solution
         made = [
-            Ragged(self._state(estimates), offsets),
-            Ragged(failure, np.searchsorted(failed, np.arange(len(offsets)))),
+            Ragged(self._state(time_ns, estimates.mean, estimates.covariance), offsets),
+            failures_by_run(self.topic, failures, len(offsets) - 1),
         ]
-        if estimates.solution:
-            columns = estimates.solution._asdict()
-            solution = self._stream("solution", schemas.SOLUTION, estimates.time_ns, {}, **columns)
-            made.append(Ragged(solution, offsets))
+        if solution:
+            topic, metadata = f"{self.topic}/solution", {"truth": self.truth}
+            columns = solution._asdict()
+            told = make_stream(topic, schemas.SOLUTION, time_ns, metadata=metadata, **columns)
+            made.append(Ragged(told, offsets))
         return made
 
-    def _state(self, estimates: Estimates) -> Stream:
-        mean = np.array(estimates.mean, dtype=float)
-        angular = [index for index, kind in enumerate(self.components.values()) if kind == "angle"]
-        mean[:, angular] = wrap_angle(mean[:, angular])
-        covariance = np.reshape(estimates.covariance, (len(mean), self.tangent**2))
-        columns = {"mean": mean, "covariance": covariance}
-        blank = self._stream(
-            "state",
-            schemas.GAUSSIAN_ESTIMATE,
-            estimates.time_ns,
-            _named(self.components),
-            **{name: np.zeros_like(column) for name, column in columns.items()},
+    def _state(self, time_ns: Integers, mean: Floats, covariance: Floats) -> Stream:
+        return state_stream(
+            f"{self.topic}/state", time_ns, self.components, self.truth, mean, covariance
         )
-        return replace(blank, columns={**blank.columns, **columns})
-
-    def _failure(self, failures: Sequence[Failure]) -> Stream:
-        return failure_stream(f"/estimates/{self.name}/failure", failures)
 
     def of_skipped(self, skipped: _Skipped) -> list[Ragged]:
         """What was not used, for estimators of what may lack a covariance."""
         if not any(skipped.reasons):
             return []
-        topic = f"/estimates/{self.name}/skipped"
+        topic = f"{self.topic}/skipped"
         stream = reason_stream(topic, schemas.SKIPPED, skipped.time_ns, skipped.reason, skipped.reasons)
         return [Ragged(stream, skipped.offsets)]
 
     def _innovations(self, messages: Messages, results: Results) -> Ragged:
         rows = np.flatnonzero(np.isfinite(results.squared))
-        stream = self._stream(
-            "innovation",
-            schemas.INNOVATION,
+        stream = innovation_stream(
+            f"{self.topic}/innovation",
             messages.time_ns[rows],
-            _named(self.measured),
+            self.measured,
+            self.truth,
             target_id=results.target[rows],
             accepted=results.accepted[rows],
             innovation=results.innovation[rows],
-            covariance=results.innovation_covariance[rows].reshape(len(rows), len(self.measured) ** 2),
-            normalised_innovation_squared=results.squared[rows],
+            covariance=results.innovation_covariance[rows],
+            squared=results.squared[rows],
         )
         return Ragged(stream, np.searchsorted(rows, messages.offsets))
 
-    def _stream(
-        self, leaf: str, schema: Schema, time_ns: Integers, metadata: Mapping[str, str], **columns: Any
-    ) -> Stream:
-        return make_stream(
-            f"/estimates/{self.name}/{leaf}",
-            schema,
-            time_ns,
-            metadata={**metadata, "truth": self.truth},
-            **columns,
-        )
 
-
-def _named(components: Components) -> dict[str, str]:
-    return {"components": ",".join(components), "kinds": ",".join(components.values())}
+def _last_of_stamps(messages: Messages, rows: Integers) -> Integers:
+    """Of these rows, in order, the last one of every stamp of a run."""
+    time_ns = messages.time_ns[rows]
+    is_last = np.ones(len(rows), bool)
+    np.not_equal(time_ns[1:], time_ns[:-1], out=is_last[:-1])
+    ends = np.searchsorted(rows, messages.offsets[1:])
+    is_last[ends[ends > 0] - 1] = True
+    return rows[is_last]

@@ -1,6 +1,7 @@
 """What estimators say, as streams: states, innovations, what was passed over, and who failed."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from recorders.log import Stream, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.blocks import Ragged
 from replay.components import Components
-from replay.failures import reason_stream
+from replay.failures import Failure, failure_stream, reason_stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -24,21 +25,31 @@ def named(components: Mapping[str, str]) -> dict[str, str]:
 
 
 def state_stream(
-    topic: str, time_ns: Integers, components: Components, truth: str, mean: Floats, covariance: Floats
+    topic: str,
+    time_ns: Integers,
+    components: Components,
+    truth: str | None,
+    mean: Floats,
+    covariance: Floats,
 ) -> Stream:
-    """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space."""
+    """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
+
+    `truth` is the topic that they are compared with; None where there is nothing to compare.
+    """
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
     if angular:
         mean = mean.copy()
         mean[:, angular] = wrap_angle(mean[:, angular])
-    return make_stream(
+    columns = {"mean": mean, "covariance": _flat(covariance)}
+    blank = make_stream(
         topic,
         schemas.GAUSSIAN_ESTIMATE,
         time_ns,
-        metadata={**named(components), "truth": truth},
-        mean=mean,
-        covariance=_flat(covariance),
+        metadata=named(components) if truth is None else {**named(components), "truth": truth},
+        **{name: np.broadcast_to(0.0, column.shape) for name, column in columns.items()},
     )
+    # numbers that are none are for the replay to find: they end their run alone
+    return replace(blank, columns={**blank.columns, **columns})
 
 
 def innovation_stream(
@@ -90,3 +101,10 @@ def failures_of(
     failed = np.flatnonzero((after >= 0) & (before == ALL_WELL))
     stream = reason_stream(f"{topic}/failure", schemas.FAILURE, time_ns[failed], after[failed], reasons)
     return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))
+
+
+def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> Ragged:
+    """The failures of some of the runs, by their numbers, on `topic`/failure."""
+    failed = sorted(failures)
+    stream = failure_stream(f"{topic}/failure", [failures[run] for run in failed])
+    return Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))

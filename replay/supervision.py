@@ -276,10 +276,8 @@ class Watch:
                 self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
                 continue
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
-            self._failed[run] = Failure(
-                int(last_ns[run]),
-                f"it gave no estimate in the last {silent_s:.1f} s of its measurements",
-            )
+            reason = f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
+            self._failed[run] = Failure(int(last_ns[run]), reason)
 
 
 class _Rhythm:

@@ -18,7 +18,17 @@ from recorders.models.orientation import require_unit
 from replay.compile import compile_over_runs
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
-from replay.distributions.bingham_kernels import compose, framed, predict, turn_columns, update
+from replay.distributions.bingham_kernels import (
+    compose,
+    compose_columns,
+    framed,
+    integrate,
+    inverse,
+    predict,
+    turn_columns,
+    update,
+    weighted_outer,
+)
 from replay.distributions.gaussian_kernels import condition
 
 
@@ -81,7 +91,38 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return compile_over_runs(run_once)
 
 
-def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tuple[Bingham, Bingham]:
+class BinghamEstimates(NamedTuple):
+    """The distribution after every row, and what a replay says of it.
+
+    Attributes:
+        axes, concentrations: see `Bingham`, batch axis (rows,).
+        covariance: of small rotations about the mode, (rows, t, t), t = 1 or 3; see `replay.tangent`.
+    """
+
+    axes: NDArray[np.float64]
+    concentrations: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @property
+    def mode(self) -> NDArray[np.float64]:
+        """The most probable axes (rows, d)."""
+        return self.axes[..., -1]
+
+
+class GaussianEstimates(NamedTuple):
+    """The Gaussian after every row, (rows, d) and (rows, d, d), and its covariance of small rotations.
+
+    The latter, `tangent` (rows, t, t), is as in `BinghamEstimates`.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+
+
+def run_bingham_filter(
+    noise: BinghamNoise, state: Bingham, steps: Steps
+) -> tuple[Bingham, BinghamEstimates]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
     Args:
@@ -90,13 +131,15 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
         steps: see there.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
-        fit does not converge, the run is NaN from there on and the others go on.
+        The state after the last row, and the estimates of all rows. Where a moment fit does not
+        converge, the run is NaN from there on and the others go on.
     """
     rows, d = steps.measurement.shape
     identity = np.eye(d)[0]
     state = Bingham(state.axes.copy(), state.concentrations.copy())
-    estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
+    estimates = BinghamEstimates(
+        np.empty((rows, d, d)), np.empty((rows, d)), np.empty((rows, d - 1, d - 1))
+    )
     _over_runs(_bingham_run)(
         len(steps.offsets) - 1,
         steps,
@@ -109,9 +152,16 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
 
 
 def _bingham_run(
-    run: int, steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
+    run: int,
+    steps: Steps,
+    system: NDArray,
+    inverse_noise: NDArray,
+    state: Bingham,
+    estimates: BinghamEstimates,
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
+    d = len(z)
+    moments, local, work = np.empty(d), np.empty((d, d)), np.empty((d, d))
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):
             turn_columns(axes, steps.increment[row])
@@ -124,11 +174,16 @@ def _bingham_run(
             axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
+        # in the frame of the mode small moments keep their digits next to large ones
+        integrate(z, moments, work)
+        compose_columns(inverse(axes[:, d - 1]), axes, local)
+        weighted_outer(local, moments, work)
+        _store_rotations(work, estimates.covariance[row])
 
 
 def run_kalman_filter(
     noise: GaussianNoise, state: Gaussian, steps: Steps, *, rotated: bool
-) -> tuple[Gaussian, Gaussian]:
+) -> tuple[Gaussian, GaussianEstimates]:
     """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
 
     Args:
@@ -138,19 +193,26 @@ def run_kalman_filter(
         rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
 
     Returns:
-        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
-        covariance loses its definiteness is NaN from there on.
+        The state after the last row, and the estimates of all rows; a run whose covariance loses its
+        definiteness is NaN from there on.
     """
     rows, d = steps.measurement.shape
     state = Gaussian(state.mean.copy(), state.covariance.copy())
-    estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
+    estimates = GaussianEstimates(
+        np.empty((rows, d)), np.empty((rows, d, d)), np.empty((rows, d - 1, d - 1))
+    )
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
     _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates)
     return state, estimates
 
 
 def _kalman_run(
-    run: int, steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
+    run: int,
+    steps: Steps,
+    noise: GaussianNoise,
+    rotated: bool,
+    state: Gaussian,
+    estimates: GaussianEstimates,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -167,6 +229,18 @@ def _kalman_run(
             x /= math.sqrt((x * x).sum())
         estimates.mean[row] = x
         estimates.covariance[row] = p
+        _store_rotations(framed(p, inverse(x)), estimates.tangent[row])
+
+
+def _store_rotations(local: NDArray, covariance: NDArray) -> None:
+    """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
+
+    See `replay.tangent.vector_part_covariance`.
+    """
+    t = len(covariance)
+    for i in range(t):
+        for j in range(t):
+            covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
 
 
 def _frame(state: NDArray, rotated: bool) -> NDArray:

@@ -26,7 +26,7 @@ from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
 from replay.estimators.landmarks import LANDMARKS, POSE, LocalizationParameters
-from replay.failures import Failure, failure_stream
+from replay.failures import Failure
 from replay.inference.binding import stated
 from replay.inference.gaussian import (
     Floats,
@@ -43,7 +43,7 @@ from replay.inference.generate import Input, derivative
 from replay.inference.happenings import Points, points_of
 from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
 from replay.priors import no_priors, read_priors
-from replay.results import ALL_WELL, failures_of, state_stream
+from replay.results import ALL_WELL, failures_by_run, failures_of, state_stream
 
 Integers = NDArray[np.int64]
 Mode = Literal["alone", "naive", "ci", "joint"]
@@ -439,12 +439,11 @@ def _excluded(
         new = np.flatnonzero(~told[:, robot] & (np.diff(odometry.offsets) > 0))
         told[new, robot] = True
         times_ns = odometry.stream.publish_time_ns[odometry.offsets[new]]
-        failures = [
-            Failure(int(time_ns), str(reasons[run, robot]))
-            for run, time_ns in zip(new, times_ns, strict=True)
-        ]
-        stream = failure_stream(f"/estimates/{name}{prefix}/failure", failures)
-        outputs.append(Ragged(stream, np.searchsorted(new, np.arange(len(told) + 1))))
+        failures = {
+            run: Failure(time_ns, str(reasons[run, robot]))
+            for run, time_ns in zip(new.tolist(), times_ns.tolist(), strict=True)
+        }
+        outputs.append(failures_by_run(f"/estimates/{name}{prefix}", failures, len(told)))
     return told, outputs
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
 from replay.compile import compile_over_runs
-from replay.estimators.gaussian import Floats, Function, cholesky
+from replay.inference.gaussian import Floats, Function, cholesky
 
 Criterion = Literal["trace", "determinant"]
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular

@@ -26,6 +26,7 @@ from replay.estimators.bingham import (
     BinghamNoise,
     Gaussian,
     GaussianNoise,
+    Steps,
     make_steps,
     run_bingham_filter,
     run_kalman_filter,
@@ -38,11 +39,12 @@ from replay.estimators.torus import (
 )
 from replay.measurements import Vectors
 from replay.plain import Given, Messages, Results, recursive
-from replay.tangent import vector_part_covariance
 
 Floats = NDArray[np.float64]
-# State of one run and its measurements -> the state after them, means (n, d), covariances (n, t, t).
-Advance = Callable[[Any, Floats], tuple[Any, Floats, Floats]]
+Integers = NDArray[np.int64]
+# States of all runs, offsets and measurements -> the states after them, means (n, d), covariances
+# (n, t, t).
+Advance = Callable[[Any, Integers, Floats], tuple[Any, Floats, Floats]]
 
 
 class BinghamParameters(Parameters):
@@ -91,14 +93,11 @@ class Distributions(NamedTuple):
     measurement: Noise
 
 
-def follow(run: int, advance: Advance, messages: Messages, state: Any, results: Results) -> None:
-    """Take one run through its measurements."""
-    rows = slice(int(messages.offsets[run]), int(messages.offsets[run + 1]))
-    one = type(state)(*(part[run : run + 1] for part in state))
-    after, mean, covariance = advance(one, messages.value[rows])
+def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
+    """Take all runs through their measurements."""
+    after, results.mean[:], results.covariance[:] = advance(state, messages.offsets, messages.value)
     for part, changed in zip(state, after, strict=True):
-        part[run] = changed[0]
-    results.mean[rows], results.covariance[rows] = mean, covariance
+        part[:] = changed
 
 
 def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
@@ -140,10 +139,9 @@ def _start_bingham(topic: str, d: int, given: Given[BinghamParameters]) -> tuple
     stated = distributions(given, topic, d)
     noise = BinghamNoise(as_bingham(stated.system), as_bingham(stated.measurement))
 
-    def advance(state: Bingham, measured: Floats) -> tuple[Bingham, Floats, Floats]:
-        after, found = run_bingham_filter(noise, state, _steps(measured[:, :d]))
-        moments = bingham.covariance(found)
-        return after, found.mode, vector_part_covariance(found.mode, moments)
+    def advance(state: Bingham, offsets: Integers, measured: Floats) -> tuple[Bingham, Floats, Floats]:
+        after, found = run_bingham_filter(noise, state, _steps(offsets, measured))
+        return after, found.mode, found.covariance
 
     return advance, _widened(as_bingham(stated.prior), given.runs)
 
@@ -153,18 +151,17 @@ def _start_kalman(topic: str, d: int, given: Given[KalmanParameters]) -> tuple[A
     noise = GaussianNoise(as_covariance(stated.system), as_covariance(stated.measurement))
     mode = np.eye(d)[0] if stated.prior.distribution == "gaussian" else as_bingham(stated.prior).mode
 
-    def advance(state: Gaussian, measured: Floats) -> tuple[Gaussian, Floats, Floats]:
+    def advance(state: Gaussian, offsets: Integers, measured: Floats) -> tuple[Gaussian, Floats, Floats]:
         rotated = given.parameters.rotated
-        after, found = run_kalman_filter(noise, state, _steps(measured[:, :d]), rotated=rotated)
-        return after, found.mean, vector_part_covariance(found.mean, found.covariance)
+        after, found = run_kalman_filter(noise, state, _steps(offsets, measured), rotated=rotated)
+        return after, found.mean, found.tangent
 
     return advance, _widened(Gaussian(mode, as_covariance(stated.prior)), given.runs)
 
 
-def _steps(measured: Floats) -> Any:
-    """One run's steps without control input."""
-    count, d = measured.shape
-    return make_steps(np.array([0, count]), np.tile(np.eye(d)[0], (count, 1)), measured)
+def _steps(offsets: Integers, measured: Floats) -> Steps:
+    """Steps without control input."""
+    return make_steps(offsets, np.tile(np.eye(measured.shape[1])[0], (len(measured), 1)), measured)
 
 
 def _widened(state: Any, runs: int) -> Any:
@@ -189,9 +186,10 @@ def _start_headings(
     model, run_filter = heading_model(given), filter_of(given.parameters)
     _, mean, covariance = given.prior("prior")
 
-    def advance(state: WrappedNormal, measured: Floats) -> tuple[WrappedNormal, Floats, Floats]:
-        offsets = np.array([0, len(measured)])
-        after, found = run_filter(model, state, offsets, np.ascontiguousarray(measured))
+    def advance(
+        state: WrappedNormal, offsets: Integers, measured: Floats
+    ) -> tuple[WrappedNormal, Floats, Floats]:
+        after, found = run_filter(model, state, offsets, measured)
         return after, found.mean, found.covariance
 
     return advance, WrappedNormal(mean, covariance)
@@ -214,8 +212,7 @@ def _of_unit_vectors(
         truth="truth",
         vectors={topic: Vectors({topic: len(kinds)})},
         start=partial(start, topic, len(kinds)),
-        follow=follow,
-        compiled=False,
+        follow_all=follow_all,
     )
 
 
@@ -232,8 +229,7 @@ def _of_headings(
         truth="truth",
         vectors={"headings": Vectors({"value": components})},
         start=partial(_start_headings, filter_of),
-        follow=follow,
-        compiled=False,
+        follow_all=follow_all,
     )
 
 

@@ -57,26 +57,16 @@ class GyroParameters(InertialParameters):
     unbiased: bool = True
 
 
-def _follow(
-    run: int,
-    settings: tuple[InertialModel, Advance],
-    messages: Messages,
-    state: Any,
-    results: Results,
+def _follow_all(
+    settings: tuple[InertialModel, Advance], messages: Messages, state: Any, results: Results
 ) -> None:
-    """Take one run through its samples; `value` is specific force, turn rate, magnetic field."""
+    """Take all runs through their samples; `value` is specific force, turn rate, magnetic field."""
     model, advance = settings
-    rows = slice(int(messages.offsets[run]), int(messages.offsets[run + 1]))
-    value = messages.value[rows]
-    offsets = np.array([0, len(value)])
-    samples = InertialSamples(
-        offsets, messages.time_ns[rows], value[:, 3:6], value[:, :3], value[:, 6:9]
-    )
-    before = type(state)(*(part[run : run + 1] for part in state))
-    after, estimates = advance(model, before, samples)
+    force, rate, field = np.split(messages.value, 3, axis=1)
+    samples = InertialSamples(messages.offsets, messages.time_ns, rate, force, field)
+    after, (results.mean[:], results.covariance[:]) = advance(model, state, samples)
     for part, changed in zip(state, after, strict=True):
-        part[run] = changed[0]
-    results.mean[rows], results.covariance[rows] = estimates
+        part[:] = changed
 
 
 def _inertial(
@@ -93,8 +83,7 @@ def _inertial(
         truth="truth",
         vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},
         start=start,
-        follow=_follow,
-        compiled=False,
+        follow_all=_follow_all,
     )
 
 

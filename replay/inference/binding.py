@@ -46,8 +46,6 @@ def topics_of(model: Model, topics: Mapping[str, Topic]) -> list[Found]:
         prefix, _, leaf = name.rpartition("/")
         if leaf != model.prior or prior.schema_name != schemas.GAUSSIAN_ESTIMATE.full_name:
             continue
-        if set(prior.metadata.get("components", "").split(",")) != set(model.state):
-            continue
         control = None
         if model.control is not None:
             control = _topic(topics, prefix, model.control.topic, model.control.schema)
@@ -72,19 +70,57 @@ def _topic(topics: Mapping[str, Topic], prefix: str, name: str, schema: Schema) 
 
 def needs_of(model: Model) -> str:
     """What a log has to have for a model, in words."""
-    parts = [f".../{model.prior} of {', '.join(model.state)}"]
+    return "; ".join(part.words for part in _parts(model, {}, "..."))
+
+
+def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
+    """Which of the models comes nearest to fitting a log, and what the log lacks for it."""
+    prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
+    tried = [(name, _parts(model, topics, each)) for name, model in models.items() for each in prefixes]
+    name, parts = max(tried, key=lambda one: sum(1 if part.is_here else -1 for part in one[1]))
+    if not any(part.is_here for part in parts):
+        return f"it has nothing that {' or '.join(models)} needs"
+    missing = "; ".join(part.words for part in parts if not part.is_here)
+    return f"model {name} comes nearest and lacks {missing}"
+
+
+class _Part(NamedTuple):
+    """Something that a model needs, and whether a log has it."""
+
+    words: str
+    is_here: bool
+
+
+def _parts(model: Model, topics: Mapping[str, Topic], prefix: str) -> list[_Part]:
+    """All that a model needs under one prefix."""
+
+    def part(name: str, schema: Schema, system: str = "") -> _Part:
+        place = name if name.startswith("/") else f"{prefix}/{name}"
+        found = _topic(topics, prefix, name, schema)
+        words = f"{place} ({schema.full_name}"
+        words += f" of system {system})" if system else ")"
+        if place in topics and found is None:
+            words += f", which is {topics[place].schema_name} here"
+        return _Part(words, found is not None and found.metadata.get("system", system) == system)
+
+    words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
+    if is_here:
+        is_here = names_state(topics[f"{prefix}/{model.prior}"], model)
+    parts = [_Part(f"{words} of {', '.join(model.state)}", is_here)]
     if model.control is not None:
-        parts.append(f".../{model.control.topic} ({model.control.schema.full_name})")
+        parts.append(part(model.control.topic, model.control.schema))
     maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
-    parts += [f"{topic} ({each.schema.full_name})" for topic, each in maps.items()]
-    sensors = [
-        f"{'' if each.topic.startswith('/') else '.../'}{each.topic} ({each.schema.full_name})"
-        for each in model.sensors
-    ]
+    parts += [part(topic, each.schema) for topic, each in maps.items()]
+    sensors = [part(each.topic, each.schema, model.system) for each in model.sensors]
     if sensors and model.needs_sensor:
-        one_of = "one of " if len(sensors) > 1 else ""
-        parts.append(one_of + ", ".join(sensors))
-    return "; ".join(parts)
+        words = ("one of " if len(sensors) > 1 else "") + ", ".join(each.words for each in sensors)
+        parts.append(_Part(words, any(each.is_here for each in sensors)))
+    return parts
+
+
+def names_state(prior: Topic, model: Model) -> bool:
+    """Whether a prior's channel names all components of a model's state."""
+    return set(model.state) <= set(prior.metadata.get("components", "").split(","))
 
 
 @cache
@@ -158,6 +194,17 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
             for first, recorder in zip(own, recorders, strict=True)
         ]
     )
+
+
+def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
+    """Why a message was not used, and what would help; "" where no covariance can be missing."""
+    if not sensor.covariance:
+        return ""
+    recorder = _Recorder(dict.fromkeys(number_fields(model.parameters)))
+    if sensor.noise is not None:
+        sensor.noise(recorder)
+    mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))
+    return f"topic {topic}: {sensor.covariance} is missing{mend}"
 
 
 def stated(

@@ -22,6 +22,9 @@ from replay.engine import Bound, Estimator, Recursive
 from replay.failures import reason_stream
 from replay.inference.binding import (
     Found,
+    complaint_of,
+    names_state,
+    nearest,
     needs_of,
     number_fields,
     reading_settings,
@@ -40,7 +43,7 @@ from replay.inference.happenings import (
     with_ticks,
 )
 from replay.inference.methods import METHODS, Method
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.priors import gaussians
@@ -125,17 +128,23 @@ def _bind_fitting(
     named = given.pop("model", None)
     if named is not None:
         models = {named: load("models", named, Model)}
-    fitting = [name for name, model in models.items() if topics_of(model, topics)]
+    found = {name: topics_of(model, topics) for name, model in models.items()}
+    fitting = [name for name in models if found[name]]
+    if len(fitting) > 1:  # then the prior's components tell
+        named_alike = [
+            name
+            for name in fitting
+            if any(names_state(each.prior, models[name]) for each in found[name])
+        ]
+        fitting = named_alike or fitting
     if len(fitting) > 1:
         raise BadInput(
             f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"
         )
-    if not fitting and named is None:
-        return []
     if not fitting:
         raise BadInput(
-            f"estimator {label}: model {named} does not fit this log: it needs "
-            f"{needs_of(models[named])}; the log has {', '.join(topics) or 'no topics'}"
+            f"estimator {label} does not fit this log: {nearest(models, topics)}; "
+            f"the log has {', '.join(topics) or 'no topics'}"
         )
     (name,) = fitting
     lacking = method.lacks(models[name])
@@ -155,7 +164,8 @@ def bind_model(
         stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors))
         numbers = settings_of(label, stage, found, parameters)
         name = label + found.prefix
-        filtering = Filter(name, found, stage, method, parameters, numbers)
+        samplers = _samplers_of(stage, method, parameters)
+        filtering = Filter(name, found, stage, method, parameters, numbers, samplers)
         maps = {sensor.about.topic: sensor.about for sensor in stage.sensors if sensor.about}
         control = [found.control.name] if found.control else []
         streams = (*control, *(topic.name for _, topic in found.sensors))
@@ -201,14 +211,20 @@ class State(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _compiled(
-    model: Model, motion: Motion, sensors: tuple[Sensor, ...], method: Method, names: tuple[str, ...]
-) -> tuple[Function, Steps]:
+def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
     """The loop over the runs, and the steps that it was made of."""
-    stage = Stage(model, motion, sensors)
     steps = method.steps(stage)
+    names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
     return compile_over_runs(loop, allocates=False), steps
+
+
+def _samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
+    """Of every sampled function; raises BadInput where the sampling is none of its dimension."""
+    if method.sampling is None:
+        return ()
+    sampling = method.sampling(parameters)
+    return tuple(sampling.at(dimension) for dimension in _compiled(stage, method)[1].sampled)
 
 
 @dataclass(frozen=True)
@@ -220,6 +236,7 @@ class Filter:
         found: its topics.
         stage, method, parameters: what it is made of.
         settings: (1 + sensors, fields), see `settings_of`.
+        samplers: one for each of `Steps.sampled`.
     """
 
     name: str
@@ -228,6 +245,7 @@ class Filter:
     method: Method
     parameters: Any
     settings: Floats
+    samplers: tuple[Sampler, ...]
 
     def start(self, whole: Mapping[str, Ragged]) -> State:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
@@ -264,7 +282,11 @@ class Filter:
         """What was not used since it lacks a covariance, if any topic may."""
         if not any(sensor.covariance for sensor in self.stage.sensors):
             return []
-        reasons = [f"{topic}: no covariance, and no parameter in its place" for topic in block.streams]
+        sensors = {topic.name: sensor for sensor, topic in self.found.sensors}
+        reasons = [
+            complaint_of(self.stage.model, sensors[topic], topic) if topic in sensors else ""
+            for topic in block.streams
+        ]
         events = block.events
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
@@ -290,8 +312,7 @@ class Filter:
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
         model, sensors = self.stage.model, self.stage.sensors
-        names = number_fields(model.parameters)
-        loop, steps = _compiled(model, self.stage.motion, sensors, self.method, names)
+        loop, steps = _compiled(self.stage, self.method)
         before, carried = state.carried, copy.deepcopy(state.carried)
         runs = len(before.time_ns)
         estimates = Estimates(*_room(happenings.is_due, happenings.offsets, model.size, model.tangent))
@@ -303,11 +324,9 @@ class Filter:
         starts = estimates.end.copy(), innovations.end.copy()
         settings = np.broadcast_to(self.settings, (runs, *self.settings.shape)).copy()
         generators = state.generators
-        sampler = self.method.sampling(self.parameters) if self.method.sampling else None
-        samplers = [sampler.at(each) for each in steps.sampled] if sampler else []
-        if any(each.redrawn for each in samplers):
-            generators = _seeded(generators, happenings, len(samplers), self.parameters.seed)
-        for part, sets in _sets(samplers, generators, happenings.offsets):
+        if any(each.redrawn for each in self.samplers):
+            generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
+        for part, sets in _sets(self.samplers, generators, happenings.offsets):
             loop(
                 part.stop - part.start,
                 happenings._replace(offsets=happenings.offsets[part.start : part.stop + 1]),

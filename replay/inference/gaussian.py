@@ -129,17 +129,6 @@ def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
             covariance[row, column] = covariance[column, row] = entry
 
 
-def is_finite(mean: Floats, covariance: Floats) -> bool:
-    """Whether a Gaussian holds neither NaN nor infinity."""
-    total = 0.0
-    for row in range(len(mean)):
-        total += mean[row]
-    for row in range(len(covariance)):
-        for column in range(row + 1):
-            total += covariance[row, column]
-    return np.isfinite(total)
-
-
 def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
     """P becomes F P F', by way of `product`."""
     size = len(covariance)

@@ -70,17 +70,28 @@ def happenings_of(
     for number, (sensor, topic) in enumerate(found.sensors):
         own = parameters(settings, number + 1)
         tables.append(_sensor_table(sensor, number, block.streams[topic.name], points, width, own))
-    is_node = events.is_last
-    if first and not (control is not None and control.estimates) and found.sensors:
-        stamp: Integers = np.cumsum(events.is_last) - events.is_last
-        sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-        sensed[stamp[events.topic >= first]] = True
-        is_node = events.is_last & sensed[stamp]
     data, source, target, lacking = (
         column[0] if len(column) == 1 else np.concatenate(column)[events.source]
         for column in zip(*tables, strict=True)
     )
-    return Happenings(events.offsets, events.time_ns, source, data, is_node, target), lacking
+    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target)
+    if lacking.any():  # as if these had not come
+        happenings = _of_rows(happenings, ~lacking)
+        happenings = happenings._replace(is_due=last_of_stamps(happenings))
+    if first and not (control is not None and control.estimates) and found.sensors:
+        stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
+        sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+        sensed[stamp[happenings.source != CONTROL]] = True
+        happenings = happenings._replace(is_due=happenings.is_due & sensed[stamp])
+    return happenings, lacking
+
+
+def last_of_stamps(happenings: Happenings) -> NDArray[np.bool_]:
+    """Whether no later event of the run has an event's stamp."""
+    is_last = np.append(np.diff(happenings.time_ns) != 0, True)[: len(happenings.time_ns)]
+    ends = happenings.offsets[1:]
+    is_last[ends[ends > happenings.offsets[:-1]] - 1] = True
+    return is_last
 
 
 class _Table(NamedTuple):

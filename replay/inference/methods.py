@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt, PositiveFloat
 
 from recorders.parameters import Parameters
-from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten
+from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
 from replay.inference.generate import is_flat, resetting, retraction, tuple_of
 from replay.inference.model import Model
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
@@ -30,10 +30,11 @@ from replay.inference.steps import (
     linear_innovation,
     linear_motion,
     linear_sensor,
+    motion_noise,
+    note_numbers,
     noting,
     reading,
     sensor_derivative,
-    state_numbers,
     workspace,
 )
 from replay.results import ALL_WELL
@@ -163,7 +164,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
             if np.isnan(squared):
                 return NOT_POSITIVE_DEFINITE
             if iteration == 0 and not squared <= gate[size]:
-                state_numbers(note, squared, determinant, size, False)
+                note_numbers(note, squared, determinant, size, False)
                 return ALL_WELL
             for row in range(t):
                 work.turned[row] = step[row]
@@ -175,7 +176,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
                 break
         reduce_covariance(covariance, innovation.cross_covariance, size)
         correct(mean, covariance, work)
-        state_numbers(note, squared, determinant, size, True)
+        note_numbers(note, squared, determinant, size, True)
         return ALL_WELL
 
     return update
@@ -227,8 +228,6 @@ def _analytic(stage: Stage) -> Steps:
 
 
 def _exact_motion(stage: Stage) -> Function:
-    from replay.inference.steps import motion_noise
-
     model, motion = stage.model, stage.motion
     moments, add_noise = motion.moments, motion_noise(model, motion)
     assert moments is not None
@@ -252,7 +251,6 @@ def _exact_motion(stage: Stage) -> Function:
 
 
 def _exact_sensor(stage: Stage, number: int) -> Function:
-    from replay.inference.gaussian import wrap
 
     sensor = stage.sensors[number]
     moments, read_about = sensor.moments, reading(sensor).about

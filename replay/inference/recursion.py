@@ -179,27 +179,29 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 row = estimates.end[run]
                 mean, covariance = estimates.mean[row], estimates.covariance[row]
                 estimate(run, carried.belief, mean, covariance)
-                if is_estimate(mean, covariance):
+                failure = fault_of(mean, covariance)
+                if failure == ALL_WELL:
                     estimates.event[row] = event
                     estimates.end[run] = row + 1
-                else:
-                    failure = NOT_FINITE
             carried.failure[run] = failure
 
     return follow
 
 
-def is_estimate(mean: Floats, covariance: Floats) -> bool:
-    """Whether a mean and the lower triangle of its covariance are finite, the variances not negative."""
+def fault_of(mean: Floats, covariance: Floats) -> int:
+    """Why an estimate is none: it is not finite, or a variance is negative; ALL_WELL where it is one."""
     total = 0.0
     for row in range(len(mean)):
         total += mean[row]
     for row in range(len(covariance)):
         for column in range(row + 1):
             total += covariance[row, column]
+    if not np.isfinite(total):
+        return NOT_FINITE
+    for row in range(len(covariance)):
         if covariance[row, row] < 0.0:
-            return False
-    return np.isfinite(total)
+            return NOT_POSITIVE_DEFINITE
+    return ALL_WELL
 
 
 def choosing(updates: tuple[Function, ...]) -> Function:

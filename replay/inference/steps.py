@@ -509,13 +509,13 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)
             correct(mean, covariance, work)
-        state_numbers(note, squared, determinant, size, accepted)
+        note_numbers(note, squared, determinant, size, accepted)
         return ALL_WELL
 
     return update
 
 
-def state_numbers(note: Note, squared: float, determinant: float, size: int, accepted: bool) -> None:
+def note_numbers(note: Note, squared: float, determinant: float, size: int, accepted: bool) -> None:
     """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is."""
     note.numbers[0] = squared
     likelihood = -0.5 * (squared + determinant + size * LOG_TWO_PI)

@@ -49,6 +49,11 @@ COMMANDS = {
     "import file -o": Command("import ais ais.csv -o OUT", ".mcap", ("ais.csv",)),
     "import folder -o": Command("import mrclam mrclam -o OUT", ".mcap", ("mrclam/Barcodes.dat",)),
     "replay -o": Command("replay log.mcap -e dead-reckoning -o OUT", ".mcap", ("log.mcap",)),
+    "replay --start-from -o": Command(
+        "replay log.mcap -e dead-reckoning --start 0.5 --start-from log.estimates.mcap -o OUT",
+        ".mcap",
+        ("log.mcap", "log.estimates.mcap"),
+    ),
     "replay --save": Command(
         "replay log.mcap -e dead-reckoning -o new.mcap --save OUT", ".rrd", ("log.mcap",)
     ),
