@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,8 +108,10 @@ def _any_parameters(method: Method) -> type[Parameters]:
     for model in registered_models().values():
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
-                same = fields.get(name, (field.annotation,))[0] == field.annotation
-                fields[name] = (field.annotation if same else Any, None)
+                bounds = tuple(field.metadata)
+                kind = Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+                same = fields.get(name, (kind,))[0] == kind
+                fields[name] = (kind if same else Any, None)
     return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
 
 
