@@ -37,7 +37,7 @@ from replay.tangent import WIDTHS, tangent_components
 
 Floats = NDArray[np.float64]
 
-STATES, PATHS, STEPS = 20, 30, 400
+STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
 STEP = 1e-5  # of central differences
 TURN = 2.0 * np.pi
@@ -141,7 +141,7 @@ def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
 
 
 def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
-    about = tuple(5.0 * rng.normal(size=sensor.about.size)) if sensor.about else ()
+    about = tuple(rng.normal(size=sensor.about.size)) if sensor.about else ()
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
     rest = (about, numbers)
     return _Call(_place(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
