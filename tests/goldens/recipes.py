@@ -80,7 +80,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
     # rukf-10 fails
-    "extended-target-failing": Recipe("extended-target", run=48),
+    "extended-target-failing": Recipe("extended-target", run=117),
     # delays, outliers, outages; ranges and bearings alone; the gate that the estimators have by default
     "landmarks-adverse": Recipe(
         "landmarks",
