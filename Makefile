@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test faults mutants bench format clean
+.PHONY: demo test mutants bench faults format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -21,14 +21,14 @@ test: .venv/with-test
 	$(BIN)/mypy
 	$(BIN)/pytest
 
-faults: .venv/with-test
-	$(BIN)/python -m tests.faults
-
 mutants: .venv/with-test
 	$(BIN)/python -m tests.mutants
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
+
+faults: .venv/with-test
+	$(BIN)/python -m tests.faults
 
 format: .venv/with-test
 	$(BIN)/ruff format .

@@ -5,9 +5,6 @@ file has changed, and stops on a damaged file. So the sources of a kernel and of
 become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
 model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
 which also run uncompiled.
-
-For finding a fault: with FUSELOG_UNCOMPILED=1 all kernels are plain Python, and an index beyond an array
-is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
 """
 
 import ast
@@ -53,7 +50,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
-        if _is_asked_for("FUSELOG_UNCOMPILED"):
+        if _is_uncompiled():
             return np.errstate(all="ignore")(function)
         bundle = _Bundle()
         name = bundle.add(function.__name__, function)
@@ -81,8 +78,11 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     cores. What `scratch()` returns, made anew for every core, is the last argument of `run_once`: arrays
     that one run after another may work in.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if _is_asked_for("FUSELOG_UNCOMPILED"):
+    if _is_uncompiled():
         return uncompiled_over_runs(run_once)
     bundle = _Bundle(allocates)
     kernel = bundle.add("run_once", run_once)
@@ -116,6 +116,10 @@ class Inlined(Compiler):
         library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
         self.state.library = library
         return super().define_pipelines()  # type: ignore[no-untyped-call]
+
+
+def _is_uncompiled() -> bool:
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -159,10 +163,6 @@ def _over_runs(
         ) from error
 
 
-def _is_asked_for(switch: str) -> bool:
-    return os.environ.get(switch) == "1"
-
-
 class _Bundle:
     """Sources in the order they are needed, and the imports above them.
 
@@ -170,9 +170,10 @@ class _Bundle:
     """
 
     def __init__(self, allocates: bool = True) -> None:
-        self.options = f"_nrt={allocates}, boundscheck={_is_asked_for('FUSELOG_BOUNDSCHECK')}"
         # a division by zero gives infinity, which is a failure of its run, and no exception
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt={allocates}{bounds}"
         self.imports = {"import numba", "import numpy"}
         if not allocates:  # one piece is faster where no counting of references stands in the way
             inner += ", forceinline=True, pipeline_class=Inlined"

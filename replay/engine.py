@@ -45,6 +45,8 @@ class Recursive:
             `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
             see `replay.priors`.
         given: whole topics that are not read from the runs, see `replay.starting`.
+        finish: the state after the last block -> the outputs that waited for messages which did not
+            come any more.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Recursive:
     run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
+    finish: Callable[[Any], list[Ragged]] | None = None
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,9 @@ def replay(
                 states[index], produced = watch.take(work, streams)
                 outputs += watch.receive(produced)
         yield outputs
+    for bound, watch, state in zip(estimators, watches, states, strict=True):
+        if isinstance(bound, Recursive) and bound.finish is not None and state is not _REFUSED:
+            yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
     yield [failures for watch in watches for failures in watch.finish()]
     if report is not None:
         for watch in watches:
@@ -260,6 +266,16 @@ def _advance(
     events = merge_events(streams, order)
     with foreign_code(f"estimator {bound.name}"):
         return bound.run(state, Block(streams, events))
+
+
+def _finish(
+    bound: Recursive,
+    finish: Callable[[Any], list[Ragged]],
+    state: Any,
+    _: dict[str, Ragged],
+) -> list[Ragged]:
+    with foreign_code(f"estimator {bound.name}"):
+        return finish(state)
 
 
 def _refuse_old_priors(

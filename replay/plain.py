@@ -362,12 +362,14 @@ def _messages(
     skipped = _Skipped(
         ragged_rows(skip, events.offsets), events.time_ns[skip], events.topic[skip], reasons
     )
+    # the messages of one topic are in order already
+    value = tables[0] if len(tables) == 1 else _side_by_side(tables)[events.source]
     rows = ~skip if skip.any() else slice(None)
     kept = Messages(
         ragged_rows(~skip, events.offsets),
         events.time_ns[rows],
         events.topic[rows],
-        _side_by_side(tables)[events.source][rows],
+        value[rows],
     )
     return kept, skipped
 

@@ -91,55 +91,26 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return compile_over_runs(run_once)
 
 
-class BinghamEstimates(NamedTuple):
-    """The distribution after every row, and what a replay says of it.
-
-    Attributes:
-        axes, concentrations: see `Bingham`, batch axis (rows,).
-        covariance: of small rotations about the mode, (rows, t, t), t = 1 or 3; see `replay.tangent`.
-    """
-
-    axes: NDArray[np.float64]
-    concentrations: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-    @property
-    def mode(self) -> NDArray[np.float64]:
-        """The most probable axes (rows, d)."""
-        return self.axes[..., -1]
-
-
-class GaussianEstimates(NamedTuple):
-    """The Gaussian after every row, (rows, d) and (rows, d, d), and its covariance of small rotations.
-
-    The latter, `tangent` (rows, t, t), is as in `BinghamEstimates`.
-    """
-
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    tangent: NDArray[np.float64]
-
-
 def run_bingham_filter(
-    noise: BinghamNoise, state: Bingham, steps: Steps
-) -> tuple[Bingham, BinghamEstimates]:
+    noise: BinghamNoise, state: Bingham, steps: Steps, rotations: NDArray[np.float64] | None = None
+) -> tuple[Bingham, Bingham]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
     Args:
         noise: see there.
         state: the distributions before the first row, batch axis (runs,).
         steps: see there.
+        rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
+            the modes, see `replay.tangent`.
 
     Returns:
-        The state after the last row, and the estimates of all rows. Where a moment fit does not
-        converge, the run is NaN from there on and the others go on.
+        The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
+        fit does not converge, the run is NaN from there on and the others go on.
     """
     rows, d = steps.measurement.shape
     identity = np.eye(d)[0]
     state = Bingham(state.axes.copy(), state.concentrations.copy())
-    estimates = BinghamEstimates(
-        np.empty((rows, d, d)), np.empty((rows, d)), np.empty((rows, d - 1, d - 1))
-    )
+    estimates = Bingham(np.empty((rows, d, d)), np.empty((rows, d)))
     _over_runs(_bingham_run)(
         len(steps.offsets) - 1,
         steps,
@@ -147,8 +118,14 @@ def run_bingham_filter(
         bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
         state,
         estimates,
+        _rotations(steps) if rotations is None else rotations,
     )
     return state, estimates
+
+
+def _rotations(steps: Steps) -> NDArray[np.float64]:
+    rows, d = steps.measurement.shape
+    return np.empty((rows, d - 1, d - 1))
 
 
 def _bingham_run(
@@ -157,7 +134,8 @@ def _bingham_run(
     system: NDArray,
     inverse_noise: NDArray,
     state: Bingham,
-    estimates: BinghamEstimates,
+    estimates: Bingham,
+    rotations: NDArray,
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
     d = len(z)
@@ -178,31 +156,36 @@ def _bingham_run(
         integrate(z, moments, work)
         compose_columns(inverse(axes[:, d - 1]), axes, local)
         weighted_outer(local, moments, work)
-        _store_rotations(work, estimates.covariance[row])
+        _store_rotations(work, rotations[row])
 
 
 def run_kalman_filter(
-    noise: GaussianNoise, state: Gaussian, steps: Steps, *, rotated: bool
-) -> tuple[Gaussian, GaussianEstimates]:
+    noise: GaussianNoise,
+    state: Gaussian,
+    steps: Steps,
+    rotations: NDArray[np.float64] | None = None,
+    *,
+    rotated: bool,
+) -> tuple[Gaussian, Gaussian]:
     """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
 
     Args:
         noise: see there; the paper adds it as it is, wherever the state points.
         state: the Gaussians before the first row, batch axis (runs,).
         steps: see there.
+        rotations: as for `run_bingham_filter`.
         rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
 
     Returns:
-        The state after the last row, and the estimates of all rows; a run whose covariance loses its
-        definiteness is NaN from there on.
+        The state after the last row, and the estimates of all rows, batch axis (rows,); a run whose
+        covariance loses its definiteness is NaN from there on.
     """
     rows, d = steps.measurement.shape
     state = Gaussian(state.mean.copy(), state.covariance.copy())
-    estimates = GaussianEstimates(
-        np.empty((rows, d)), np.empty((rows, d, d)), np.empty((rows, d - 1, d - 1))
-    )
+    estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
-    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates)
+    local = _rotations(steps) if rotations is None else rotations
+    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates, local)
     return state, estimates
 
 
@@ -212,7 +195,8 @@ def _kalman_run(
     noise: GaussianNoise,
     rotated: bool,
     state: Gaussian,
-    estimates: GaussianEstimates,
+    estimates: Gaussian,
+    rotations: NDArray,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -229,7 +213,7 @@ def _kalman_run(
             x /= math.sqrt((x * x).sum())
         estimates.mean[row] = x
         estimates.covariance[row] = p
-        _store_rotations(framed(p, inverse(x)), estimates.tangent[row])
+        _store_rotations(framed(p, inverse(x)), rotations[row])
 
 
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:

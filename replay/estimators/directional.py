@@ -41,10 +41,8 @@ from replay.measurements import Vectors
 from replay.plain import Given, Messages, Results, recursive
 
 Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-# States of all runs, offsets and measurements -> the states after them, means (n, d), covariances
-# (n, t, t).
-Advance = Callable[[Any, Integers, Floats], tuple[Any, Floats, Floats]]
+# The states of all runs and their measurements -> the states after them; fills the results.
+Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
@@ -95,8 +93,7 @@ class Distributions(NamedTuple):
 
 def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
     """Take all runs through their measurements."""
-    after, results.mean[:], results.covariance[:] = advance(state, messages.offsets, messages.value)
-    for part, changed in zip(state, after, strict=True):
+    for part, changed in zip(state, advance(state, messages, results), strict=True):
         part[:] = changed
 
 
@@ -139,9 +136,10 @@ def _start_bingham(topic: str, d: int, given: Given[BinghamParameters]) -> tuple
     stated = distributions(given, topic, d)
     noise = BinghamNoise(as_bingham(stated.system), as_bingham(stated.measurement))
 
-    def advance(state: Bingham, offsets: Integers, measured: Floats) -> tuple[Bingham, Floats, Floats]:
-        after, found = run_bingham_filter(noise, state, _steps(offsets, measured))
-        return after, found.mode, found.covariance
+    def advance(state: Bingham, messages: Messages, results: Results) -> Bingham:
+        after, found = run_bingham_filter(noise, state, _steps(messages), results.covariance)
+        results.mean[:] = found.mode
+        return after
 
     return advance, _widened(as_bingham(stated.prior), given.runs)
 
@@ -151,17 +149,19 @@ def _start_kalman(topic: str, d: int, given: Given[KalmanParameters]) -> tuple[A
     noise = GaussianNoise(as_covariance(stated.system), as_covariance(stated.measurement))
     mode = np.eye(d)[0] if stated.prior.distribution == "gaussian" else as_bingham(stated.prior).mode
 
-    def advance(state: Gaussian, offsets: Integers, measured: Floats) -> tuple[Gaussian, Floats, Floats]:
-        rotated = given.parameters.rotated
-        after, found = run_kalman_filter(noise, state, _steps(offsets, measured), rotated=rotated)
-        return after, found.mean, found.tangent
+    def advance(state: Gaussian, messages: Messages, results: Results) -> Gaussian:
+        rotated, steps = given.parameters.rotated, _steps(messages)
+        after, found = run_kalman_filter(noise, state, steps, results.covariance, rotated=rotated)
+        results.mean[:] = found.mean
+        return after
 
     return advance, _widened(Gaussian(mode, as_covariance(stated.prior)), given.runs)
 
 
-def _steps(offsets: Integers, measured: Floats) -> Steps:
+def _steps(messages: Messages) -> Steps:
     """Steps without control input."""
-    return make_steps(offsets, np.tile(np.eye(measured.shape[1])[0], (len(measured), 1)), measured)
+    count, d = messages.value.shape
+    return make_steps(messages.offsets, np.tile(np.eye(d)[0], (count, 1)), messages.value)
 
 
 def _widened(state: Any, runs: int) -> Any:
@@ -186,11 +186,10 @@ def _start_headings(
     model, run_filter = heading_model(given), filter_of(given.parameters)
     _, mean, covariance = given.prior("prior")
 
-    def advance(
-        state: WrappedNormal, offsets: Integers, measured: Floats
-    ) -> tuple[WrappedNormal, Floats, Floats]:
-        after, found = run_filter(model, state, offsets, measured)
-        return after, found.mean, found.covariance
+    def advance(state: WrappedNormal, messages: Messages, results: Results) -> WrappedNormal:
+        after, found = run_filter(model, state, messages.offsets, messages.value)
+        results.mean[:], results.covariance[:] = found
+        return after
 
     return advance, WrappedNormal(mean, covariance)
 

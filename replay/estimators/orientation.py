@@ -27,7 +27,9 @@ from replay.plain import Given, Messages, Results, recursive
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
-Advance = Callable[[InertialModel, Any, InertialSamples], tuple[Any, OrientationEstimates]]
+Advance = Callable[
+    [InertialModel, Any, InertialSamples, OrientationEstimates], tuple[Any, OrientationEstimates]
+]
 
 
 class InertialParameters(Parameters):
@@ -64,7 +66,7 @@ def _follow_all(
     model, advance = settings
     force, rate, field = np.split(messages.value, 3, axis=1)
     samples = InertialSamples(messages.offsets, messages.time_ns, rate, force, field)
-    after, (results.mean[:], results.covariance[:]) = advance(model, state, samples)
+    after, _ = advance(model, state, samples, OrientationEstimates(results.mean, results.covariance))
     for part, changed in zip(state, after, strict=True):
         part[:] = changed
 
@@ -98,9 +100,9 @@ def _start_gyro(given: Given[GyroParameters]) -> tuple[tuple[InertialModel, Adva
 
 def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
     def advance(
-        model: InertialModel, state: Any, samples: InertialSamples
+        model: InertialModel, state: Any, samples: InertialSamples, estimates: OrientationEstimates
     ) -> tuple[Any, OrientationEstimates]:
-        return state, attitudes(model, samples)
+        return state, attitudes(model, samples, estimates)
 
     return (given.parameters.model, advance), start_reckoning(given.runs)
 

@@ -176,11 +176,12 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     given = {name: getattr(parameters, name) for name in names}
     everything = [topic for topic in (found.control, found.prior) if topic is not None]
     everything += [topic for _, topic in found.sensors]
-    check_state(label, model)
+    where = f"estimator {label}"
+    check_state(where, model)
     recorders = [_Recorder(given) for _ in range(1 + len(found.sensors))]
-    check_motion(label, model, stage.motion, recorders[0])
+    check_motion(where, model, stage.motion, recorders[0])
     for (sensor, _), recorder in zip(found.sensors, recorders[1:], strict=True):
-        check_sensor(label, model, sensor, recorder)
+        check_sensor(where, model, sensor, recorder)
     own = [[], *([topic] for _, topic in found.sensors)]
     return np.array(
         [

@@ -2,9 +2,10 @@
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +33,17 @@ from replay.inference.binding import (
 )
 from replay.inference.happenings import (
     Points,
+    data_columns,
     happenings_of,
     held,
     interpolated,
     joined,
     points_of,
+    times_alone,
     with_ticks,
 )
 from replay.inference.methods import METHODS, Method
-from replay.inference.model import Model, ModelParameters
+from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.priors import gaussians
@@ -79,7 +82,7 @@ def of_any_model(method: str) -> Estimator[Any]:
     chosen = METHODS[method]
     return Estimator(
         f"{chosen.summary}, of any model (`fuselog models` lists them)",
-        "a log of one of the models that `fuselog models` lists",
+        " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items()),
         _any_parameters(chosen),
         partial(_bind_fitting, method=chosen),
         variant=chosen.variant,
@@ -87,8 +90,12 @@ def of_any_model(method: str) -> Estimator[Any]:
 
 
 def registered_models() -> dict[str, Model]:
-    """All models by name."""
-    return {name: load("models", name, Model) for name in available("models")}
+    """The models by name; one that does not load is left out, and says why where it is named."""
+    found = {}
+    for name in available("models"):
+        with suppress(BadInput):
+            found[name] = load("models", name, Model)
+    return found
 
 
 @lru_cache(maxsize=16)
@@ -101,26 +108,28 @@ def _any_parameters(method: Method) -> type[Parameters]:
     for model in registered_models().values():
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
-                same = fields.get(name, (field.annotation,))[0] == field.annotation
-                fields[name] = (field.annotation if same else Any, None)
+                bounds = tuple(field.metadata)
+                kind = Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+                same = fields.get(name, (kind,))[0] == kind
+                fields[name] = (kind if same else Any, None)
     return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
 
 
 def _bind_fitting(
     label: str, topics: Mapping[str, Topic], values: Parameters, *, method: Method
 ) -> list[Bound]:
-    """Bind the model that is named, or else the one that fits.
+    """Bind the model that is named, or else the one that fits; nothing where none does.
 
-    Raises BadInput where none fits, several do, the method cannot serve it, or it has no such parameter.
+    Raises BadInput where the one named does not fit, several do, the method cannot serve it, or it has
+    no such parameter.
     """
     models = registered_models()
     given = {name: getattr(values, name) for name in values.model_fields_set}
     named = given.pop("model", None)
-    if named is not None and named not in models:
-        raise BadInput(f"estimator {label}: no model '{named}'; {choices(named, models)}")
-    tried = {named: models[named]} if named else models
-    found = {name: topics_of(model, topics) for name, model in tried.items()}
-    fitting = [name for name in tried if found[name]]
+    if named is not None:
+        models = {named: load("models", named, Model)}
+    found = {name: topics_of(model, topics) for name, model in models.items()}
+    fitting = [name for name in models if found[name]]
     if len(fitting) > 1:  # then the prior's components tell
         named_alike = [
             name
@@ -134,7 +143,7 @@ def _bind_fitting(
         )
     if not fitting:
         raise BadInput(
-            f"estimator {label} does not fit this log: {nearest(tried, topics)}; "
+            f"estimator {label} does not fit this log: {nearest(models, topics)}; "
             f"the log has {', '.join(topics) or 'no topics'}"
         )
     (name,) = fitting
@@ -150,8 +159,9 @@ def bind_model(
 ) -> list[Bound]:
     """A filter for everything in the log that is of this model."""
     bound: list[Bound] = []
+    motion = _motion_of(label, model, parameters.mode)
     for found in topics_of(model, topics):
-        stage = Stage(model, model.motion, tuple(sensor for sensor, _ in found.sensors))
+        stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors))
         numbers = settings_of(label, stage, found, parameters)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)
@@ -161,8 +171,22 @@ def bind_model(
         streams = (*control, *(topic.name for _, topic in found.sensors))
         whole = (found.prior.name, *maps)
         priors = {found.prior.name: model.state}
-        bound.append(Recursive(name, streams, whole, filtering.start, filtering.run, priors))
+        start, run, finish = filtering.start, filtering.run, filtering.finish
+        bound.append(Recursive(name, streams, whole, start, run, priors, finish=finish))
     return bound
+
+
+def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
+    """The motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    if mode is None:
+        return model.motion
+    if not model.modes:
+        raise BadInput(f"estimator {label}: mode = {mode}: the model has one motion; leave out `mode`")
+    if mode not in model.modes:
+        raise BadInput(
+            f"estimator {label}: the model has no mode '{mode}'; {choices(mode, model.modes)}"
+        )
+    return model.modes[mode]
 
 
 # The filter of one thing
@@ -205,7 +229,7 @@ def _samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler
 
 @dataclass(frozen=True)
 class Filter:
-    """One bound filter; its `start` and `run` are what `replay.engine.Recursive` asks for.
+    """One bound filter; `start`, `run` and `finish` are what `replay.engine.Recursive` asks for.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.
@@ -227,13 +251,16 @@ class Filter:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
         model = self.stage.model
         time_ns, mean, covariance = gaussians(whole[self.found.prior.name])
-        initial = model.control.initial if model.control else ()
-        control = np.tile(np.array(initial or (0.0,) * model.controls), (len(mean), 1))
+        control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         carried = Carried(Gaussian(mean, covariance), control, time_ns, started)
         maps = {each.about.topic: each.about for each in self.stage.sensors if each.about}
         points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
-        return State(carried, points, (), None, np.zeros(len(mean), np.int64))
+        waiting = None
+        if model.control is not None and model.control.interpolated:  # what drives from there on
+            runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
+            waiting = times_alone(runs, time_ns.copy(), width, is_due=False)
+        return State(carried, points, (), waiting, np.zeros(len(mean), np.int64))
 
     def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
         """Filter a block."""
@@ -274,7 +301,13 @@ class Filter:
         """What still waits for a control that does not come any more."""
         if state.waiting is None:
             return []
-        return self.follow(state, held(state.waiting, self.stage.model.controls))[1]
+        return self.follow(state, held(state.waiting, self.initial))[1]
+
+    @property
+    def initial(self) -> tuple[float, ...]:
+        """What drives the motion before the first message of the control."""
+        control = self.stage.model.control
+        return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""

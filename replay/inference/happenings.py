@@ -1,6 +1,6 @@
 """A log's messages as the recursion takes them: rows of numbers in time order, whatever the model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -46,14 +46,22 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
+def data_columns(stage: Stage) -> tuple[int, int]:
+    """How many numbers an event has, and the first of the control's among them."""
+    width, control = (
+        max((reading(sensor).width for sensor in stage.sensors), default=0),
+        stage.model.control,
+    )
+    start = width if control is not None and control.interpolated else 0
+    return max(width, start + stage.model.controls), start
+
+
 def happenings_of(
     stage: Stage, found: Found, block: Block, points: Mapping[str, Points], settings: Floats
 ) -> tuple[Happenings, NDArray[np.bool_]]:
     """A block's messages as the recursion takes them, and which of them lack their covariance."""
     events, control = block.events, stage.model.control
-    width = max((reading(sensor).width for sensor in stage.sensors), default=0)
-    start = width if control is not None and control.interpolated else 0
-    width = max(width, start + stage.model.controls)
+    width, start = data_columns(stage)
     tables: list[_Table] = []
     if control is not None and found.control is not None:
         tables.append(_control_table(control, block.streams[found.control.name], width, start))
@@ -99,8 +107,9 @@ def _control_table(control: Control, ragged: Ragged, width: int, start: int) -> 
     """The control's numbers in the columns from `start` on."""
     count = len(ragged)
     data = np.full((count, width), np.nan)
-    read = control.read(ragged.stream) if control.read else _fields(ragged.stream, control.components)
-    data[:, start : start + len(control.components)] = _checked(read, ragged, len(control.components))
+    names = control.components
+    read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
+    data[:, start : start + len(names)] = read
     return _Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
 
 
@@ -125,7 +134,7 @@ def _sensor_table(
             spread[lacking], lacking = np.diag(variances), np.zeros(len(stream), bool)
         parts = [fixes.value, spread[:, *np.tril_indices(m)]]
     elif sensor.read:
-        parts = [_checked(sensor.read(stream), ragged, m)]
+        parts = [_computed(sensor.read, ragged, m)]
     elif sensor.vector:
         parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
@@ -152,9 +161,11 @@ def _fields(stream: Stream, names: Sequence[str]) -> Floats:
     return np.stack([stream[name] for name in names], axis=1)
 
 
-def _checked(read: Any, ragged: Ragged, components: int) -> Floats:
-    """What a model's own function read of a topic, if it is as wide as the model says."""
-    numbers = np.asarray(read, float)
+def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:
+    """What a model's own function reads of a topic; BadInput where that is not as wide as it says."""
+    if not len(ragged):  # vectors have no width here
+        return np.empty((0, components))
+    numbers = np.asarray(read(ragged.stream), float)
     if numbers.shape != (len(ragged), components):
         raise BadInput(
             f"topic {ragged.stream.topic}: the model reads an array of shape {numbers.shape} from "
@@ -163,11 +174,18 @@ def _checked(read: Any, ragged: Ragged, components: int) -> Floats:
     return numbers
 
 
+def times_alone(offsets: Integers, time_ns: Integers, width: int, *, is_due: bool) -> Happenings:
+    """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
+    count = len(time_ns)
+    nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
+    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), np.zeros(count, np.int64))
+
+
 def joined(first: Happenings, second: Happenings) -> Happenings:
-    """The events of two blocks, run by run."""
+    """The events of both in time, run by run; at equal stamps those of the first go first."""
     runs = len(first.offsets) - 1
     run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
-    order = np.argsort(run, kind="stable")
+    order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
     columns: Any = (
         np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
     )
@@ -198,15 +216,21 @@ def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Hap
         for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
         ready[inside], waiting[begin : at[-1]] = True, False
-    return _of_rows(happenings._replace(data=data), ready), _of_rows(happenings, waiting)
+    again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
+    return _of_rows(happenings._replace(data=data), ready), _of_rows(again, waiting)
 
 
-def held(happenings: Happenings, controls: int) -> Happenings:
-    """Events that wait for a control message that does not come: the last one holds."""
+def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
+    """Events that wait for a control message that does not come: the last one holds.
+
+    `initial` holds in a run in which there was none.
+    """
     data = happenings.data.copy()
     for begin, end in pairwise(happenings.offsets):
         if begin < end:
-            data[begin:end, -controls:] = data[begin, -controls:]
+            is_control = happenings.source[begin] == CONTROL
+            control = data[begin, -len(initial) :].copy() if is_control else initial
+            data[begin:end, -len(initial) :] = control
     return happenings._replace(data=data)
 
 
@@ -229,18 +253,6 @@ def with_ticks(
         runs.append(np.full(len(wanted), number))
     if not times:
         return happenings, ticks
-    time_ns, run = np.concatenate(times), np.concatenate(runs)
-    count = len(time_ns)
-    extra = Happenings(
-        np.searchsorted(run, np.arange(len(happenings.offsets))),
-        time_ns,
-        np.full(count, NOTHING),
-        np.full((count, happenings.data.shape[1]), np.nan),
-        np.ones(count, bool),
-        np.zeros(count, np.int64),
-    )
-    together = joined(happenings, extra)
-    run = np.repeat(np.arange(len(tick)), np.diff(together.offsets))
-    order = np.lexsort((together.time_ns, run))
-    columns: Any = (column[order] for column in together[1:])
-    return Happenings(together.offsets, *columns), ticks
+    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(happenings.offsets)))
+    width = happenings.data.shape[1]
+    return joined(happenings, times_alone(offsets, np.concatenate(times), width, is_due=True)), ticks

@@ -49,9 +49,14 @@ SETTLED = 1e-12  # of the iterated update: the largest component of the last ste
 
 
 class MethodParameters(Parameters):
-    """What every method takes: estimates every so often, beside those at the stamps of sensors."""
+    """What every method takes.
+
+    `every_s` asks for estimates every so often, beside those at the stamps of sensors; `mode` is the
+    motion to use of a model that has several.
+    """
 
     every_s: PositiveFloat | None = None
+    mode: str | None = None
 
 
 class UnscentedParameters(MethodParameters):

@@ -7,6 +7,7 @@ every model that gives what the method needs.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -225,7 +226,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     state, control = _origin(model.kinds), (0.0,) * model.controls
     sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
-    _check(f"{where}: move", motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
+    _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
     if motion.noises and (motion.noise is None or motion.control_noise is not None):
         raise BadInput(
             f"{where}: noise that is not additive needs its variances, `noise`, and takes that of the "
@@ -233,9 +234,9 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         )
     if motion.noise is not None:
         wanted = (motion.noises,) if motion.noises else sizes
-        _check(f"{where}: noise", motion.noise, (state, 1.0, parameters), wanted)
+        _check(where, motion.noise, (state, 1.0, parameters), wanted)
     if motion.control_noise is not None:
-        _check(f"{where}: control_noise", motion.control_noise, (1.0, parameters), (model.controls,))
+        _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
 def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
@@ -246,7 +247,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
     state, about = _origin(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    _check(f"{where}: measure", sensor.measure, (state, *entering, about, parameters), (size,))
+    _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
         raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
     if sensor.covariance and not sensor.vector:
@@ -255,7 +256,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
         )
     if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
-        _check(f"{where}: noise", sensor.noise, (parameters,), wanted)
+        _check(where, sensor.noise, (parameters,), wanted)
 
 
 def _origin(kinds: tuple[str, ...]) -> tuple[float, ...]:
@@ -267,16 +268,16 @@ def _origin(kinds: tuple[str, ...]) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _check(what: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
+def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
+    code = function.__code__
+    what = f"{where}: {function.__name__} ({Path(code.co_filename).name}, line {code.co_firstlineno})"
     with np.errstate(all="ignore"):
         try:
             found = function(*arguments)
         except Exception as error:
-            raise BadInput(f"{what}: {type(error).__name__}: {error}") from error
+            raise BadInput(f"{what} raised {type(error).__name__}: {error}") from error
     wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
     if not isinstance(found, tuple):
-        raise BadInput(
-            f"{what}: returns a {type(found).__name__}; return a tuple of {wanted} components"
-        )
+        raise BadInput(f"{what} returns a {type(found).__name__}; return a tuple of {wanted} components")
     if len(found) not in sizes:
-        raise BadInput(f"{what}: returns {len(found)} components; {wanted} are needed")
+        raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")

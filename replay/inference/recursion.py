@@ -137,7 +137,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             carried.time_ns[run] = happenings.time_ns[event]
             if not advance(run, event, duration_s, happenings, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE
-        if interpolated or source == CONTROL:
+        if duration_s >= 0.0 if interpolated else source == CONTROL:
             drive(run, data, carried)
         if source >= 0 and duration_s >= 0.0:
             row = innovations.end[run]

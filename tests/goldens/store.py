@@ -27,6 +27,8 @@ FOLDER = Path(__file__).parent / "stored"
 # Of each stream as many rows as this many numbers of the whole golden allow, between the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
+# Their values are numbers of sentences, which may be worded anew.
+REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name}
 
 Golden = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -76,25 +78,24 @@ def make(recipe: Recipe, places: Mapping[str, Path]) -> Golden:
 
 
 def _is_estimated(stream: Stream) -> bool:
-    """Whether an output is an estimator's; how much was estimated, and that none failed, is not."""
-    if stream.schema.full_name == schemas.FAILURE.full_name:
-        return len(stream) > 0
-    return stream.schema.full_name != schemas.COVERAGE.full_name
+    """Whether an output is an estimator's; how much was estimated, and that nothing failed, is not."""
+    schema = stream.schema.full_name
+    return schema != schemas.COVERAGE.full_name and (len(stream) > 0 or schema not in REASONS)
 
 
 def _stream(stream: Stream, rows: int) -> dict[str, Any]:
-    """What a golden has of a stream; of failures only how many there were, and when."""
-    is_failure = stream.schema.full_name == schemas.FAILURE.full_name
+    """What a golden has of a stream; of failures and the like only how many there were, and when."""
+    has_values = stream.schema.full_name not in REASONS
     kept = np.linspace(0, len(stream) - 1, min(rows, len(stream))).round().astype(int)
     return {
         "rows": len(stream),
         "publish_times": _sha256(stream.publish_time_ns),
         "log_times": _sha256(stream.log_time_ns),
-        "metadata": {} if is_failure else dict(stream.metadata),
+        "metadata": dict(stream.metadata) if has_values else {},
         "columns": {
             name: _column(column.astype(float), kept)
             for name, column in stream.columns.items()
-            if not is_failure
+            if has_values
         },
     }
 

@@ -36,6 +36,15 @@ def test_every_estimator_has_a_golden() -> None:
     assert (store.FOLDER.parent / "README.md").read_text(encoding="utf-8") == index()
 
 
+def test_what_a_replay_says_of_itself_is_no_golden() -> None:
+    """How much was estimated is in none; where a run fails, when it did is."""
+    streams = [each for name in RECIPES for each in store.read(name)["streams"].items()]
+    assert not [topic for topic, _ in streams if topic.endswith("/coverage")]
+    failures = [stream["rows"] for topic, stream in streams if topic.endswith("/failure")]
+    assert failures
+    assert all(rows > 0 for rows in failures)
+
+
 @pytest.fixture(scope="module")
 def golden() -> Golden:
     return store.read("landmarks")

@@ -108,7 +108,7 @@ ATTITUDE = Model(
 
 
 def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
-    """The log, and the true quaternions and biases after every step."""
+    """The log, the true states after every step, and what the gyro said."""
     rng = np.random.default_rng(seed)
     start = np.array([0.3] * 3 + [0.02] * 3) * rng.standard_normal(6)
     q, bias = from_rotation_vector(start[:3]), start[3:]
@@ -149,4 +149,4 @@ def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
     ]
     run = RunMetadata(scenario="attitude", parameters={}, seed=seed, run=0, epoch_ns=EPOCH_NS)
     states = np.array(truth)
-    return memory_source(Recording(streams), run), states[:, :4], np.array(gyro)
+    return memory_source(Recording(streams), run), states, np.array(gyro)

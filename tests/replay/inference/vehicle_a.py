@@ -17,6 +17,7 @@ from replay.sources import MemorySource, memory_source
 Floats = NDArray[np.float64]
 MEAN = np.array([0.0, 0.0, 0.0, 1.0, 0.2])
 VARIANCES = np.array([1.0, 1.0, 0.09, 0.25, 0.04])
+COVARIANCE = np.diag(VARIANCES)
 NOISE = np.array([0.01, 0.01, 0.0025, 0.04, 0.0225])
 BEACONS = np.array([[12.0, 2.0], [-3.0, 14.0], [-9.0, -4.0]])
 STATE = {
@@ -156,15 +157,19 @@ def simulate(
     return told, truth
 
 
-def source(told: list[tuple[float, str, int, Floats]]) -> MemorySource:
-    """The messages as a log in memory; equal stamps keep the order of the streams."""
+def source(
+    told: list[tuple[float, str, int, Floats]],
+    mean: Floats = MEAN,
+    covariance: Floats = COVARIANCE,
+) -> MemorySource:
+    """The messages as a log in memory, and the prior; equal stamps keep the order of the streams."""
 
     def stamps(chosen: list[Any]) -> Any:
         return EPOCH_NS + np.rint(np.array([each[0] for each in chosen]) * 1e9).astype(np.int64)
 
     sights = [each for each in told if each[1] == "rb"]
     speeds = [each for each in told if each[1] == "speed"]
-    values = np.array([each[3] for each in sights])
+    values = np.array([each[3] for each in sights]).reshape(-1, 2)
     metadata = {"components": ",".join(STATE), "kinds": ",".join(STATE.values())}
     streams = [
         make_stream("/landmarks", schemas.LANDMARK, [0] * 3, landmark_id=[0, 1, 2], position_m=BEACONS),
@@ -173,8 +178,8 @@ def source(told: list[tuple[float, str, int, Floats]]) -> MemorySource:
             schemas.GAUSSIAN_ESTIMATE,
             [EPOCH_NS],
             metadata=metadata,
-            mean=MEAN[None],
-            covariance=np.diag(VARIANCES).reshape(1, 25),
+            mean=mean[None],
+            covariance=covariance.reshape(1, 25),
         ),
         make_stream(
             "/sighting",
@@ -188,7 +193,7 @@ def source(told: list[tuple[float, str, int, Floats]]) -> MemorySource:
             "/speed",
             schemas.VECTOR_MEASUREMENT,
             stamps(speeds),
-            value=np.array([each[3] for each in speeds]),
+            value=np.array([each[3] for each in speeds]).reshape(-1, 1),
         ),
     ]
     run = RunMetadata(scenario="vehicle-a", parameters={}, seed=0, run=0, epoch_ns=EPOCH_NS)
