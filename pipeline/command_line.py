@@ -318,6 +318,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
     logging.basicConfig(format="fuselog: %(message)s")
+    if sys.stderr.isatty():  # somebody waits
+        logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals():
             fuselog(arguments, prog_name="fuselog", standalone_mode=False)
