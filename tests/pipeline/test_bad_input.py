@@ -31,7 +31,11 @@ TABLE: dict[str, tuple[str, ...]] = {
     "replay log.mcap": ("Missing option '-e'", "fuselog replay --help"),
     "replay log.mcap -e efk": ("no estimator 'efk'", "did you mean 'ekf'"),
     "replay log.mcap -e ekf --model robt": ("no model 'robt'", "did you mean 'robot'"),
-    "replay log.mcap -e ekf --model vehicle": ("model vehicle does not fit", ".../fix", "/robot1/prior"),
+    "replay log.mcap -e ekf --model vehicle": (
+        "does not fit",
+        "nothing that vehicle needs",
+        "/robot1/prior",
+    ),
     "replay log.mcap -e triad --model robot": ("--model", "methods such as ekf", "triad takes none"),
     "replay log.mcap -e ekf --every 0": ("'every_s' is 0", "greater than 0"),
     "replay log.mcap -e ekf --every soon": ("--every", "soon"),
