@@ -161,7 +161,9 @@ class _Recorder:
             raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._values)}")
         self.read.add(name)
         value = self._values[name]
-        return 1.0 if value is None else float(value)
+        return np.float64(
+            1.0 if value is None else value
+        )  # overflows to infinity, as compiled code does
 
 
 def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:

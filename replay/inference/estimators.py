@@ -142,8 +142,9 @@ def _bind_fitting(
             f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"
         )
     if not fitting:
+        which = f"estimator {label}: model {named}" if named else f"estimator {label}"
         raise BadInput(
-            f"estimator {label} does not fit this log: {nearest(models, topics)}; "
+            f"{which} does not fit this log: {nearest(models, topics)}; "
             f"the log has {', '.join(topics) or 'no topics'}"
         )
     (name,) = fitting
