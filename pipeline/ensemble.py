@@ -229,9 +229,9 @@ def replay_to_logs(
     """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
 
     `origins` are what the runs start from where their spans begin after their priors, one per run.
-    Returns how many seconds each estimator took, by label.
+    Returns how many seconds each estimator took, by label. Raises BadInput as `replay` does.
     """
-    seconds: dict[str, float] = defaultdict(float)
+    reports: list[Report] = []
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
 
     def write_some(first: int) -> Iterator[int]:
@@ -244,18 +244,30 @@ def replay_to_logs(
                 stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
                 for path, source in zip(paths[now], sources[now], strict=True)
             ]
-            part = Report()
-            blocks = replay(sources[now], begun, order=order, block_messages=block_messages, report=part)
+            reports.append(part := Report())
+            blocks = replay(
+                sources[now],
+                begun,
+                order=order,
+                block_messages=block_messages,
+                report=part,
+                is_part=len(sources) > RUNS_AT_ONCE,
+            )
             for block in chain(blocks, _coverage_of(part)):
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block])
                 yield first
-            for label, time_s in part.seconds.items():
-                seconds[label] += time_s
 
     parts = map(write_some, range(0, len(sources), RUNS_AT_ONCE))
     for _ in progress(chain.from_iterable(parts), "replaying", None):
         pass
+    for name, refusal in reports[0].refused.items():
+        if all(name in report.refused for report in reports):
+            raise refusal
+    seconds: dict[str, float] = defaultdict(float)
+    for report in reports:
+        for label, time_s in report.seconds.items():
+            seconds[label] += time_s
     return dict(seconds)
 
 

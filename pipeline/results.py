@@ -211,11 +211,17 @@ def write_outcome(
 
 
 def _show_names_as_they_are(figure: "Figure") -> None:
-    """Titles and labels hold names from logs: a dollar sign in them begins no formula."""
+    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
+    from matplotlib.ticker import FixedFormatter, FuncFormatter
+
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
     texts = [text for legend in legends for text in legend.get_texts()]
     for axes in figure.axes:
-        texts += [axes.title, axes.xaxis.label, axes.yaxis.label]
+        texts.append(axes.title)
+        for axis in (axes.xaxis, axes.yaxis):
+            texts.append(axis.label)
+            if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
+                texts += axis.get_ticklabels()
     for text in texts:
         text.set_parse_math(False)
 

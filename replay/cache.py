@@ -10,7 +10,9 @@ from functools import cache
 from hashlib import sha256
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+
+from recorders.atomic import whole_file
+from recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
 
@@ -70,18 +72,16 @@ def read_checked(source: Path | Traversable) -> bytes | None:
 
 
 def write_checked(path: Path, content: bytes, made_by: str) -> None:
-    """Write a file, which appears whole or not at all, in folders of this user alone; raises OSError."""
-    _make_private(path.parent)
-    with NamedTemporaryFile(
-        dir=path.parent, prefix=f".{path.name}.", suffix=".part", delete=False
-    ) as part:
-        try:
-            part.write(_digest(content) + f" {made_by}\n".encode() + content)
-            part.close()
-            Path(part.name).replace(path)
-        except BaseException:
-            Path(part.name).unlink(missing_ok=True)
-            raise
+    """Write a file, which appears whole or not at all, in folders of this user alone.
+
+    Raises BadInput, which begins with the path, where that cannot be done.
+    """
+    try:
+        _make_private(path.parent)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written ({error.strerror})") from error
+    with whole_file(path, parents=False) as new:
+        new.write_bytes(_digest(content) + f" {made_by}\n".encode() + content)
 
 
 def _make_private(folder: Path) -> None:

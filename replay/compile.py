@@ -435,11 +435,9 @@ class _CompiledCode:
             return
         try:
             write_checked(path, dumps((path.name, result._reduce())), "a kernel that fuselog compiled")
-        except OSError as error:
-            say_once(
-                f"the cache {path.parent} cannot be written ({error.strerror}): "
-                "what is compiled now is not kept"
-            )
+        except BadInput as error:
+            why = str(error).removeprefix(f"{path}: ")
+            say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
 
     def _path(self, signature: Any, target: Any) -> Path | None:
         """The file for one processor and these types of arguments."""

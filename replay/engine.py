@@ -85,10 +85,12 @@ class Report:
     Attributes:
         seconds: how long each estimator worked, by label; compiling is part of a first use.
         coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
+        refused: by estimator, why no run of a part can be replayed.
     """
 
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     coverage: list[Ragged] = field(default_factory=list)
+    refused: dict[str, BadInput] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,7 @@ def replay(
     order: Clock = "publish_time",
     block_messages: int = BLOCK_MESSAGES,
     report: Report | None = None,
+    is_part: bool = False,
 ) -> Iterator[list[Ragged]]:
     """Replay an ensemble; yields the output streams of all estimators, block by block.
 
@@ -186,6 +189,8 @@ def replay(
         order: the clock to go by, publish time or (as it arrived) log time.
         block_messages: about how many messages of a run are in memory at once.
         report: filled with what there is to say when all is done.
+        is_part: whether there are more runs than these. Then it is no bad input that an estimator can
+            follow none of them: they fail, and the report says so.
 
     A run that an estimator cannot follow fails alone, see `replay.supervision`; the failures come last.
     Raises BadInput where an estimator can follow no run, no run has a message for it, or a run's span
@@ -196,9 +201,12 @@ def replay(
     for bound, whole in zip(estimators, wholes, strict=True):
         _refuse_old_priors(bound, sources, whole, order)
     watches = [
-        Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch)) for bound in estimators
+        Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch), is_part=is_part)
+        for bound in estimators
     ]
-    states = _start(estimators, watches, wholes)
+    states, refused = _start(estimators, watches, wholes)
+    if refused and not is_part:
+        raise next(iter(refused.values()))
     for bound, watch, given in zip(estimators, watches, states, strict=True):
         if isinstance(bound, Batch):
             for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
@@ -218,37 +226,41 @@ def replay(
             yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
     yield [failures for watch in watches for failures in watch.finish()]
     if report is not None:
+        report.refused |= refused
         for watch in watches:
+            if watch.refused is not None:
+                report.refused[watch.name] = watch.refused
             report.seconds[watch.name.partition("/")[0]] += watch.seconds
             report.coverage += watch.coverage()
 
 
 def _start(
     estimators: Sequence[Bound], watches: Sequence[Watch], wholes: Sequence[Mapping[str, Ragged]]
-) -> list[Any]:
-    """The states of recursions and what batches are given; _REFUSED where no run can start.
+) -> tuple[list[Any], dict[str, BadInput]]:
+    """The states of recursions and what batches are given; _REFUSED where there is none.
 
-    Of what one estimator estimates (each robot, say), what cannot start fails alone. Raises BadInput
-    where that is all.
+    Of what one estimator estimates (each robot, say), what cannot start fails alone. Where that is all,
+    there is also the reason, by the estimator's label.
     """
     states: list[Any] = []
-    refused: dict[str, list[BadInput | None]] = {}
+    told_of: dict[str, list[BadInput | None]] = {}
     for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
-        told = refused.setdefault(bound.name.partition("/")[0], [])
+        told = told_of.setdefault(bound.name.partition("/")[0], [])
         try:
             given, unable = start_of_runs(whole, bound.priors)
             watch.exclude(unable)
             with foreign_code(f"estimator {bound.name}"):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
-            told.append(None)
+            starts = len(unable) < watch.runs
+            told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
         except BadInput as error:
             watch.exclude(dict.fromkeys(range(watch.runs), str(error)))
             states.append(_REFUSED)
             told.append(error)
-    for errors in refused.values():
-        if errors[0] is not None and all(errors):
-            raise errors[0]
-    return states
+    refused = {
+        label: errors[0] for label, errors in told_of.items() if errors[0] is not None and all(errors)
+    }
+    return states, refused
 
 
 def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:

@@ -42,6 +42,14 @@ def read_priors(prior: Ragged, components: Components) -> Priors:
     Raises BadInput where the channel does not state the components (see `match_components`), the
     vectors have other widths than it states, or no run has a prior that can be used.
     """
+    priors = _priors_of(prior, components)
+    if all(priors.reasons):
+        raise BadInput(f"{priors.reasons[0]}; the filter cannot start")
+    return priors
+
+
+def _priors_of(prior: Ragged, components: Components) -> Priors:
+    """As `read_priors`, where no run may have one that can be used."""
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, components, where)
@@ -69,12 +77,8 @@ def read_priors(prior: Ragged, components: Components) -> Priors:
         reasons[present[~finite[present]]] = NOT_FINITE
     unusable = reasons != ""
     mean[unusable], covariance[unusable] = np.nan, np.nan
-    if unusable.all():
-        raise BadInput(
-            f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used: "
-            f"{reasons[0] if runs else MISSING}; the filter cannot start"
-        )
-    told = tuple(f"{where}: {reason}" if reason else "" for reason in reasons.tolist())
+    wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
+    told = tuple(f"{wanted}: {reason}" if reason else "" for reason in reasons.tolist())
     return Priors(time_ns, mean, covariance, told)
 
 
@@ -99,18 +103,16 @@ def start_of_runs(
         priors: which of them are priors, and the components that are wanted of each.
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
-    order, NaN where the run cannot start; and the reasons by run.
-    Raises BadInput as `read_priors` does, and where no run can start.
+    order, NaN where the run cannot start; and the reasons by run, which may be all of them.
+    Raises BadInput where a topic is no such prior, see `read_priors`.
     """
     found, failed = dict(whole), dict[int, str]()
     for topic, components in priors.items():
-        read = read_priors(whole[topic], components)
+        read = _priors_of(whole[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)
         found[topic] = _one_each(topic, read)
-    if failed and len(failed) == next(iter(found.values())).runs:
-        raise BadInput(f"no run can start: {failed[0]}")
     return found, failed
 
 

@@ -51,14 +51,19 @@ class Watch:
         name: the bound estimator's.
         runs: how many there are.
         seconds: how long the estimator worked.
+        refused: what all runs of a part of an ensemble raised.
     """
 
-    def __init__(self, name: str, runs: int, order: Clock, *, is_batch: bool) -> None:
+    def __init__(
+        self, name: str, runs: int, order: Clock, *, is_batch: bool, is_part: bool = False
+    ) -> None:
         self.seconds = 0.0
+        self.refused: BadInput | None = None
         self.name = name
         self.runs = runs
         self._order: Clock = order
         self._is_batch = is_batch
+        self._is_part = is_part
         # a run gets no message from here on
         self._end_ns = np.full(runs, FOREVER)
         self._first_ns, self._last_ns = np.full(runs, FOREVER), np.full(runs, -1)
@@ -78,7 +83,7 @@ class Watch:
         """What `work` makes of the next streams of the runs that have not failed.
 
         `work` is called again, from the same state, without a run that raises. Raises what it raises
-        where every run has, or it is no run's fault.
+        where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
         began = time.perf_counter()
@@ -198,11 +203,13 @@ class Watch:
             return search(runs[:half]) | search(runs[half:])
 
         alive = np.flatnonzero(self._end_ns > 0).tolist()
-        if self.runs == 1 or raised(only([])):
+        if raised(only([])):
             raise error
         guilty = search(alive)
-        if not guilty or len(guilty) == len(alive):
-            raise error
+        if len(guilty) == len(alive):
+            if not self._is_part:
+                raise error
+            self.refused = error
         for run, found in guilty.items():
             stamps = np.unique(
                 np.concatenate([each.of_run(run).times(self._order) for each in streams.values()])

@@ -100,11 +100,12 @@ class _Index(NamedTuple):
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """The entry of the chunk that stands there, where the index has it right."""
+        """The entry of the chunk that stands there, where an index has it right and not empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None
-        return entry
+        # a chunk without messages states the time 0 as well
+        return entry if entry.message_end_time else None
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:

@@ -47,11 +47,16 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
 
 
 def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, NDArray[np.int64]]:
-    """The batches of a table, one for each value of `key` in each run, and which one each row is of."""
+    """The batches of a table, one for each value of `key` in each run, and which one each row is of.
+
+    A run's batches are in the order of their last stamps, whatever their keys.
+    """
     groups = table.groupby(["run", key])
     last = groups["time_ns"].max()
     run = last.index.get_level_values("run").to_numpy()
-    return Batches(runs, run, last.to_numpy()), np.asarray(groups.ngroup(), np.int64)
+    in_order = np.lexsort((last, run))
+    place = np.argsort(in_order)
+    return Batches(runs, run[in_order], last.to_numpy()[in_order]), place[groups.ngroup()]
 
 
 def solution_streams(

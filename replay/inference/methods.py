@@ -6,6 +6,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt, PositiveFloat
 
 from recorders.parameters import Parameters
+from replay.inference.binding import number_fields, settings_type
 from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
 from replay.inference.generate import is_flat, resetting, retraction, tuple_of
-from replay.inference.model import Model
+from replay.inference.model import Model, trial_state
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
@@ -275,6 +277,27 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     return innovate
 
 
+def _lacks_slopes(model: Model) -> str:
+    """A sensor whose linearised components depend on one another at every state, in noise and all.
+
+    As those of a point and its square do: the innovation covariance is then singular.
+    """
+    names = number_fields(model.parameters)
+    parameters = settings_type(names)(*(1.0,) * len(names))
+    for sensor in model.sensors:
+        if sensor.noises and sensor.jacobian is None:
+            m, about = len(sensor.measured), (0.7,) * (sensor.about.size if sensor.about else 0)
+            rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
+            work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
+            try:
+                sensor_derivative(model, sensor)(trial_state(model.kinds), about, parameters, work)
+            except Exception:  # is said when the model is bound, see `model.check_sensor`
+                continue
+            if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
+                return f"a regular linearisation of its sensor {sensor.topic}"
+    return ""
+
+
 def _lacks_moments(model: Model) -> str:
     motions = (model.modes or {"": model.motion}).values()
     if not all(motion.linear or motion.moments for motion in motions):
@@ -284,8 +307,8 @@ def _lacks_moments(model: Model) -> str:
 
 
 METHODS: Mapping[str, Method] = {
-    "ekf": Method("extended Kalman filter", MethodParameters, _extended),
-    "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated),
+    "ekf": Method("extended Kalman filter", MethodParameters, _extended, lacks=_lacks_slopes),
+    "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated, lacks=_lacks_slopes),
     "ukf": Method(
         "unscented Kalman filter",
         UnscentedParameters,

@@ -223,7 +223,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     `parameters` has a number for every parameter. Raises BadInput where a function fails, or
     returns what the model denies.
     """
-    state, control = _origin(model.kinds), (0.0,) * model.controls
+    state, control = trial_state(model.kinds), (0.0,) * model.controls
     sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
@@ -245,7 +245,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
-    state, about = _origin(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
+    state, about = trial_state(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
@@ -259,12 +259,13 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
         _check(where, sensor.noise, (parameters,), wanted)
 
 
-def _origin(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """A state at which to try functions: small numbers, unit vectors."""
+def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
+    """A state at which to try functions: numbers that differ, unit vectors."""
     found: list[float] = []
     while len(found) < len(kinds):
         kind = kinds[len(found)]
-        found += {"axis": [1.0, 0.0], "quaternion": [1.0, 0.0, 0.0, 0.0]}.get(kind, [0.1])
+        number = 0.1 * (1 + len(found))
+        found += {"axis": [0.6, 0.8], "quaternion": [0.1, 0.5, -0.5, 0.7]}.get(kind, [number])
     return tuple(found)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recorders.errors import BadInput
 from replay.cache import cache_folder, is_private, read_checked, write_checked
 from replay.sampling.distance import Array
 from replay.sampling.lcd import Report, check_count, lcd_samples, moment_corrected, silent
@@ -60,8 +61,8 @@ def cached_set(name: SetName, report: Report = silent) -> Array:
     points = compute_set(name, report)
     try:
         write_sets(path, {name: points}, "fuselog on demand")
-    except OSError as error:
-        report(f"{path} cannot be written ({error.strerror}); its samples are not kept")
+    except BadInput as error:
+        report(f"{error}; its samples are not kept")
     return points
 
 
@@ -83,7 +84,7 @@ def read_set(source: Path | Traversable, name: SetName) -> Array | None:
 
 
 def write_sets(path: Path, sets: Mapping[SetName, Array], made_by: str) -> None:
-    """Write sets to one file, which appears whole or not at all; raises OSError."""
+    """Write sets to one file, which appears whole or not at all; raises BadInput."""
     archive = io.BytesIO()
     members = {str(name): points for name, points in sets.items()}
     np.savez(archive, **members)  # type: ignore[arg-type]

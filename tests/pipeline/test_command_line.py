@@ -4,6 +4,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -100,6 +101,22 @@ def test_more_runs_than_are_replayed_at_once(
         fuselog("replay", *logs, "-e", "ekf", "--out", str(here / "b"), "--json").json["metrics"]
         == in_parts
     )
+
+
+@pytest.mark.usefixtures("here")
+def test_a_part_of_the_runs_that_cannot_start_fails_alone(
+    world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one run of an ensemble does; where no run of any part can start, that is bad input."""
+    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    good, bad = str(world / "log.mcap"), str(world / "bad-prior.mcap")
+    said = fuselog("replay", good, bad, "-e", "ekf", "--out", "both", "--json")
+    assert said.code == 0, said.err
+    assert said.json["metrics"]["ekf.failed_runs.robot1"] == 1
+    again = shutil.copy(bad, "again.mcap")
+    none = fuselog("replay", bad, again, "-e", "ekf", "--out", "none")
+    assert none.code == 2
+    assert "not positive definite" in none.err
 
 
 @pytest.mark.usefixtures("here")

@@ -200,6 +200,21 @@ def test_no_two_topics_share_a_figure_and_none_runs_in_the_page(
     assert "<script" not in text
 
 
+def test_stated_ticks_are_drawn_as_they_are(tmp_path: Path) -> None:
+    """A name at a tick is no formula; the numbers of a logarithmic axis are."""
+    figure = matplotlib.figure.Figure()
+    axes = figure.subplots()
+    axes.boxplot([[1, 20], [3, 40]], tick_labels=["$\\foo$", "a$b$"])
+    axes.set_yscale("log")
+    with result_folder(tmp_path / "r") as part:
+        write_outcome(part, "test", {"title": ""}, Outcome(figures={"f": figure}))
+    drawn = (tmp_path / "r" / "figures" / "f.svg").read_text()
+    for text in ("$\\foo$", "a$b$", "$\\mathdefault{10^{1}}$"):
+        assert f"<!-- {text} -->" in drawn
+    names = [label for label in axes.get_xticklabels() if not label.get_parse_math()]
+    assert len(names) == 2
+
+
 def test_topics_that_look_like_formulas_are_drawn(tmp_path: Path) -> None:
     """A dollar sign starts no formula, and two cases that differ by a sign have two figures."""
     time_ns = np.arange(3)

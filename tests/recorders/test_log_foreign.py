@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, open_log, read_blocks, read_streams, schemas
+from recorders.log import LogWriter, open_log, read_blocks, read_span, read_streams, schemas
 from recorders.log.schemas import message_class
 from recorders.log.streams import concatenate
 from tests.recorders.log_samples import assert_same, rows_read, some_streams
@@ -481,6 +481,33 @@ def test_messages_beside_indexed_chunks_are_read(tmp_path):
         found = read(path, "/bearing", recover=recover)
         assert sorted(found.publish_time_ns) == sorted([*bearings.publish_time_ns, 1050, 1050])
         assert found["target_id"][found.log_time_ns == 1100][-2:].tolist() == [6, 6]
+
+
+def test_a_chunk_without_messages_has_no_time(tmp_path):
+    """The index of one states the time 0, at which such a log does not begin."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(schemas.BEARING.full_name, "protobuf", BEARING)
+        channel = writer.register_channel("/bearing", "protobuf", schema)
+        writer.add_message(channel, 1100, CLOCK + TARGET + ANGLE, 1050)
+        writer.finish()
+    raw = path.read_bytes()
+    (start,) = struct.unpack_from("<Q", raw, len(raw) - 28)
+    content = struct.pack("<QQQIIQ", 0, 0, 0, 0, 0, 0)
+    chunk = struct.pack("<BQ", 6, len(content)) + content
+    data_end = start - 13
+    raw = raw[:data_end] + chunk + raw[data_end:-28] + struct.pack("<Q", start + len(chunk)) + raw[-20:]
+
+    def tell_of_it(summary):
+        statistics(summary).chunk_count += 1
+        summary.append(records.ChunkIndex(len(chunk), data_end, "", 0, 0, 0, {}, 0, 0))
+
+    path.write_bytes(with_summary(raw, tell_of_it))
+    assert read_span(open_log(path), "publish_time") == (1050, 1050)
+    assert read_span(open_log(path), "log_time") == (1100, 1100)
+    assert read(path, "/bearing").publish_time_ns.tolist() == [1050]
 
 
 def chunk_indexes(summary):

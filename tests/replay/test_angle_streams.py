@@ -1,5 +1,7 @@
 """Estimators of optical bias and of the shooter on streams: batches, failures told per run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -116,6 +118,21 @@ def test_every_shot_is_located_on_its_own(mode: str) -> None:
     assert errors is not None
     size = len(errors.components)
     assert errors.nees.mean() == pytest.approx(size, abs=5.0 * np.sqrt(2.0 * size / len(errors.nees)))
+
+
+def test_shots_may_have_any_numbers() -> None:
+    """Numbers that do not count up in time: every shot is what it was, in the order of time."""
+    run = source("acoustic-shots", shots=4)
+    plain = solve([run], "shooter:bearings-only")["state"].stream
+    streams = dict(run.streams)
+    for topic, stream in run.streams.items():
+        if topic.endswith("/detections"):
+            other = np.array([30, 7, 99, 2], np.uint32)[stream["shot_id"] - stream["shot_id"].min()]
+            streams[topic] = replace(stream, columns={**stream.columns, "shot_id": other})
+    outputs = solve([replace(run, streams=streams)], "shooter:bearings-only")
+    assert failures(outputs, 0) == []
+    np.testing.assert_array_equal(outputs["state"]["mean"], plain["mean"])
+    np.testing.assert_array_equal(outputs["state"].stream.publish_time_ns, plain.publish_time_ns)
 
 
 def test_sensors_need_not_be_estimated() -> None:

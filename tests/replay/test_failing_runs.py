@@ -275,7 +275,7 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
     monkeypatch.setattr(
         ensemble, "bind", lambda label, all_, _: estimator.bind(label, all_[0].topics, Parameters())
     )
-    modes = [0, RAISE, INDEFINITE, 0, SILENT, 0]
+    modes = [0, RAISE, INDEFINITE, 0, SILENT, 0, RAISE]  # the last part is one run, which raises
     sources = [make_run(mode) for mode in modes]
     paths = [tmp_path / f"{number}.mcap" for number in range(len(modes))]
     ensemble.replay_to_logs(sources, {"m": {}}, paths)
@@ -283,9 +283,11 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
     read = [LogSource(open_log(path)).read(topics) for path in paths]
     outputs = {topic: gather([each[topic] for each in read]) for topic in topics}
     said = ensemble.judge(sources, outputs, 0.2).failures
-    assert len(said) == 3
+    assert len(said) == 4
     for sentence, mode in zip(said, [mode for mode in modes if mode], strict=True):
         assert CASES[mode] in sentence
+    with pytest.raises(BadInput, match="estimator m raised ZeroDivisionError"):
+        ensemble.replay_to_logs([make_run(RAISE)] * 3, {"m": {}}, paths[:3])
 
 
 @pytest.mark.parametrize(
