@@ -1,7 +1,9 @@
 """What estimators of third parties can ask for: outputs, topics, random numbers, small matrices."""
 
+import logging
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +14,7 @@ from recorders.log import Field, RunMetadata, Schema, Stream, make_stream, schem
 from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.blocks import Ragged
-from replay.compile import compile_over_runs
+from replay.compile import _load, compile_over_runs
 from replay.engine import Estimator, collect, replay
 from replay.plain import (
     Estimates,
@@ -291,3 +293,41 @@ def test_small_matrices_compile() -> None:
     np.testing.assert_allclose(compiled[0][0], plain[0][0])
     np.testing.assert_allclose(compiled[1][1], plain[1][0])
     assert compiled[3][1] == pytest.approx(plain[3][0])
+
+
+def test_all_runs_at_once_are_one_call() -> None:
+    """`follow_all` sees the whole ensemble; neither it nor `follow` is bad input."""
+    seen: list[int] = []
+
+    def settle(settings: Any, messages: Messages, state: State, results: Results) -> None:
+        seen.append(len(messages.offsets) - 1)
+        results.mean[:, 0], results.covariance[:] = messages.value[:, 1], 1.0
+
+    given: dict[str, Any] = {
+        "parameters": Parameters,
+        "streams": {"range": schemas.RANGE},
+        "whole": {"prior": schemas.GAUSSIAN_ESTIMATE},
+        "components": X,
+        "start": start,
+    }
+    out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
+    assert seen == [2]
+    assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(BadInput, match="give follow or follow_all"):
+        recursive("none", **given)
+
+
+@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
+def test_long_compiling_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """While it happens, and not where the code was kept."""
+    monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
+    monkeypatch.setattr("replay.compile._PATIENCE_S", 0.0)
+    caplog.set_level(logging.INFO, logger="fuselog")
+    arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
+    for _ in range(2):
+        _load.cache_clear()
+        compile_over_runs(tracked)(2, *arguments)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [f"compiling {tracked.__module__}.tracked, once"]
