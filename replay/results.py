@@ -39,7 +39,8 @@ def state_stream(
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
     if angular:
         mean = mean.copy()
-        mean[:, angular] = wrap_angle(mean[:, angular])
+        angles = mean[:, angular]  # those in range stay as they are, to the last bit
+        mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
     columns = {"mean": mean, "covariance": _flat(covariance)}
     blank = make_stream(
         topic,
