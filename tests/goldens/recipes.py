@@ -86,7 +86,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         "landmarks",
         "landmarks-adverse",
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
-        {label: {"gate_probability": 0.999} for label in ("ekf", "ukf")},
+        {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
     "lcd-sampling": Recipe(
         "lcd-sampling",

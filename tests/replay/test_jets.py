@@ -482,7 +482,7 @@ def test_loops_branches_and_tuples_compile_and_give_what_plain_python_gives():
 def test_a_kernel_names_the_source_of_what_it_imports(monkeypatch: pytest.MonkeyPatch):
     """A kernel's text is its key: other derivatives are another kernel."""
     texts: list[str] = []
-    monkeypatch.setattr("replay.compile._load", texts.append)
+    monkeypatch.setattr("replay.compile._load", lambda text, *_: texts.append(text))
     compile_over_runs(language, allocates=False)
     assert hashlib.sha256(Path(jets.__file__).read_bytes()).hexdigest() in texts[0]
 
