@@ -16,6 +16,10 @@ from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
 from replay.engine import Estimator
+from replay.inference.binding import needs_of
+from replay.inference.estimators import registered_models
+from replay.inference.methods import METHODS
+from replay.inference.model import Model
 from replay.metrics import Metric
 
 
@@ -39,6 +43,11 @@ def scenarios() -> list[Entry]:
 def estimators() -> list[Entry]:
     """Estimators with what they need of a log."""
     return _registered("estimators", Estimator, _estimator)
+
+
+def models() -> list[Entry]:
+    """Models with what they are made of, and the methods that estimate them."""
+    return _registered("models", Model, _model)
 
 
 def metrics() -> list[Entry]:
@@ -66,6 +75,20 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         say(f"All about one of them: fuselog {kind}s NAME")
     else:
         _print_details(entries[0])
+
+
+def show_models(name: str | None, *, as_json: bool) -> None:
+    """Print the models and the methods that estimate each, or all about one of them."""
+    show(models(), "model", name, as_json=as_json)
+    if name is None and not as_json:
+        rows = [[name, *_methods_of(model).values()] for name, model in registered_models().items()]
+        print_table(["model", *METHODS], rows, "Methods that estimate them")
+
+
+def _methods_of(model: Model) -> dict[str, str]:
+    """For every method "yes", or what the model lacks for it."""
+    lacking = {name: method.lacks(model) for name, method in METHODS.items()}
+    return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
 
 
 def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
@@ -103,6 +126,27 @@ def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
     if estimator.variant:
         facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
     return Entry(name, estimator.summary, facts, estimator.parameters)
+
+
+def _model(name: str, model: Model) -> Entry:
+    facts = {"state": _listed(model.state)}
+    for sensor in model.sensors:
+        of = f" of {sensor.about.topic}" if sensor.about else ""
+        facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({sensor.schema.full_name})"
+    if model.control:
+        facts[f"control {model.control.topic}"] = ", ".join(model.control.components)
+    if model.modes:
+        facts["modes"] = ", ".join(model.modes)
+    facts["needs"] = needs_of(model)
+    facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
+    return Entry(name, model.summary, facts, model.parameters)
+
+
+def _listed(components: Mapping[str, str]) -> str:
+    """Components, each with its kind unless that is linear."""
+    return ", ".join(
+        name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
+    )
 
 
 def _metric(name: str, metric: Metric[Any]) -> Entry:

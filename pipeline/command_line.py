@@ -163,6 +163,13 @@ def _say_written(path: Path, messages: int) -> None:
     type=ANY_PATH,
     help="Where to write LOG.estimates.mcap: a folder, or for one log a name.mcap [default: beside].",
 )
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option(
+    "--every",
+    "every_s",
+    type=Seconds(0),
+    help="Give estimates every so many seconds too, not at measurements alone.",
+)
 @click.option("--arrival-order", is_flag=True, help="Go by log time, as the messages arrived.")
 @click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
 @click.option(
@@ -292,6 +299,16 @@ _list_command("metric", "List the metrics, or all about NAME.")
 _list_command("experiment", "List the shipped experiments, or all about NAME.")
 
 
+@fuselog.command(short_help="List the models, and the methods that estimate each, or all about NAME.")
+@click.argument("name", required=False)
+@json_option
+def models(name: str | None, as_json: bool) -> None:
+    """List the models and whether each method can estimate them or why not, or all about NAME."""
+    from pipeline.catalog import show_models
+
+    show_models(name, as_json=as_json)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
 
@@ -301,6 +318,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
     logging.basicConfig(format="fuselog: %(message)s")
+    if sys.stderr.isatty():  # somebody waits
+        logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals():
             fuselog(arguments, prog_name="fuselog", standalone_mode=False)

@@ -28,6 +28,8 @@ from replay.starting import Origin, from_estimates, from_truth
 
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
 TOLD = ("failure", "skipped", "coverage")
+# Parameters of estimators that have an option of their own.
+OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
 def replay_logs(
@@ -35,6 +37,8 @@ def replay_logs(
     names: list[str],
     *,
     out: Path | None,
+    model: str | None,
+    every_s: float | None,
     arrival_order: bool,
     start_s: float | None,
     end_s: float | None,
@@ -52,7 +56,9 @@ def replay_logs(
     timelines = [] if save is None else [(save, TIMELINE)]
     inputs = {"log": logs, "start": [Path(origin) for origin in origins]}
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
-    estimators = _settings_of_estimators(names, parse_settings(settings))
+    stated = {"model": model, "every_s": every_s}
+    chosen = {key: value for key, value in stated.items() if value is not None}
+    estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [_span(source, start_s, end_s, order) for source in opened]
@@ -109,6 +115,8 @@ def _settings_of_estimators(
         known[label] = set(estimator.parameters.model_fields)
     for key in [each for each in settings if each not in chosen]:
         takers = [label for label in chosen if key in known[label]]
+        if not takers and key in OPTIONS:
+            raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
         if not takers:
             names = sorted(set(chosen).union(*known.values()))
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")

@@ -51,7 +51,7 @@ class Events(NamedTuple):
     is_last: NDArray[np.bool_]
 
 
-CarriedType = TypeVar("CarriedType", bound=NamedTuple)
+CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 
 
 class Block(NamedTuple):
@@ -70,9 +70,15 @@ class Block(NamedTuple):
 
 
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
-    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs."""
+    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
+
+    An entry may be such a NamedTuple itself.
+    """
     columns: Any = carried
-    return type(carried)(*(column[runs] for column in columns))
+    made: Any = type(carried)
+    return made(
+        *(of_runs(column, runs) if isinstance(column, tuple) else column[runs] for column in columns)
+    )
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -119,6 +125,11 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     bounds = np.stack([ragged.offsets for ragged in everything]) + starts[:, None]
     offsets = sum((ragged.offsets for ragged in everything), np.zeros(1, np.int64))
     count = len(times_ns)
+    if len(everything) == 1:  # in order already
+        is_last = np.ones(count, bool)
+        is_last[:-1] = times_ns[1:] != times_ns[:-1]
+        is_last[offsets[1:][np.diff(offsets) > 0] - 1] = True
+        return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)

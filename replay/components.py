@@ -1,12 +1,18 @@
 """A vector's components by the names that its channel states; their order never matters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 from recorders.errors import BadInput
+from recorders.models.states import state_metadata
 from replay.tangent import TANGENT_WIDTHS, Kind, are_kinds, things
 
 Components = Mapping[str, Kind]
+
+
+def components_of(names: Sequence[str]) -> Components:
+    """Names with their kinds: an angle is a component in rad that wraps, others are linear."""
+    return stated_components(state_metadata(names), {}, "components")
 
 
 def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:

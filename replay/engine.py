@@ -45,6 +45,8 @@ class Recursive:
             `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
             see `replay.priors`.
         given: whole topics that are not read from the runs, see `replay.starting`.
+        finish: the state after the last block -> the outputs that waited for messages which did not
+            come any more.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Recursive:
     run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
+    finish: Callable[[Any], list[Ragged]] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,8 +146,11 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     """
     estimator, parameters = configure(label, settings)
     first = sources[0]
-    with foreign_code(f"estimator {label}"):
-        bound = estimator.bind(label, first.topics, parameters)
+    try:
+        with foreign_code(f"estimator {label}"):
+            bound = estimator.bind(label, first.topics, parameters)
+    except BadInput as error:
+        raise BadInput(f"{first.name}: {error}") from error
     if not bound:
         raise BadInput(
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
@@ -215,6 +221,9 @@ def replay(
                 states[index], produced = watch.take(work, streams)
                 outputs += watch.receive(produced)
         yield outputs
+    for bound, watch, state in zip(estimators, watches, states, strict=True):
+        if isinstance(bound, Recursive) and bound.finish is not None and state is not _REFUSED:
+            yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
     yield [failures for watch in watches for failures in watch.finish()]
     if report is not None:
         report.refused |= refused
@@ -271,14 +280,26 @@ def _advance(
         return bound.run(state, Block(streams, events))
 
 
+def _finish(
+    bound: Recursive,
+    finish: Callable[[Any], list[Ragged]],
+    state: Any,
+    _: dict[str, Ragged],
+) -> list[Ragged]:
+    with foreign_code(f"estimator {bound.name}"):
+        return finish(state)
+
+
 def _refuse_old_priors(
     bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
     for topic in bound.priors.keys() - bound.given.keys():
         for run, source in enumerate(sources):
+            if source.start_ns is None:
+                continue
             times_ns = whole[topic].of_run(run).times(order)[:1]
-            if source.start_ns is not None and len(times_ns) and times_ns[0] < source.start_ns:
+            if len(times_ns) and times_ns[0] < source.start_ns:
                 raise BadInput(
                     f"{source.name}: the replay would start {bound.name} from {topic}, which is "
                     f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "

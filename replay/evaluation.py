@@ -72,7 +72,10 @@ class Errors:
 
 
 class Innovations(NamedTuple):
-    """One innovation stream of an ensemble; `degrees` is the number of measured components."""
+    """One innovation stream of an ensemble; `degrees` is the number of measured components.
+
+    `log_likelihood` is NaN where the estimator states none, and None of a log from before it was stated.
+    """
 
     estimator: str
     case: str
@@ -81,6 +84,7 @@ class Innovations(NamedTuple):
     accepted: NDArray[np.bool_]
     squared: Floats
     degrees: NDArray[np.int64]
+    log_likelihood: Floats | None = None
 
 
 def split_topic(topic: str) -> tuple[str, str]:
@@ -229,6 +233,7 @@ def innovations_of(stream: Ragged) -> Innovations:
         stream["accepted"] != 0,
         stream["normalised_innovation_squared"],
         np.isfinite(stream["innovation"]).sum(axis=1),
+        stream.stream.columns.get("log_likelihood"),
     )
 
 

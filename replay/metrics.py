@@ -123,6 +123,19 @@ def innovation(innovations: Innovations) -> dict[str, float]:
     }
 
 
+def likelihood(innovations: Innovations) -> dict[str, float]:
+    """The log-likelihood of a run's measurements as the filter predicted them: the mean over the runs.
+
+    Of the measurements that a gate let in alone, so that it is no measure to tune a gate by. Nothing
+    where the estimator does not state it of all of them.
+    """
+    stated = innovations.log_likelihood
+    if stated is None or not len(stated) or not np.isfinite(stated[innovations.accepted]).all():
+        return {}
+    runs = len(np.unique(innovations.run))
+    return {"log_likelihood": float(stated[innovations.accepted].sum() / runs)}
+
+
 def failures(output: Output) -> dict[str, float]:
     """How many runs failed."""
     if output.rows.stream.schema.full_name != schemas.FAILURE.full_name:
@@ -159,6 +172,7 @@ def solution(output: Output) -> dict[str, float]:
 ACCURACY = Metric("RMSE of position and other components against truth", Errors, accuracy)
 CONSISTENCY = Metric("NEES against its chi-square bounds", Errors, consistency)
 INNOVATION = Metric("NIS, and the share of measurements that a gate kept out", Innovations, innovation)
+LIKELIHOOD = Metric("log-likelihood of the measurements, per run", Innovations, likelihood)
 FAILURES = Metric("how many runs an estimator could not follow to the end", Output, failures)
 COVERAGE = Metric("what share of the span was estimated, and what was not used", Output, coverage)
 SOLUTION = Metric("how many batch solutions converged, and how fast", Output, solution)

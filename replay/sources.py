@@ -165,6 +165,16 @@ class MemorySource:
             yield block
 
     def _in_order(self, topic: str, order: Clock) -> Stream:
+        if (topic, order) not in self._ordered:
+            self._ordered[topic, order] = self._sorted(topic, order)
+        return self._ordered[topic, order]
+
+    @cached_property
+    def _ordered(self) -> dict[tuple[str, Clock], Stream]:
+        """What was sorted once; an ensemble is replayed several times."""
+        return {}
+
+    def _sorted(self, topic: str, order: Clock) -> Stream:
         stream = self.streams[topic]
         clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
         position = stream.position

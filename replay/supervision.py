@@ -126,8 +126,7 @@ class Watch:
         failed = set(self._failed).union(
             *(np.flatnonzero(np.diff(each.offsets)).tolist() for each in told.values())
         )
-        for run in set(range(self.runs)) - failed:
-            self._find_silence(run)
+        self._find_silence(failed)
         own_topic = f"/estimates/{self.name}/failure"
         topic = next((topic for topic in told if topic == own_topic), next(iter(told), own_topic))
         runs = sorted(self._failed)
@@ -267,21 +266,25 @@ class Watch:
             kept &= output.stream.publish_time_ns < self._end_ns[run]
         return output if kept.all() else _kept(output, kept)
 
-    def _find_silence(self, run: int) -> None:
-        """Note a failure where messages came and no state was estimated, or not any more."""
+    def _find_silence(self, failed: set[int]) -> None:
+        """Note a failure where messages came and no state was estimated, or not any more.
+
+        What has failed already is left out.
+        """
         rhythms = [self._rhythms[case] for case in self._states]
-        if not rhythms or self._last_ns[run] < 0:
+        if not rhythms:
             return
-        last_ns = max(int(rhythm.last_ns[run]) for rhythm in rhythms)
-        if not any(rhythm.said[run] for rhythm in rhythms):
-            self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
-        elif not self._is_batch and all(
-            rhythm.misses(run, int(self._last_ns[run])) for rhythm in rhythms
-        ):
-            silent_s = (self._last_ns[run] - last_ns) * 1e-9
-            self._failed[run] = Failure(
-                last_ns, f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
-            )
+        mute = ~np.any([rhythm.said for rhythm in rhythms], axis=0)
+        silent = np.all([rhythm.misses(self._last_ns) for rhythm in rhythms], axis=0)
+        last_ns = np.max([rhythm.last_ns for rhythm in rhythms], axis=0)
+        found = (self._last_ns >= 0) & (mute | (silent & (not self._is_batch)))
+        for run in set(np.flatnonzero(found).tolist()) - failed:
+            if mute[run]:
+                self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
+                continue
+            silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
+            reason = f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
+            self._failed[run] = Failure(int(last_ns[run]), reason)
 
 
 class _Rhythm:
@@ -322,9 +325,10 @@ class _Rhythm:
         is_gap = np.arange(self.BINS) > self._longest()[:, None]
         return np.where(is_gap, 0, self._sums_ns).sum(axis=1) * 1e-9
 
-    def misses(self, run: int, now_ns: int) -> bool:
-        """Whether the time since a run's last estimate is a gap."""
-        return bool(_bin_of(now_ns - self.last_ns[run : run + 1])[0] > self._longest()[run])
+    def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
+        """Whether the time (runs,) since each run's last estimate is a gap."""
+        missed: NDArray[np.bool_] = _bin_of(now_ns - self.last_ns) > self._longest()
+        return missed
 
     def _longest(self) -> Integers:
         """The bin (runs,) of the longest intervals that are no gaps."""

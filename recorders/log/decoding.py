@@ -68,10 +68,14 @@ class Decoder:
         return schema
 
     def _check_fields(self) -> None:
-        """A message of one of our names must have our fields, whatever else it has."""
+        """A message of one of our names must have our fields (but the latest), whatever else it has."""
         kinds = {entry.name: entry.kind for entry in self.schema}
         expected = SCHEMAS.get(self.schema.full_name, self.schema)
-        wrong = [entry.name for entry in expected if kinds.get(entry.name) != entry.kind]
+        wrong = [
+            entry.name
+            for entry in expected
+            if kinds.get(entry.name, entry.kind if entry.may_be_absent else None) != entry.kind
+        ]
         if wrong or not kinds:
             raise BadInput(
                 f"{self._where}: this {self.schema.full_name} has no numeric field "

@@ -33,11 +33,16 @@ NUMPY_TYPES: dict[Kind, np.dtype] = {
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a message; `may_be_nan` says that NaN stands for a value that is missing."""
+    """One field of a message.
+
+    `may_be_nan` says that NaN stands for a value that is missing, `may_be_absent` that logs written
+    before there was such a field lack it: who reads them asks whether the column is there.
+    """
 
     name: str
     kind: Kind
     may_be_nan: bool = False
+    may_be_absent: bool = False
 
     @property
     def dtype(self) -> np.dtype:
@@ -305,6 +310,7 @@ INNOVATION = _declare(
     _vector("innovation", may_be_nan=True),
     _vector("covariance", may_be_nan=True),
     _real("normalised_innovation_squared"),
+    Field("log_likelihood", "real", may_be_nan=True, may_be_absent=True),
 )
 FAILURE = _declare(
     "Failure",

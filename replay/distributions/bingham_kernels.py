@@ -20,6 +20,8 @@ from recorders.models.orientation import SIGNS
 from replay.compile import compiled
 from replay.distributions.gaussian_kernels import solve_in_place
 
+Vector = NDArray | tuple[float, ...]
+
 NODES = 28
 _theta = np.pi / NODES * np.arange(1, NODES, 2)
 _cotangent = 1.0 / np.tan(0.6407 * _theta)
@@ -154,7 +156,7 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
                 vectors[k, i], vectors[k, least] = vectors[k, least], vectors[k, i]
 
 
-def compose(left: NDArray, right: NDArray, out: NDArray) -> None:
+def compose(left: Vector, right: Vector, out: NDArray) -> None:
     """Write left (+) right to `out`, all (d,); `out` is neither of the others."""
     for i in range(len(out)):
         out[i] = 0.0

@@ -18,7 +18,17 @@ from recorders.models.orientation import require_unit
 from replay.compile import compile_over_runs
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
-from replay.distributions.bingham_kernels import compose, framed, predict, turn_columns, update
+from replay.distributions.bingham_kernels import (
+    compose,
+    compose_columns,
+    framed,
+    integrate,
+    inverse,
+    predict,
+    turn_columns,
+    update,
+    weighted_outer,
+)
 from replay.distributions.gaussian_kernels import condition
 
 
@@ -81,13 +91,17 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return compile_over_runs(run_once)
 
 
-def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tuple[Bingham, Bingham]:
+def run_bingham_filter(
+    noise: BinghamNoise, state: Bingham, steps: Steps, rotations: NDArray[np.float64] | None = None
+) -> tuple[Bingham, Bingham]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
     Args:
         noise: see there.
         state: the distributions before the first row, batch axis (runs,).
         steps: see there.
+        rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
+            the modes, see `replay.tangent`.
 
     Returns:
         The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
@@ -104,14 +118,28 @@ def run_bingham_filter(noise: BinghamNoise, state: Bingham, steps: Steps) -> tup
         bingham.parameter_matrix(bingham.likelihood(noise.measurement, identity)),
         state,
         estimates,
+        _rotations(steps) if rotations is None else rotations,
     )
     return state, estimates
 
 
+def _rotations(steps: Steps) -> NDArray[np.float64]:
+    rows, d = steps.measurement.shape
+    return np.empty((rows, d - 1, d - 1))
+
+
 def _bingham_run(
-    run: int, steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
+    run: int,
+    steps: Steps,
+    system: NDArray,
+    inverse_noise: NDArray,
+    state: Bingham,
+    estimates: Bingham,
+    rotations: NDArray,
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
+    d = len(z)
+    moments, local, work = np.empty(d), np.empty((d, d)), np.empty((d, d))
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):
             turn_columns(axes, steps.increment[row])
@@ -124,10 +152,20 @@ def _bingham_run(
             axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
+        # in the frame of the mode small moments keep their digits next to large ones
+        integrate(z, moments, work)
+        compose_columns(inverse(axes[:, d - 1]), axes, local)
+        weighted_outer(local, moments, work)
+        _store_rotations(work, rotations[row])
 
 
 def run_kalman_filter(
-    noise: GaussianNoise, state: Gaussian, steps: Steps, *, rotated: bool
+    noise: GaussianNoise,
+    state: Gaussian,
+    steps: Steps,
+    rotations: NDArray[np.float64] | None = None,
+    *,
+    rotated: bool,
 ) -> tuple[Gaussian, Gaussian]:
     """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
 
@@ -135,6 +173,7 @@ def run_kalman_filter(
         noise: see there; the paper adds it as it is, wherever the state points.
         state: the Gaussians before the first row, batch axis (runs,).
         steps: see there.
+        rotations: as for `run_bingham_filter`.
         rotated: turn the noise into the frame of the state, x (+) (w - e_1), before adding it.
 
     Returns:
@@ -145,12 +184,19 @@ def run_kalman_filter(
     state = Gaussian(state.mean.copy(), state.covariance.copy())
     estimates = Gaussian(np.empty((rows, d)), np.empty((rows, d, d)))
     noise = GaussianNoise(*map(np.ascontiguousarray, noise))
-    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates)
+    local = _rotations(steps) if rotations is None else rotations
+    _over_runs(_kalman_run)(len(steps.offsets) - 1, steps, noise, rotated, state, estimates, local)
     return state, estimates
 
 
 def _kalman_run(
-    run: int, steps: Steps, noise: GaussianNoise, rotated: bool, state: Gaussian, estimates: Gaussian
+    run: int,
+    steps: Steps,
+    noise: GaussianNoise,
+    rotated: bool,
+    state: Gaussian,
+    estimates: Gaussian,
+    rotations: NDArray,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
@@ -167,6 +213,18 @@ def _kalman_run(
             x /= math.sqrt((x * x).sum())
         estimates.mean[row] = x
         estimates.covariance[row] = p
+        _store_rotations(framed(p, inverse(x)), rotations[row])
+
+
+def _store_rotations(local: NDArray, covariance: NDArray) -> None:
+    """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
+
+    See `replay.tangent.vector_part_covariance`.
+    """
+    t = len(covariance)
+    for i in range(t):
+        for j in range(t):
+            covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
 
 
 def _frame(state: NDArray, rotated: bool) -> NDArray:

@@ -298,7 +298,7 @@ def learn_mixture(
 
 
 def _bind_rule(name: str, topics: Mapping[str, Topic], parameters: RuleParameters) -> list[Bound]:
-    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:  # noqa: ARG001
+    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
         values = normalise(compared.scores[:, :, chosen], parameters.normalisation)
         fused = RULES[parameters.rule](values, axis=2)
         return fused_stream(compared, all_pairs(len(fused)), fused.ravel(), {})
@@ -311,7 +311,7 @@ def _bind_classifier(
 ) -> list[Bound]:
     is_ratio = parameters.calibrated or parameters.classifier in LIKELIHOOD_RATIOS
 
-    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:  # noqa: ARG001
+    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
         return _learnt(compared, chosen, parameters, partial(learn_classifier, parameters), is_ratio)
 
     return _bind(name, topics, parameters, fuse)

@@ -18,36 +18,32 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
-from recorders.models.planar import drive, range_bearing, wrap_angle
+from recorders.log import Topic
+from recorders.models.planar import drive, range_bearing
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
-from replay.estimators.gaussian import (
-    ALL_WELL,
-    NOT_FINITE,
-    NOT_POSITIVE_DEFINITE,
+from replay.estimators.landmarks import LANDMARKS, POSE, LocalizationParameters
+from replay.failures import Failure
+from replay.inference.binding import stated
+from replay.inference.gaussian import (
     Floats,
     Function,
     Innovation,
-    add_control_noise,
-    correct,
-    failures_of,
+    add_through,
+    kalman_step,
+    keep_measured,
+    reduce_covariance,
+    whiten,
     wrap,
 )
-from replay.estimators.landmarks import (
-    POSE,
-    Landmarks,
-    fill_motion_jacobians,
-    fill_sensor_jacobian,
-    map_of_runs,
-    rows_on_map,
-    stated,
-)
-from replay.failures import Failure, failure_stream
+from replay.inference.generate import Input, derivative
+from replay.inference.happenings import Points, points_of
+from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
 from replay.priors import no_priors, read_priors
+from replay.results import ALL_WELL, failures_by_run, failures_of, state_stream
 
 Integers = NDArray[np.int64]
 Mode = Literal["alone", "naive", "ci", "joint"]
@@ -91,7 +87,7 @@ class State(NamedTuple):
     """
 
     carried: Carried
-    landmarks: Landmarks
+    landmarks: Points
     reasons: NDArray[np.str_]
     told: NDArray[np.bool_]
 
@@ -140,6 +136,34 @@ class Sighting(NamedTuple):
     spread: Floats
 
 
+class Linear(NamedTuple):
+    """A robot's drive, linearised: the end (3,), by the pose (3, 3) and by the velocity (3, 2)."""
+
+    state: Floats
+    transition: Floats
+    gain: Floats
+
+
+class Seen(NamedTuple):
+    """Range and bearing of a place (2,), and by the pose (2, 3)."""
+
+    predicted: Floats
+    rows: Floats
+
+
+KINDS = tuple(POSE.values())
+linear_drive = derivative(
+    drive,
+    [Input("pose", KINDS, "transition"), Input("velocity", ("linear", "linear"), "gain")],
+    KINDS,
+    ("duration_s",),
+    "state",
+)
+linear_sight = derivative(
+    range_bearing, [Input("pose", KINDS, "rows")], ("linear", "angle"), ("place",), "predicted"
+)
+
+
 def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Floats) -> None:
     """Move one robot to a time by its odometry, with its correlations."""
     duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
@@ -149,9 +173,13 @@ def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Float
     mean, covariance, first = carried.mean[run], carried.covariance[run], 3 * robot
     velocity = carried.velocity[run, robot]
     pose = (mean[first], mean[first + 1], mean[first + 2])
-    transition, gain = np.empty((3, 3)), np.empty((3, 2))
-    fill_motion_jacobians(pose, velocity, duration_s, transition, gain)
-    mean[first], mean[first + 1], mean[first + 2] = drive(pose, velocity, duration_s)
+    work = Linear(np.empty(3), np.empty((3, 3)), np.empty((3, 2)))
+    transition, variances = work.transition, np.empty(2)
+    linear_drive(pose, (velocity[0], velocity[1]), duration_s, work)
+    for k in range(3):
+        mean[first + k] = work.state[k]
+    for k in range(2):
+        variances[k] = density[k] * density[k] / duration_s
     moved = np.empty(3)
     for other in range(len(mean)):  # F P, and beside it P F'
         if first <= other < first + 3:
@@ -164,7 +192,7 @@ def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Float
             covariance[first + row, other] = covariance[other, first + row] = moved[row]
     own = np.empty((3, 3))
     fill_spread(covariance, first, transition, own)
-    add_control_noise(own, gain, density, duration_s)
+    add_through(own, work.gain, variances)
     for row in range(3):
         for column in range(3):
             covariance[first + row, first + column] = own[row, column]
@@ -211,17 +239,17 @@ def look(
     """Fill the innovation of a robot's sighting of a place, and its rows."""
     first = 3 * robot
     pose = (mean[first], mean[first + 1], mean[first + 2])
-    range_m, bearing_rad = range_bearing(pose, place)
-    sighting.innovation[0] = value[0] - range_m
-    sighting.innovation[1] = wrap(value[1] - bearing_rad, True)
-    fill_sensor_jacobian(pose, place, sighting.rows[0])
+    work = Seen(np.empty(2), sighting.rows[0])
+    linear_sight(pose, place, work)
+    sighting.innovation[0] = value[0] - work.predicted[0]
+    sighting.innovation[1] = wrap(value[1] - work.predicted[1], True)
     for row in range(2):
         for k in range(2):
             sighting.rows[1, row, k] = -sighting.rows[0, row, k]
         sighting.rows[1, row, 2] = 0.0
 
 
-def improve(
+def update(
     mean: Floats,
     covariance: Floats,
     first: Integers,
@@ -230,7 +258,7 @@ def improve(
     noise: Floats,
     gate: Floats,
 ) -> tuple[float, bool]:
-    """The extended Kalman filter's update of the robots on these sides, see `gaussian.correct`."""
+    """The extended Kalman filter's update of the robots on these sides: NIS, and whether it was made."""
     cross, spread, difference = np.zeros((len(mean), 2)), np.empty((2, 2)), np.empty(2)
     for row in range(2):
         difference[row] = sighting.innovation[row]
@@ -245,7 +273,16 @@ def improve(
                 for k in range(3):
                     entry += sighting.rows[side, row, k] * cross[first[side] + k, column]
             spread[row, column] = entry
-    return correct(mean, covariance, Innovation(difference, spread, cross), gate)
+    innovation, step = Innovation(difference, spread, cross), np.empty(len(mean))
+    size = keep_measured(innovation)
+    squared, _ = whiten(innovation, size)
+    if not squared <= gate[size]:
+        return squared, False
+    kalman_step(innovation, size, step)
+    reduce_covariance(covariance, cross, size)
+    for row in range(len(mean)):
+        mean[row] += step[row]
+    return squared, True
 
 
 def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
@@ -278,7 +315,7 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
             blend(1.0, own, share, sighting.spread[1 - side], noise)
             scale(covariance, first[side], 1.0 / weight)
             sides = (side, side + 1 + (both and joint))
-            squared, used = improve(mean, covariance, first, sides, sighting, noise, gate)
+            squared, used = update(mean, covariance, first, sides, sighting, noise, gate)
             if np.isnan(squared):
                 return False
             if not used:
@@ -359,7 +396,7 @@ def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
         np.full(runs, ALL_WELL),
     )
     reasons = np.stack([each.reasons for each in priors], axis=1)
-    return State(carried, map_of_runs(whole["/landmarks"]), reasons, reasons == "")
+    return State(carried, points_of(whole["/landmarks"], LANDMARKS), reasons, reasons == "")
 
 
 def run(
@@ -380,10 +417,10 @@ def run(
     count = int(events.emit.max(initial=-1)) + 1
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
     loop = _compiled(mode, criterion)
-    loop(len(carried.mean), events, landmarks.positions, settings, carried, results)
+    loop(len(carried.mean), events, landmarks.places, settings, carried, results)
     poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
     failed_ns = carried.time_ns.max(axis=1)
-    failures = failures_of(f"/estimates/{name}", before.failure, carried.failure, failed_ns)
+    failures = failures_of(f"/estimates/{name}", before.failure, carried.failure, failed_ns, FAILURES)
     told, excluded = _excluded(name, prefixes, block, reasons, told)
     return State(carried, landmarks, reasons, told), [*poses, failures, *excluded]
 
@@ -402,12 +439,11 @@ def _excluded(
         new = np.flatnonzero(~told[:, robot] & (np.diff(odometry.offsets) > 0))
         told[new, robot] = True
         times_ns = odometry.stream.publish_time_ns[odometry.offsets[new]]
-        failures = [
-            Failure(int(time_ns), str(reasons[run, robot]))
-            for run, time_ns in zip(new, times_ns, strict=True)
-        ]
-        stream = failure_stream(f"/estimates/{name}{prefix}/failure", failures)
-        outputs.append(Ragged(stream, np.searchsorted(new, np.arange(len(told) + 1))))
+        failures = {
+            run: Failure(time_ns, str(reasons[run, robot]))
+            for run, time_ns in zip(new.tolist(), times_ns.tolist(), strict=True)
+        }
+        outputs.append(failures_by_run(f"/estimates/{name}{prefix}", failures, len(told)))
     return told, outputs
 
 
@@ -416,25 +452,15 @@ def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, res
     rows = np.flatnonzero((events.emit >= 0) & (events.robots[:, 0] == robot))
     rows = rows[np.isfinite(results.mean[events.emit[rows], 0])]
     mean, covariance = (part[events.emit[rows]] for part in results)
-    mean[:, 2] = wrap_angle(mean[:, 2])
-    stream = make_stream(
-        f"/estimates/{name}{prefixes[robot]}/pose",
-        schemas.GAUSSIAN_ESTIMATE,
-        events.time_ns[rows],
-        metadata={
-            "components": "x_m,y_m,heading_rad",
-            "kinds": "linear,linear,angle",
-            "truth": f"{prefixes[robot]}/truth",
-        },
-        mean=mean,
-        covariance=covariance.reshape(-1, 9),
-    )
+    prefix = prefixes[robot]
+    topic = f"/estimates/{name}{prefix}/pose"
+    stream = state_stream(topic, events.time_ns[rows], POSE, f"{prefix}/truth", mean, covariance)
     return Ragged(stream, np.searchsorted(rows, events.offsets))
 
 
 def _events(
     block: Block,
-    landmarks: Landmarks,
+    landmarks: Points,
     prefixes: tuple[str, ...],
     mode: Mode,
     settings: Settings,
@@ -457,7 +483,7 @@ def _events(
     acts = is_able[run_of, robot]
     is_fellow = (sees == 1) & (numbers[fellow] == target_id) & (fellow != robot) & acts
     is_fellow &= is_able[run_of, fellow]
-    place = rows_on_map(landmarks, (run_of << 32) + target_id)
+    place = landmarks.rows(run_of, target_id)
     is_mapped = (sees == 1) & (place >= 0) & settings.anchor[robot] & acts
     due = (sees == 0) & (order.time_ns >= start_ns[run_of, robot]) & acts
     kept = np.flatnonzero(((sees == 0) & acts) | is_mapped | (is_fellow & (mode != "alone")))
@@ -500,13 +526,18 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
                 f"estimator {name}: anchor {anchor} is none of the robots "
                 f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
             )
-    given = parameters.model_dump(exclude={"mode", "criterion", "anchors"})
     density, variance = np.empty((len(prefixes), 2)), np.empty((len(prefixes), 2))
+
+    def number(topic: str, key: str) -> float:
+        """A parameter as given, else as its channel states it."""
+        given = getattr(parameters, key)
+        return stated(LocalizationParameters, [topics[topic]], key) if given is None else given
+
     for row, prefix in enumerate(prefixes):
         for column, key in enumerate(("forward_noise_density", "turn_noise_density")):
-            density[row, column] = stated(topics[f"{prefix}/odometry"], given, key)
+            density[row, column] = number(f"{prefix}/odometry", key)
         for column, key in enumerate(("sigma_range_m", "sigma_bearing_rad")):
-            variance[row, column] = stated(topics[f"{prefix}/range_bearing"], given, key) ** 2
+            variance[row, column] = number(f"{prefix}/range_bearing", key) ** 2
     settings = Settings(
         density,
         variance,

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
 from replay.compile import compile_over_runs
-from replay.estimators.gaussian import Floats, Function, cholesky
+from replay.inference.gaussian import Floats, Function, cholesky
 
 Criterion = Literal["trace", "determinant"]
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
@@ -161,7 +161,7 @@ def optimised(fill_slope: Function, power: float, tolerance: float, iterations: 
 
     def weigh(
         count: int,
-        covariances: Floats,  # noqa: ARG001
+        covariances: Floats,
         information: Floats,
         means: Floats,
         weights: Floats,
@@ -231,7 +231,7 @@ def determinant(matrix: Floats) -> float:
 
 def weigh_by_shares(
     count: int,
-    covariances: Floats,  # noqa: ARG001
+    covariances: Floats,
     information: Floats,
     means: Floats,
     weights: Floats,
@@ -257,7 +257,7 @@ def weigh_by_shares(
 
 def weigh_fully(
     count: int,
-    covariances: Floats,  # noqa: ARG001
+    covariances: Floats,
     information: Floats,
     means: Floats,
     weights: Floats,
@@ -277,7 +277,7 @@ def weighted(weigh: Function) -> Function:
         count: int,
         means: Floats,
         covariances: Floats,
-        independents: Floats,  # noqa: ARG001
+        independents: Floats,
         weights: Floats,
         mean: Floats,
         covariance: Floats,

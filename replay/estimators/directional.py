@@ -26,6 +26,7 @@ from replay.estimators.bingham import (
     BinghamNoise,
     Gaussian,
     GaussianNoise,
+    Steps,
     make_steps,
     run_bingham_filter,
     run_kalman_filter,
@@ -38,11 +39,10 @@ from replay.estimators.torus import (
 )
 from replay.measurements import Vectors
 from replay.plain import Given, Messages, Results, recursive
-from replay.tangent import vector_part_covariance
 
 Floats = NDArray[np.float64]
-# State of one run and its measurements -> the state after them, means (n, d), covariances (n, t, t).
-Advance = Callable[[Any, Floats], tuple[Any, Floats, Floats]]
+# The states of all runs and their measurements -> the states after them; fills the results.
+Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
@@ -91,14 +91,10 @@ class Distributions(NamedTuple):
     measurement: Noise
 
 
-def follow(run: int, advance: Advance, messages: Messages, state: Any, results: Results) -> None:
-    """Take one run through its measurements."""
-    rows = slice(int(messages.offsets[run]), int(messages.offsets[run + 1]))
-    one = type(state)(*(part[run : run + 1] for part in state))
-    after, mean, covariance = advance(one, messages.value[rows])
-    for part, changed in zip(state, after, strict=True):
-        part[run] = changed[0]
-    results.mean[rows], results.covariance[rows] = mean, covariance
+def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
+    """Take all runs through their measurements."""
+    for part, changed in zip(state, advance(state, messages, results), strict=True):
+        part[:] = changed
 
 
 def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
@@ -140,10 +136,10 @@ def _start_bingham(topic: str, d: int, given: Given[BinghamParameters]) -> tuple
     stated = distributions(given, topic, d)
     noise = BinghamNoise(as_bingham(stated.system), as_bingham(stated.measurement))
 
-    def advance(state: Bingham, measured: Floats) -> tuple[Bingham, Floats, Floats]:
-        after, found = run_bingham_filter(noise, state, _steps(measured[:, :d]))
-        moments = bingham.covariance(found)
-        return after, found.mode, vector_part_covariance(found.mode, moments)
+    def advance(state: Bingham, messages: Messages, results: Results) -> Bingham:
+        after, found = run_bingham_filter(noise, state, _steps(messages), results.covariance)
+        results.mean[:] = found.mode
+        return after
 
     return advance, _widened(as_bingham(stated.prior), given.runs)
 
@@ -153,18 +149,19 @@ def _start_kalman(topic: str, d: int, given: Given[KalmanParameters]) -> tuple[A
     noise = GaussianNoise(as_covariance(stated.system), as_covariance(stated.measurement))
     mode = np.eye(d)[0] if stated.prior.distribution == "gaussian" else as_bingham(stated.prior).mode
 
-    def advance(state: Gaussian, measured: Floats) -> tuple[Gaussian, Floats, Floats]:
-        rotated = given.parameters.rotated
-        after, found = run_kalman_filter(noise, state, _steps(measured[:, :d]), rotated=rotated)
-        return after, found.mean, vector_part_covariance(found.mean, found.covariance)
+    def advance(state: Gaussian, messages: Messages, results: Results) -> Gaussian:
+        rotated, steps = given.parameters.rotated, _steps(messages)
+        after, found = run_kalman_filter(noise, state, steps, results.covariance, rotated=rotated)
+        results.mean[:] = found.mean
+        return after
 
     return advance, _widened(Gaussian(mode, as_covariance(stated.prior)), given.runs)
 
 
-def _steps(measured: Floats) -> Any:
-    """One run's steps without control input."""
-    count, d = measured.shape
-    return make_steps(np.array([0, count]), np.tile(np.eye(d)[0], (count, 1)), measured)
+def _steps(messages: Messages) -> Steps:
+    """Steps without control input."""
+    count, d = messages.value.shape
+    return make_steps(messages.offsets, np.tile(np.eye(d)[0], (count, 1)), messages.value)
 
 
 def _widened(state: Any, runs: int) -> Any:
@@ -189,10 +186,10 @@ def _start_headings(
     model, run_filter = heading_model(given), filter_of(given.parameters)
     _, mean, covariance = given.prior("prior")
 
-    def advance(state: WrappedNormal, measured: Floats) -> tuple[WrappedNormal, Floats, Floats]:
-        offsets = np.array([0, len(measured)])
-        after, found = run_filter(model, state, offsets, np.ascontiguousarray(measured))
-        return after, found.mean, found.covariance
+    def advance(state: WrappedNormal, messages: Messages, results: Results) -> WrappedNormal:
+        after, found = run_filter(model, state, messages.offsets, messages.value)
+        results.mean[:], results.covariance[:] = found
+        return after
 
     return advance, WrappedNormal(mean, covariance)
 
@@ -214,8 +211,7 @@ def _of_unit_vectors(
         truth="truth",
         vectors={topic: Vectors({topic: len(kinds)})},
         start=partial(start, topic, len(kinds)),
-        follow=follow,
-        compiled=False,
+        follow_all=follow_all,
     )
 
 
@@ -232,8 +228,7 @@ def _of_headings(
         truth="truth",
         vectors={"headings": Vectors({"value": components})},
         start=partial(_start_headings, filter_of),
-        follow=follow,
-        compiled=False,
+        follow_all=follow_all,
     )
 
 

@@ -24,9 +24,11 @@ from replay.blocks import Block, Ragged
 from replay.compile import compile_over_runs
 from replay.components import Components
 from replay.engine import Bound, Estimator, Recursive
-from replay.estimators.gaussian import ALL_WELL, NOT_POSITIVE_DEFINITE, cholesky, failures_of
+from replay.inference.gaussian import cholesky
+from replay.inference.steps import FAILURES, NOT_POSITIVE_DEFINITE
 from replay.measurements import PLANE, read_vectors
 from replay.priors import gaussians
+from replay.results import ALL_WELL, failures_of, state_stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -191,7 +193,7 @@ def add_detected(
     return end
 
 
-def prepare(mean: Floats, covariance: Floats, variance: float, gain: Floats) -> bool:  # noqa: ARG001
+def prepare(mean: Floats, covariance: Floats, variance: float, gain: Floats) -> bool:
     """Fill what the update of a component needs and all detections share; see `add_detected`."""
     a = covariance[X, X] + variance
     b = covariance[X, Y]
@@ -525,7 +527,7 @@ class Outputs(NamedTuple):
         counts = np.concatenate([[0], np.cumsum(elements)])
         rows = np.repeat(sets.room[told] - counts[:-1], elements) + np.arange(counts[-1])
         expected = sets.expected[told]
-        state = state_metadata(PLANE_MOTION)
+        state, topic = state_metadata(PLANE_MOTION), f"/estimates/{self.name}"
         return [
             self._ragged("set", schemas.ESTIMATE_SIZE, offsets, time_ns, state, elements=elements),
             self._ragged(
@@ -539,16 +541,18 @@ class Outputs(NamedTuple):
                 covariance=sets.covariance[rows].reshape(-1, STATES**2),
             ),
             # a PHD knows the number as a Poisson variable, whose variance is its mean
-            self._ragged(
-                "cardinality",
-                schemas.GAUSSIAN_ESTIMATE,
+            Ragged(
+                state_stream(
+                    f"{topic}/cardinality",
+                    time_ns,
+                    {"things": "linear"},
+                    None,
+                    expected[:, None],
+                    expected[:, None, None],
+                ),
                 offsets,
-                time_ns,
-                {"components": "things", "kinds": "linear"},
-                mean=expected[:, None],
-                covariance=expected[:, None],
             ),
-            failures_of(f"/estimates/{self.name}", before.failure, after.failure, after.time_ns),
+            failures_of(topic, before.failure, after.failure, after.time_ns, FAILURES),
         ]
 
     def _ragged(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from replay.compile import compile_over_runs, compiled
 from replay.distributions.bingham_kernels import (
+    Vector,
     compose,
     compose_columns,
     integrate,
@@ -149,42 +150,56 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
 
 
 def run_inertial_filter(
-    model: InertialModel, state: InertialState, samples: InertialSamples
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates | None = None,
 ) -> tuple[InertialState, OrientationEstimates]:
     """Go through the samples of an ensemble; returns the state after them and the estimates.
 
-    Raises BadInput where the columns have different lengths or the model's numbers are not positive.
+    These are filled into `estimates`, all NaN, where given. Raises BadInput where the columns have
+    different lengths or the model's numbers are not positive.
     """
-    samples, estimates = _prepared(model, samples)
+    samples, estimates = _prepared(model, samples, estimates)
     state = InertialState._make(part.copy() for part in state)
     _over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
     return state, estimates
 
 
 def run_dead_reckoning(
-    model: InertialModel, state: ReckoningState, samples: InertialSamples, *, unbiased: bool
+    model: InertialModel,
+    state: ReckoningState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates | None = None,
+    *,
+    unbiased: bool,
 ) -> tuple[ReckoningState, OrientationEstimates]:
     """The gyro alone from the attitude of the rest on, less its mean over the rest where `unbiased`.
 
     There are no estimates before the rest is over, nor after a gap. Args and errors as
     `run_inertial_filter`.
     """
-    samples, estimates = _prepared(model, samples)
+    samples, estimates = _prepared(model, samples, estimates)
     state = ReckoningState._make(part.copy() for part in state)
     _over_runs(_reckoning_run)(len(samples.offsets) - 1, model, unbiased, state, samples, estimates)
     return state, estimates
 
 
-def attitudes(model: InertialModel, samples: InertialSamples) -> OrientationEstimates:
-    """The TRIAD attitude of every sample alone: gravity is taken for all that is felt."""
-    samples, estimates = _prepared(model, samples)
+def attitudes(
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
+) -> OrientationEstimates:
+    """The TRIAD attitude of every sample alone: gravity is taken for all that is felt.
+
+    Args and errors as `run_inertial_filter`.
+    """
+    samples, estimates = _prepared(model, samples, estimates)
     _attitudes(samples.force, samples.field, estimates.orientation)
     estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
     return estimates
 
 
 def _prepared(
-    model: InertialModel, samples: InertialSamples
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
 ) -> tuple[InertialSamples, OrientationEstimates]:
     """Checked samples, and estimates to fill."""
     rows = int(samples.offsets[-1])
@@ -192,7 +207,8 @@ def _prepared(
         raise BadInput("inertial samples: give a time, and rate, force and field (3) of each")
     if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
         raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
-    estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
+    if estimates is None:
+        estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
     return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
 
 
@@ -244,7 +260,8 @@ def _reckon(
     if (orientation == 0.0).all():
         orientation[:] = _triad(sums[1], sums[2])
     bias = sums[0] / max(state.rest_samples[run], 1) if unbiased else np.zeros(3)
-    compose(orientation.copy(), _increment((rate - bias) * duration_s), orientation)
+    x, y, z = (rate - bias) * duration_s
+    compose(orientation.copy(), _increment(x, y, z), orientation)
     estimates.orientation[row] = orientation
     variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
     estimates.covariance[row] = variance * np.eye(3)
@@ -273,13 +290,10 @@ def _accumulate(
 
     Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
     """
-    time_ns, rate, force, field = (
-        samples.time_ns[row],
-        samples.rate[row],
-        samples.force[row],
-        samples.field[row],
-    )
-    if not math.isfinite(rate.sum() + force.sum() + field.sum()):
+    # scalars and tuples: making an array takes longer than what is done with it
+    time_ns, force, field = samples.time_ns[row], samples.force[row], samples.field[row]
+    x, y, z = samples.rate[row]
+    if not math.isfinite(x + y + z + force.sum() + field.sum()):
         return math.nan
     times = state.time_ns[run]
     duration_s = (time_ns - times[1]) * _NS
@@ -291,12 +305,15 @@ def _accumulate(
         _start_block(state, run, time_ns)
     times[1] = time_ns
     if (time_ns - times[0]) * _NS < model.rest_s:
-        state.rate_sum[run] += rate
+        state.rate_sum[run] += samples.rate[row]
         state.rest_samples[run] += 1
     else:
-        bias = state.rate_sum[run] / max(state.rest_samples[run], 1)
-        step = _increment((rate - bias) * duration_s)
-        compose(state.increment[run].copy(), step, state.increment[run])
+        a, b, c = state.rate_sum[run]
+        count, increment = max(state.rest_samples[run], 1), state.increment[run]
+        step = _increment(
+            (x - a / count) * duration_s, (y - b / count) * duration_s, (z - c / count) * duration_s
+        )
+        compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
         _carry(step, state.force[run])
         _carry(step, state.field[run])
     state.force[run] += force
@@ -360,15 +377,15 @@ def _isotropic(sigma_rad: float) -> NDArray:
     return z
 
 
-def _increment(rotation_rad: NDArray) -> NDArray:
-    """The quaternion of a rotation vector (3,)."""
-    x, y, z = 0.5 * rotation_rad
+def _increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
+    """The quaternion of a rotation vector."""
+    x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
     angle = math.sqrt(x * x + y * y + z * z)
     scale = math.sin(angle) / angle if angle > 0.0 else 1.0
-    return np.array([math.cos(angle), scale * x, scale * y, scale * z])
+    return math.cos(angle), scale * x, scale * y, scale * z
 
 
-def _carry(turned: NDArray, vector: NDArray) -> None:
+def _carry(turned: Vector, vector: NDArray) -> None:
     """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
     a, b, c = vector

@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
+from recorders.log import Topic
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
 from replay.blocks import Ragged
 from replay.compile import compile_over_runs
-from replay.components import Components
+from replay.components import components_of
 from replay.engine import Batch, Bound, Estimator
 from replay.estimators.covariance_intersection import rule
-from replay.estimators.gaussian import ALL_WELL, Floats, Function, failures_of
+from replay.inference.gaussian import Floats, Function
 from replay.priors import gaussians
+from replay.results import ALL_WELL, failures_of, state_stream
 
 Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
@@ -289,7 +290,6 @@ def solve(
         results,
         failed_ns,
     )
-    metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * size)}
     well = np.full_like(failed_ns, ALL_WELL)
     outputs = [
         failures_of(f"/estimates/{name}", well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)
@@ -302,7 +302,8 @@ def solve(
                 f"/estimates/{name}/{place}/state",
                 activities,
                 (activities.node == node) & done,
-                metadata | {"truth": "/truth"},
+                components,
+                "/truth",
                 results.mean,
                 results.covariance,
             )
@@ -313,7 +314,8 @@ def solve(
                     f"/estimates/{name}/{place}/sent",
                     activities,
                     (activities.node == node) & done & sent,
-                    metadata,
+                    components,
+                    None,
                     results.sent_mean,
                     results.sent_covariance,
                 )
@@ -433,19 +435,14 @@ def _estimates(
     topic: str,
     activities: Activities,
     chosen: NDArray[np.bool_],
-    metadata: Mapping[str, str],
+    components: Sequence[str],
+    truth: str | None,
     mean: Floats,
     covariance: Floats,
 ) -> Ragged:
     rows = np.flatnonzero(chosen)
-    stream = make_stream(
-        topic,
-        schemas.GAUSSIAN_ESTIMATE,
-        activities.time_ns[rows],
-        metadata=metadata,
-        mean=mean[rows],
-        covariance=covariance[rows].reshape(len(rows), covariance.shape[1] ** 2),
-    )
+    time_ns, kinds = activities.time_ns[rows], components_of(components)
+    stream = state_stream(topic, time_ns, kinds, truth, mean[rows], covariance[rows])
     return Ragged(stream, np.searchsorted(rows, activities.offsets))
 
 
@@ -461,8 +458,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters)
     components = state_of(topics["/prior"])
     read = ("/links", *(topic.name for topic in sensors.values()))
     work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
-    priors: dict[str, Components] = {"/prior": dict.fromkeys(components, "linear")}
-    return [Batch(name, read, ("/prior",), work, priors)]
+    return [Batch(name, read, ("/prior",), work, {"/prior": components_of(components)})]
 
 
 def state_of(prior: Topic) -> list[str]:

@@ -27,7 +27,9 @@ from replay.plain import Given, Messages, Results, recursive
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
-Advance = Callable[[InertialModel, Any, InertialSamples], tuple[Any, OrientationEstimates]]
+Advance = Callable[
+    [InertialModel, Any, InertialSamples, OrientationEstimates], tuple[Any, OrientationEstimates]
+]
 
 
 class InertialParameters(Parameters):
@@ -57,26 +59,16 @@ class GyroParameters(InertialParameters):
     unbiased: bool = True
 
 
-def _follow(
-    run: int,
-    settings: tuple[InertialModel, Advance],
-    messages: Messages,
-    state: Any,
-    results: Results,
+def _follow_all(
+    settings: tuple[InertialModel, Advance], messages: Messages, state: Any, results: Results
 ) -> None:
-    """Take one run through its samples; `value` is specific force, turn rate, magnetic field."""
+    """Take all runs through their samples; `value` is specific force, turn rate, magnetic field."""
     model, advance = settings
-    rows = slice(int(messages.offsets[run]), int(messages.offsets[run + 1]))
-    value = messages.value[rows]
-    offsets = np.array([0, len(value)])
-    samples = InertialSamples(
-        offsets, messages.time_ns[rows], value[:, 3:6], value[:, :3], value[:, 6:9]
-    )
-    before = type(state)(*(part[run : run + 1] for part in state))
-    after, estimates = advance(model, before, samples)
+    force, rate, field = np.split(messages.value, 3, axis=1)
+    samples = InertialSamples(messages.offsets, messages.time_ns, rate, force, field)
+    after, _ = advance(model, state, samples, OrientationEstimates(results.mean, results.covariance))
     for part, changed in zip(state, after, strict=True):
-        part[run] = changed[0]
-    results.mean[rows], results.covariance[rows] = estimates
+        part[:] = changed
 
 
 def _inertial(
@@ -93,8 +85,7 @@ def _inertial(
         truth="truth",
         vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},
         start=start,
-        follow=_follow,
-        compiled=False,
+        follow_all=_follow_all,
     )
 
 
@@ -109,9 +100,9 @@ def _start_gyro(given: Given[GyroParameters]) -> tuple[tuple[InertialModel, Adva
 
 def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel, Advance], Any]:
     def advance(
-        model: InertialModel, state: Any, samples: InertialSamples
+        model: InertialModel, state: Any, samples: InertialSamples, estimates: OrientationEstimates
     ) -> tuple[Any, OrientationEstimates]:
-        return state, attitudes(model, samples)
+        return state, attitudes(model, samples, estimates)
 
     return (given.parameters.model, advance), start_reckoning(given.runs)
 

@@ -1,19 +1,19 @@
 """What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
 
-import json
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Topic, make_stream, schemas
-from recorders.models.states import state_metadata
+from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from replay.blocks import Ragged
-from replay.failures import REASONS
+from replay.components import components_of
+from replay.failures import reason_stream
 from replay.least_squares import SENTENCES, Solution
+from replay.results import state_stream
 
 
 class Batches(NamedTuple):
@@ -23,16 +23,8 @@ class Batches(NamedTuple):
     run: NDArray[np.int64]
     time_ns: NDArray[np.int64]
 
-    def ragged(
-        self,
-        topic: str,
-        schema: Schema,
-        rows: NDArray[np.bool_],
-        metadata: Mapping[str, str],
-        **columns: NDArray[Any],
-    ) -> Ragged:
+    def ragged(self, stream: Stream, rows: NDArray[np.bool_]) -> Ragged:
         """An output stream with a message for each of these batches."""
-        stream = make_stream(topic, schema, self.time_ns[rows], metadata=metadata, **columns)
         return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
 
 
@@ -74,34 +66,32 @@ def solution_streams(
 
     A batch that failed has no state; its failure is one of `SENTENCES`.
     """
-    found, every = solution.converged, np.ones(len(solution.cost), bool)
-    size = len(components)
+    found, time_ns = solution.converged, batches.time_ns
+    state = state_stream(
+        f"{topic}/state",
+        time_ns[found],
+        components_of(components),
+        truth,
+        solution.parameters[found],
+        solution.covariance[found],
+    )
+    ended = make_stream(
+        f"{topic}/solution",
+        schemas.SOLUTION,
+        time_ns,
+        metadata={"parameters": str(len(components))},
+        iterations=solution.iterations,
+        converged=found,
+        rank=solution.rank,
+        cost=np.nan_to_num(solution.cost, nan=0.0, posinf=np.finfo(float).max),
+    )
+    failure = reason_stream(
+        f"{topic}/failure", schemas.FAILURE, time_ns[~found], solution.status[~found], SENTENCES.values()
+    )
     return [
-        batches.ragged(
-            f"{topic}/state",
-            schemas.GAUSSIAN_ESTIMATE,
-            found,
-            state_metadata(components) | {"truth": truth},
-            mean=solution.parameters[found],
-            covariance=solution.covariance[found].reshape(-1, size**2),
-        ),
-        batches.ragged(
-            f"{topic}/solution",
-            schemas.SOLUTION,
-            every,
-            {"parameters": str(size)},
-            iterations=solution.iterations,
-            converged=found,
-            rank=solution.rank,
-            cost=np.nan_to_num(solution.cost, nan=0.0, posinf=np.finfo(float).max),
-        ),
-        batches.ragged(
-            f"{topic}/failure",
-            schemas.FAILURE,
-            ~found,
-            {REASONS: json.dumps(list(SENTENCES.values()))},
-            reason=solution.status[~found],
-        ),
+        batches.ragged(state, found),
+        batches.ragged(ended, np.ones(len(found), bool)),
+        batches.ragged(failure, ~found),
     ]
 
 

@@ -174,15 +174,21 @@ def _unscented_step(
     _move(model, x)
     if not wrapped:
         x %= TURN
-    for k in range(2):
-        mean[k] = x[:, k].mean()
+    for k in range(2):  # scalar loops: arrays would take longer than what is in them
+        mean[k] = 0.0
+        for n in range(len(x)):
+            mean[k] += x[n, k] / len(x)
     for i in range(2):
-        for j in range(2):
-            spread = ((x[:, i] - mean[i]) * (x[:, j] - mean[j])).mean()
-            covariance[i, j] = spread + model.system[i, j]
+        for j in range(i + 1):
+            spread = 0.0
+            for n in range(len(x)):
+                spread += (x[n, i] - mean[i]) * (x[n, j] - mean[j])
+            covariance[i, j] = covariance[j, i] = spread / len(x) + model.system[i, j]
     if not math.isnan(z[0]):
-        innovation = z - mean
-        condition(mean, covariance, wrap_angle(innovation) if wrapped else innovation, model.measurement)
+        innovation = np.empty(2)
+        for k in range(2):
+            innovation[k] = wrap_angle(z[k] - mean[k]) if wrapped else z[k] - mean[k]
+        condition(mean, covariance, innovation, model.measurement)
     for k in range(2):
         mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
 

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput, choices
-from recorders.log import Topic, make_stream, schemas
-from recorders.models.planar import wrap_angle
-from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.log import Topic, schemas
+from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
 from replay.blocks import Block, Ragged
-from replay.components import Components
+from replay.components import Components, components_of
 from replay.engine import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import MISSED, Scanning
 from replay.estimators.vehicle_updates import (
@@ -37,14 +36,14 @@ from replay.estimators.vehicle_updates import (
     where,
 )
 from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
-from replay.failures import Failure, failure_stream, reason_stream
+from replay.failures import Failure, reason_stream
 from replay.measurements import PLANE, read_fixes, read_vectors
 from replay.priors import gaussians
+from replay.results import failures_by_run, innovation_stream, state_stream
 
 Booleans = NDArray[np.bool_]
 
-PLACE = ("x_m", "y_m")
-POSE_COMPONENTS = (*PLACE, "heading_rad")
+POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
 FAILED = "the estimate is no longer finite"
 
 
@@ -327,16 +326,13 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
 
     def gaussians(case: str, names: Sequence[str], own: slice, told: Booleans) -> Ragged:
-        mean = results.mean[told][:, own]
-        angular = [index for index, name in enumerate(names) if name.endswith("_rad")]
-        mean[:, angular] = wrap_angle(mean[:, angular])
-        stream = make_stream(
+        stream = state_stream(
             f"/estimates/{setup.name}/{case}/state",
-            schemas.GAUSSIAN_ESTIMATE,
             frames.time_ns[told],
-            metadata=state_metadata(names) | {"truth": f"/{case}/truth"},
-            mean=mean,
-            covariance=results.covariance[told][:, own, own].reshape(len(mean), len(names) ** 2),
+            components_of(names),
+            f"/{case}/truth",
+            results.mean[told][:, own],
+            results.covariance[told][:, own, own],
         )
         return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
 
@@ -347,16 +343,16 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
         squared = np.einsum(
             "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
         )
-        stream = make_stream(
+        stream = innovation_stream(
             f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
-            schemas.INNOVATION,
             frames.time_ns[told],
-            metadata=state_metadata(PLACE) | {"truth": ""},
+            PLANE,
+            "",
             target_id=detection[told] + 1,
             accepted=np.ones(told.sum(), np.int64),
             innovation=innovation[told],
-            covariance=spread[told].reshape(-1, 4),
-            normalised_innovation_squared=squared,
+            covariance=spread[told],
+            squared=squared,
         )
         return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
 
@@ -369,11 +365,12 @@ def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans
     if setup.has_pose:
         is_found = results.covariance[:, :, -1, -1] > 0.0
         yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
-    failed = np.flatnonzero(failing)
     last = np.maximum(said.sum(axis=1), 1) - 1
-    failures = [Failure(int(frames.time_ns[run, last[run]]), FAILED) for run in failed]
-    stream = failure_stream(f"/estimates/{setup.name}/failure", failures)
-    yield Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))
+    failures = {
+        run: Failure(int(frames.time_ns[run, last[run]]), FAILED)
+        for run in np.flatnonzero(failing).tolist()
+    }
+    yield failures_by_run(f"/estimates/{setup.name}", failures, runs)
     if setup.fixes == "known":
         at_run, at_frame, which = np.nonzero(frames.skipped)
         mend = "its fixes lack a covariance; give --set sigma_fix_m=..."

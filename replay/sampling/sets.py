@@ -58,12 +58,17 @@ def sets_by_runs(
 
 
 def seeded_by_data(
-    generators: Generators, data: Array, offsets: NDArray[np.int64], seed: int
+    generators: Generators, data: Array, offsets: NDArray[np.int64], seed: int, function: int = 0
 ) -> Generators:
-    """Copies of the runs' generators; one that is missing comes from `seed` and the run's first data."""
+    """Copies of the runs' generators; one that is missing comes from `seed` and the run's first data.
+
+    Every sampled `function` of a filter, counted from zero, has generators of its own.
+    """
     words = np.ascontiguousarray(data).view(np.uint32).reshape(len(data), -1)
     return tuple(
-        np.random.default_rng([seed, *(words[first].tolist() if first < last else [])])
+        np.random.default_rng(
+            [seed, *(words[first].tolist() if first < last else []), *([function] if function else [])]
+        )
         if generator is None
         else copy.deepcopy(generator)
         for generator, first, last in zip(generators, offsets[:-1], offsets[1:], strict=True)

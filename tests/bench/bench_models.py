@@ -1,9 +1,10 @@
 """Today's estimators beside the hand-specialised kernels of `reference`, frozen, in one run.
 
 The kernels get columns that are ready, and fill arrays; the estimators start from columns in memory and
-end with output streams, plumbing included. That the estimates are equal is asserted. CPU time of all
-cores together, medians of turns. The ratio is how many times the reference's time an estimator takes.
-Needs a C compiler. Run it with `make bench`, or `python -m tests.bench models`.
+end with output streams, plumbing included. Where they are made of a model, their loop is timed alone as
+well. That the estimates are equal is asserted. CPU time of all cores together, medians of turns. The
+ratio is how many times the reference's time an estimator takes. Needs a C compiler. Run it with
+`make bench`, or `python -m tests.bench models`.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.ensemble import record_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
+from recorders.models.planar import wrap_angle
 from recorders.recording import Recording, simulation_stamps_ns
 from recorders.simulators.headings import equal_sigmas
 from replay.distributions import bingham
@@ -22,6 +24,7 @@ from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
 from replay.engine import bind, collect, replay
 from replay.sources import MemorySource, memory_source
+from tests.bench.loops import Call, calls_of
 from tests.bench.reference import bingham as bingham_reference
 from tests.bench.reference import inertial, landmarks, reactor, torus, vehicles
 from tests.bench.reference.gaussian import ALL_WELL, unscented
@@ -61,19 +64,37 @@ def main() -> list[Row]:
 def timed(case: Case, parameters: dict[str, Any], runs: int) -> list[Row]:
     """The estimator beside each of its references."""
     sources = case.record(parameters, runs)
-    ways = {"": partial(estimated, case, sources)}
-    ways |= {name: prepare(sources) for name, prepare in case.references.items()}
+    ours: dict[str, Callable[[], Floats]] = {"": partial(estimated, case, sources)}
+    calls = calls_of(bind(case.estimator, sources, case.settings), sources)
+    if calls:
+        ours[", its loop alone"] = partial(repeated, calls)
+    ways = ours | {name: prepare(sources) for name, prepare in case.references.items()}
     means = {name: way() for name, way in ways.items()}  # compiles as well
-    for name in case.references:
+    for name in means:
         apart = np.max(np.abs(means[name] - means[""]))
         assert apart < TOLERANCE, f"{case.name}: {name} and the estimator are {apart} apart"
     steps = len(means[""])
     us = {name: 1e6 * taken / steps for name, taken in cpu_seconds(ways).items()}
     what = f"{case.name}, {'one log' if runs == 1 else f'{runs} runs'}"
     return [
-        (f"{what}; {name}", f"{us['']:.3g} us", f"{us[name]:.3g} us", f"{us[''] / us[name]:.2f} times")
+        (
+            f"{what}{part}; {name}",
+            f"{us[part]:.3g} us",
+            f"{us[name]:.3g} us",
+            f"{us[part] / us[name]:.2f} times",
+        )
         for name in case.references
+        for part in ours
     ]
+
+
+def repeated(calls: list[Call]) -> Floats:
+    """The means of the loops on columns that are ready, one output after the other."""
+    means = [call() for call in calls]
+    for mean in means:
+        if mean.shape[1] == 3:  # a pose
+            mean[:, 2] = wrap_angle(mean[:, 2])
+    return np.concatenate(means)
 
 
 def estimated(case: Case, sources: list[MemorySource]) -> Floats:

@@ -80,13 +80,13 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
     # rukf-10 fails
-    "extended-target-failing": Recipe("extended-target", run=48),
+    "extended-target-failing": Recipe("extended-target", run=117),
     # delays, outliers, outages; ranges and bearings alone; the gate that the estimators have by default
     "landmarks-adverse": Recipe(
         "landmarks",
         "landmarks-adverse",
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
-        {label: {"gate_probability": 0.999} for label in ("ekf", "ukf")},
+        {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
     "lcd-sampling": Recipe(
         "lcd-sampling",

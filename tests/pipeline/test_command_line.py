@@ -202,6 +202,18 @@ def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
         ("scenarios", "mrclam", ["sigma_range_m", "fuselog import mrclam PATH"]),
         ("estimators", "ukf", ["gate_probability", "number > 0 <= 1", "/landmarks"]),
         ("metrics", "consistency", ["NEES"]),
+        (
+            "models",
+            "robot",
+            [
+                "state: x_m, y_m, heading_rad (angle)",
+                "sensor bearing: bearing_rad (angle) of /landmarks",
+                "control odometry: forward_mps, turn_radps",
+                "sigma_range_m",
+                "by ukf: yes",
+                "by analytic: no: it lacks exact moments of its motion",
+            ],
+        ),
         ("experiments", "landmarks", ["dead-reckoning, ekf, ukf", "100 runs"]),
     ],
 )
@@ -214,6 +226,43 @@ def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuse
     for word in words:
         assert word in details.out
     assert fuselog(kind, name, "--json").json == [row for row in listed if row["name"] == name]
+
+
+def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog) -> None:
+    """Every cell of the table is filled, or says why not."""
+    listed = {
+        row["name"]: {
+            key.removeprefix("by_"): said for key, said in row.items() if key.startswith("by_")
+        }
+        for row in fuselog("models", "--json").json
+    }
+    assert listed["vehicle"] == dict.fromkeys(("ekf", "iekf", "ukf", "lrkf", "analytic"), "yes")
+    table = fuselog("models").out
+    for name, cells in listed.items():
+        (row,) = re.findall(rf"^ {name} +((?:yes|no:).*)$", table, re.MULTILINE)
+        assert re.split(r"  +", row.strip()) == list(cells.values())
+
+
+@pytest.mark.usefixtures("here")
+def test_the_model_and_the_interval_of_estimates_are_options(world: Path, fuselog: Fuselog) -> None:
+    """They reach every label that has them; --set of one label is stronger."""
+    log, out = str(world / "log.mcap"), "estimates.mcap"
+    every = ["replay", log, "-e", "ekf", "-e", "dead-reckoning", "-e", "e", "--set", "e.kind=ekf"]
+    more = ["--set", "e.every_s=0.5", "--model", "robot", "--every", "0.01", "--out", out, "--json"]
+    metrics = fuselog(*every, *more).json["metrics"]
+    likely = pytest.approx(metrics["e.log_likelihood.robot1"], rel=1e-4)
+    assert metrics["ekf.log_likelihood.robot1"] == likely != 0
+    settings = json.loads(open_log(out).run.notes["estimators"])  # type: ignore[union-attr]
+    assert settings == {
+        "ekf": {"model": "robot", "every_s": 0.01},
+        "dead-reckoning": {"every_s": 0.01},
+        "e": {"kind": "ekf", "model": "robot", "every_s": 0.5},
+    }
+    topics = [f"/estimates/{name}/robot1/pose" for name in ("ekf", "dead-reckoning", "e")]
+    poses = read_streams(open_log(out), topics)
+    ekf, reckoning, e = (np.diff(poses[topic].publish_time_ns).max() * 1e-9 for topic in topics)
+    assert ekf == reckoning == pytest.approx(0.01)
+    assert e > 0.04
 
 
 def test_help_imports_nothing_heavy() -> None:

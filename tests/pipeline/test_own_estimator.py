@@ -109,21 +109,31 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
 
 
 def test_the_page_works_as_written(package: Path) -> None:
-    """Every command of the page runs with its package; the estimators are worth showing."""
+    """Every command of the page runs with its package; its model serves every method as it should."""
     commands = [line for block in _blocks("sh") for line in block.splitlines()]
-    commands.append("fuselog replay beacons.mcap -e locate -e follow --json --out again.mcap")
+    commands.append("fuselog replay beacons.mcap -e locate -e nearest --json --out again.mcap")
     said = _run(package, commands)
     assert len(commands) >= 9
     for command, each in zip(commands, said, strict=True):
         assert each["code"] == 0, (command, each)
         assert each["err"] == "", command
     metrics = json.loads((package / "walk/result.json").read_text())["metrics"]
-    assert metrics["follow.position_rmse_m.walker"] < 1.2
-    assert metrics["follow.position_rmse_m.walker"] < 0.7 * metrics["locate.position_rmse_m.walker"]
-    assert metrics["follow.nis_per_component.walker"] == pytest.approx(1, abs=0.1)
-    assert 0 < metrics["locate.within_1m_share.walker"] < metrics["follow.within_1m_share.walker"] < 1
-    assert metrics["follow-deaf.nis_per_component.walker"] < 0.3
-    assert "within_1m_share" in str(said[4]["out"])
+    for method in ("ekf", "ukf", "iekf"):
+        assert metrics[f"{method}.position_rmse_m.walker"] < 1.2
+        assert (
+            metrics[f"{method}.position_rmse_m.walker"] < 0.7 * metrics["locate.position_rmse_m.walker"]
+        )
+        assert metrics[f"{method}.nis_per_component.walker"] == pytest.approx(1, abs=0.1)
+        assert metrics[f"{method}.nees.walker"] == pytest.approx(2, abs=0.5)
+        within = metrics[f"{method}.within_1m_share.walker"]
+        assert 0 < metrics["locate.within_1m_share.walker"] < within < 1
+    assert metrics["locate.position_rmse_m.walker"] < metrics["nearest.position_rmse_m.walker"] < 4
+    assert metrics["nearest.nees.walker"] == pytest.approx(2, abs=0.5)
+    assert metrics["deaf.nis_per_component.walker"] < 0.3
+    out = {command: str(each["out"]) for command, each in zip(commands, said, strict=True)}
+    (evaluated,) = (text for command, text in out.items() if "fuselog evaluate" in command)
+    assert "within_1m_share" in evaluated
+    assert "signal_strength" in out["fuselog models walker"]
     assert (package / "beacons.rrd").stat().st_size > 1000
     schema = open_log(package / "beacons.mcap").topics["/walker/signal_strength"].schema_name
     assert schema == "radio.SignalStrength"
@@ -139,10 +149,10 @@ def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
     (package / "plain").mkdir()
     (package / "plain/radio.py").write_text(plain)
     record = "fuselog record beacons --set duration_s=20 --out b.mcap"
-    said = _run(package, [record, "fuselog replay b.mcap -e follow --out compiled.mcap"])
+    said = _run(package, [record, "fuselog replay b.mcap -e nearest --out compiled.mcap"])
     code = "import sys; from pipeline.command_line import main; sys.exit(main())"
     subprocess.run(
-        [sys.executable, "-c", code, "replay", "b.mcap", "-e", "follow", "--out", "plain.mcap"],
+        [sys.executable, "-c", code, "replay", "b.mcap", "-e", "nearest", "--out", "plain.mcap"],
         cwd=package,
         check=True,
         capture_output=True,

@@ -1,5 +1,6 @@
 """The replay: ensembles, blocks, files and memory give the same numbers, bit for bit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -13,7 +14,8 @@ from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording, record_run
 from replay.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
-from replay.engine import Bound, bind, collect, replay
+from replay.engine import Bound, Recursive, Report, bind, collect, replay
+from replay.results import state_stream
 from replay.sources import LogSource, MemorySource, Source, memory_source
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
@@ -142,6 +144,61 @@ def test_arrival_order_is_what_a_recorder_with_one_clock_would_have_seen(
     )
     published = replayed([source])["/estimates/ekf/robot1/pose"]
     assert len(published) != len(by_arrival["/estimates/ekf/robot1/pose"])
+
+
+def late_by_a_block(*, finish: bool = True, raises_at: int | None = None) -> Recursive:
+    """Gives every block's estimates with the next one, the last when all is done."""
+
+    def run(before: Ragged | None, block: Block) -> tuple[Ragged, list[Ragged]]:
+        if raises_at is not None and np.any(block.events.time_ns >= raises_at):
+            raise BadInput("it is too late")
+        ragged = block.streams["/robot1/range_bearing"]
+        ones, time_ns = np.ones((len(ragged), 1)), ragged.stream.publish_time_ns
+        state = state_stream(
+            "/estimates/late/state", time_ns, {"x_m": "linear"}, "", ones, ones[:, :, None]
+        )
+        return Ragged(state, ragged.offsets), [] if before is None else [before]
+
+    def last(waiting: Ragged | None) -> list[Ragged]:
+        return [] if waiting is None else [waiting]
+
+    streams = ("/robot1/range_bearing",)
+    return Recursive("late", streams, (), lambda _: None, run, finish=last if finish else None)
+
+
+def test_what_waits_is_given_when_all_is_done(late: tuple[MemorySource, Path]):
+    """As the last block of all, and watched as any: it counts as estimated."""
+    source, path = late
+    times_ns = source.streams["/robot1/range_bearing"].publish_time_ns
+    log = LogSource(open_log(path))
+    for each, block_messages in ((source, 1 << 18), (log, 50)):
+        report = Report()
+        outputs = replay([each], [late_by_a_block()], block_messages=block_messages, report=report)
+        found = collect(outputs)
+        assert_array_equal(found["/estimates/late/state"].stream.publish_time_ns, np.sort(times_ns))
+        assert len(found["/estimates/late/failure"]) == 0
+        (coverage,) = report.coverage
+        assert coverage["estimated_s"][0] == pytest.approx(np.ptp(times_ns) * 1e-9)
+    without = collect(replay([log], [late_by_a_block(finish=False)], block_messages=50))
+    assert len(without["/estimates/late/state"]) < len(times_ns)
+
+
+def test_what_waits_of_a_failed_run_is_not_given(ensemble: list[MemorySource]):
+    """Only what is before its end; a `finish` that raises is said to be the estimator's."""
+    first, second = ensemble[0], ensemble[3]
+    times_ns = first.streams["/robot1/range_bearing"].publish_time_ns
+    stop_ns = int(times_ns[len(times_ns) // 2])
+    cut = second.streams["/robot1/range_bearing"]
+    cut = cut.take(cut.publish_time_ns < stop_ns)
+    other = MemorySource({**second.streams, cut.topic: cut}, second.run, "other")
+    found = collect(replay([first, other], [late_by_a_block(raises_at=stop_ns)]))
+    state = found["/estimates/late/state"]
+    assert_array_equal(state.of_run(0).publish_time_ns, times_ns[times_ns < stop_ns])
+    assert len(state.of_run(1)) == len(cut) > 0
+    assert np.diff(found["/estimates/late/failure"].offsets).tolist() == [1, 0]
+    broken = replace(late_by_a_block(), finish=lambda _: 1 // 0)
+    with pytest.raises(BadInput, match="estimator late raised ZeroDivisionError"):
+        collect(replay([first], [broken]))
 
 
 def test_equal_stamps_keep_the_order_of_the_log_in_memory_too(tmp_path: Path):

@@ -1,6 +1,7 @@
 """Alignment with truth, errors, NEES and NIS: known answers."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.log import (
+    RunMetadata,
+    Stream,
+    make_stream,
+    open_log,
+    read_streams,
+    schemas,
+    write_log,
+)
 from recorders.log.streams import empty_stream
 from recorders.recording import Recording
 from replay.blocks import Ragged, gather
@@ -25,7 +34,7 @@ from replay.evaluation import (
     truth_at,
     unjudged,
 )
-from replay.metrics import accuracy, consistency, innovation
+from replay.metrics import accuracy, consistency, innovation, likelihood
 from replay.sources import MemorySource, memory_source
 
 SECOND = 1_000_000_000
@@ -328,6 +337,7 @@ def test_innovations_count_the_components_that_were_measured():
         innovation=[[0.1, 0.2], [np.nan, 0.2], [9, 9]],
         covariance=np.full((3, 4), np.nan),
         normalised_innovation_squared=[2.0, 1.5, 50.0],
+        log_likelihood=[-1.0, -2.0, 0.0],
     )
     innovations = innovations_of(gather([stream]))
     assert innovations.degrees.tolist() == [2, 1, 2]
@@ -335,3 +345,25 @@ def test_innovations_count_the_components_that_were_measured():
         {"nis_per_component": 53.5 / 5, "gated_share": 1 / 3}
     )
     assert innovation(innovations_of(gather([stream.take(slice(0, 0))]))) == {}
+    assert likelihood(innovations) == {"log_likelihood": -3.0}
+
+
+def test_innovations_of_logs_from_before_the_log_likelihood_are_judged(tmp_path: Path):
+    """They lack the field; all else that is said of them stays."""
+    older = replace(schemas.INNOVATION, fields=schemas.INNOVATION.fields[:-1])
+    stream = make_stream(
+        "/estimates/ekf/robot1/innovation",
+        older,
+        [1, 2],
+        metadata={"components": "range_m", "kinds": "linear"},
+        target_id=[1, 1],
+        accepted=[1, 1],
+        innovation=[[0.1], [0.2]],
+        covariance=[[1.0], [1.0]],
+        normalised_innovation_squared=[2.0, 1.0],
+    )
+    write_log(tmp_path / "old.mcap", [stream], RunMetadata("landmarks", epoch_ns=0))
+    read = read_streams(open_log(tmp_path / "old.mcap"), [stream.topic])[stream.topic]
+    innovations = innovations_of(gather([read]))
+    assert innovation(innovations) == {"nis_per_component": 1.5, "gated_share": 0.0}
+    assert likelihood(innovations) == {}

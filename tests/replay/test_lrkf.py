@@ -1,6 +1,7 @@
 """The linear regression Kalman filters against exact moments, and their place in the replay."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,12 @@ from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log
 from recorders.models.planar import range_bearing
 from replay.engine import bind, collect, replay
-from replay.estimators import extended_target, reactor
-from replay.estimators.gaussian import no_innovation, regression, sample_memory
+from replay.estimators.extended_target import EXTENDED_TARGET, measure
+from replay.estimators.reactor import REACTOR
+from replay.inference.gaussian import no_innovation
+from replay.inference.methods import METHODS
+from replay.inference.regression import regression, sample_memory, sampled_sensor
+from replay.inference.steps import Gaussian, Stage
 from replay.sampling import Samples, parse_sampling
 from replay.sampling.sets import SampleSets
 from replay.sources import LogSource, MemorySource
@@ -31,11 +36,16 @@ def as_sets(samples: Samples) -> SampleSets:
 def regress(function, angular, mean, covariance, samples, *arguments):
     """Mean, covariance and cross-covariance by the kernel, uncompiled."""
     count, states = len(angular), len(mean)
-    memory = sample_memory(as_sets(samples), states, count)
+    kinds, outputs = ("linear",) * states, tuple("angle" if each else "linear" for each in angular)
+    memory = sample_memory(as_sets(samples), kinds, 0, outputs)
     found, with_state = np.empty((count, count)), np.empty((states, count))
-    regress = regression(function, angular, states)
-    assert regress(mean, covariance, arguments, found, with_state, 0, memory)
-    return memory.shift, found, with_state
+
+    def of_state(state, _, arguments):
+        return function(np.array(state), *arguments)
+
+    regress = regression(of_state, kinds, 0, outputs)
+    assert regress(mean, covariance, arguments, (), found, with_state, 0, memory)
+    return memory.centre, found, with_state
 
 
 def random_gaussian(dimension: int, seed: int):
@@ -76,21 +86,26 @@ def test_angles_across_the_cut_are_regressed_as_away_from_it():
     assert across[1][1, 1] < 0.2
 
 
-def predicted(predict, mean, covariance, samples):
-    mean, covariance = mean.copy(), covariance.copy()
-    noise = np.array([0.1, 1e-5, 0.1])
-    assert predict(mean, covariance, noise, 0, reactor.memory_of(noise, as_sets(samples)))
-    return mean, covariance
+STEP = SimpleNamespace(step_s=0.1, process_variance=1e-5, pressure_variance=0.1)
+POINT = SimpleNamespace(size_drift_m2=1e-4, position_drift_m2=1e-3, point_variance_m2=1.0)
+
+
+def predicted(method, mean, covariance, *samples):
+    """One step of the reactor, uncompiled."""
+    steps = METHODS[method].steps(Stage(REACTOR, REACTOR.motion, REACTOR.sensors))
+    belief = Gaussian(mean[None].copy(), covariance[None].copy())
+    memory = steps.memory(tuple(as_sets(each) for each in samples))
+    assert steps.predict(0, belief, np.empty(0), 1.0, STEP, 0, memory)
+    return belief.mean[0], belief.covariance[0]
 
 
 def test_reactor_step_has_the_moments_of_the_sheet():
     """spec/s2kf.md, one step from m = [.5, 3.5], C = 10 I: models, appendix and UKF in one."""
     mean, covariance = np.array([0.5, 3.5]), 10 * np.eye(2)
-    none = Samples(np.empty((0, 2)), np.empty(0))
-    exact = predicted(reactor.predict_analytic, mean, covariance, none)
+    exact = predicted("analytic", mean, covariance)
     np.testing.assert_allclose(exact[0], [0.172, 3.664], atol=1e-12)
     np.testing.assert_allclose(exact[1], [[9.57505, 0.05248], [0.05248, 10.05377]], atol=1e-8)
-    unscented = predicted(reactor.predict_sampled, mean, covariance, samples_of("ukf", 2))
+    unscented = predicted("lrkf", mean, covariance, samples_of("ukf", 2))
     np.testing.assert_allclose(unscented[0], [0.172, 3.664], atol=1e-12)
     np.testing.assert_allclose(unscented[1], [[9.52385, 0.07808], [0.07808, 10.04097]], atol=1e-8)
 
@@ -98,8 +113,8 @@ def test_reactor_step_has_the_moments_of_the_sheet():
 def test_reactor_analytic_equals_gauss_hermite_quadrature():
     """The closed form is exact for any Gaussian, correlated ones included: 5 nodes integrate it."""
     mean, covariance = random_gaussian(2, 3)
-    exact = predicted(reactor.predict_analytic, mean, covariance, samples_of("ukf", 2))
-    quadrature = predicted(reactor.predict_sampled, mean, covariance, gauss_hermite(2, 5))
+    exact = predicted("analytic", mean, covariance)
+    quadrature = predicted("lrkf", mean, covariance, gauss_hermite(2, 5))
     np.testing.assert_allclose(exact[0], quadrature[0], rtol=1e-12)
     np.testing.assert_allclose(exact[1], quadrature[1], rtol=1e-12)
 
@@ -111,25 +126,31 @@ def gauss_hermite(dimension: int, nodes: int) -> Samples:
     return Samples(points, weights)
 
 
-def innovated(innovate, mean, covariance, measured, samples):
-    innovation, noise = no_innovation(4, 4), np.array([1e-4, 1e-3, 1.0])
-    memory = extended_target.memory_of(noise, as_sets(samples))
-    assert innovate(mean, covariance, measured, noise, innovation, 0, memory)
-    return innovation
+def innovated_exactly(mean, covariance, measured):
+    """The innovation of a point (x, y, x^2, y^2) by the exact moments."""
+    difference, spread, with_state = no_innovation(4, 4)
+    EXTENDED_TARGET.sensors[0].moments(mean, covariance, (), POINT, difference, spread, with_state)
+    return measured - difference, spread, with_state
+
+
+def innovated(mean, covariance, measured, samples):
+    """The same by samples of the target and of the noise."""
+    stage = Stage(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
+    work = METHODS["lrkf"].steps(stage).memory((as_sets(samples),))
+    assert sampled_sensor(stage, 0, 0)(mean, covariance, measured, POINT, 0, work)
+    return work.innovations[0]
 
 
 def test_extended_target_first_update_has_the_moments_of_the_sheet():
     """spec/s2kf.md, prior I + C^v: analytic moments, and the UKF's blindness for the size."""
     mean, covariance = np.array([1.0, 1, 0, 0]), np.diag([1.0001, 1.0001, 1.001, 1.001])
     samples = samples_of("ukf", 8)
-    difference, found, with_state = innovated(
-        extended_target.innovate_analytic, mean, covariance, np.zeros(2), samples
-    )
+    difference, found, with_state = innovated_exactly(mean, covariance, np.zeros(4))
     np.testing.assert_allclose(-difference, [0, 0, 2.6677, 2.6677], atol=1e-12)
     np.testing.assert_allclose(np.diag(found), [2.6677, 2.6677, 16.23351325, 16.23351325], atol=1e-8)
     np.testing.assert_allclose(with_state[:2, 2:], 0.66673333 * np.eye(2), atol=1e-8)
     np.testing.assert_allclose(with_state[2:, :2], 1.001 * np.eye(2), atol=1e-12)
-    blind = innovated(extended_target.innovate_sampled, mean, covariance, np.zeros(2), samples)
+    blind = innovated(mean, covariance, np.zeros(4), samples)
     np.testing.assert_allclose(blind[2][:2, 2:], 0, atol=1e-12)
 
 
@@ -137,9 +158,7 @@ def test_extended_target_analytic_equals_gauss_hermite_quadrature():
     """Exact for any correlated prior: 5 nodes per dimension integrate it."""
     mean, covariance = random_gaussian(4, 5)
     measured = np.array([0.7, -2.0])
-    exact = innovated(
-        extended_target.innovate_analytic, mean, covariance, measured, samples_of("ukf", 8)
-    )
+    exact = innovated_exactly(mean, covariance, np.array([*measured, *measured**2]))
     quadrature = product_rule(mean, covariance, measured)
     for ours, theirs in zip(exact, quadrature, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
@@ -153,7 +172,7 @@ def product_rule(mean, covariance, measured):
     root[4:6, 4:6] = np.eye(2) / np.sqrt(3)
     root[6:, 6:] = np.eye(2)
     joint = points @ root.T + np.append(mean, np.zeros(4))
-    values = np.array(extended_target.measure(joint.T))
+    values = np.array(measure(joint[:, :4].T, joint[:, 4:].T, (), POINT))
     centre = values @ weights
     changes = values - centre[:, None]
     seen = np.array([*measured, *measured**2])
@@ -266,8 +285,11 @@ def test_a_log_in_blocks_gives_the_same_bytes(scenario, name, tmp_path):
             np.testing.assert_array_equal(values, cut[topic][column])
 
 
-def test_robot_parameters_are_refused_for_other_systems():
-    """A gate that is given but not used would be believed."""
+def test_parameters_of_other_models_are_refused_and_gates_are_used():
+    """What is given but not used would be believed."""
     (source,) = record_ensemble("batch-reactor", {}, seed=0, runs=1)
-    with pytest.raises(BadInput, match="gate_probability is for robots"):
-        bind("lrkf:ukf", [source], {"gate_probability": 0.9})
+    with pytest.raises(BadInput, match=r"lrkf:ukf, model batch-reactor: .*sigma_range_m"):
+        bind("lrkf:ukf", [source], {"sigma_range_m": 0.1})
+    found = estimates([source], ["lrkf:ukf"], gate_probability=0.5)["lrkf:ukf"]
+    accepted = found["/estimates/lrkf:ukf/innovation"]["accepted"]
+    assert 0 < accepted.mean() < 1

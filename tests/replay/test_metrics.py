@@ -7,7 +7,16 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from replay.blocks import Ragged
 from replay.evaluation import Errors, Innovations
-from replay.metrics import Metric, Output, accuracy, failures, find_metrics, innovation, measure
+from replay.metrics import (
+    Metric,
+    Output,
+    accuracy,
+    failures,
+    find_metrics,
+    innovation,
+    likelihood,
+    measure,
+)
 
 
 def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:
@@ -63,6 +72,17 @@ def test_innovations_count_per_measured_component() -> None:
         "e", "", three, three, np.array([True, False]), np.array([4.0, 2.0]), np.array([2, 1])
     )
     assert innovation(seen) == {"nis_per_component": 2.0, "gated_share": 0.5}
+
+
+def test_the_log_likelihood_is_the_mean_over_the_runs_of_what_was_let_in() -> None:
+    """Nothing where one is not stated, as by an estimator that knows none or in an older log."""
+    runs = np.array([0, 0, 2])
+    accepted = np.array([True, False, True])
+    told = Innovations("e", "", runs, runs, accepted, np.ones(3), runs, np.array([-1.0, 0.0, -4.0]))
+    assert likelihood(told) == {"log_likelihood": -2.5}
+    assert likelihood(told._replace(log_likelihood=np.array([-1.0, 0.0, np.nan]))) == {}
+    assert likelihood(told._replace(log_likelihood=None)) == {}
+    assert likelihood(told._replace(log_likelihood=np.array([-1.0, np.nan, -4.0]))) != {}
 
 
 def test_failed_runs_are_counted_once() -> None:

@@ -214,7 +214,7 @@ def linearised(models: Models) -> Filter:
         states: int,
         controls: int,
         components: int,
-        sets: SampleSets,  # noqa: ARG001
+        sets: SampleSets,
     ) -> LinearMemory:
         return LinearMemory(
             transition=np.empty((states, states)),
@@ -229,7 +229,7 @@ def linearised(models: Models) -> Filter:
         control: Floats,
         control_density: Floats,
         duration_s: float,
-        event: int,  # noqa: ARG001
+        event: int,
         memory: LinearMemory,
     ) -> bool:
         transition, product, gain = memory.transition, memory.product, memory.gain
@@ -258,7 +258,7 @@ def linearised(models: Models) -> Filter:
         measured: Floats,
         variance: Floats,
         innovation: Innovation,
-        event: int,  # noqa: ARG001
+        event: int,
         memory: LinearMemory,
     ) -> bool:
         difference, innovation_covariance, cross_covariance = innovation

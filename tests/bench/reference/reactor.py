@@ -156,8 +156,8 @@ def innovate(
     measured: Floats,
     noise: Floats,
     innovation: Innovation,
-    step: int,  # noqa: ARG001
-    memory: SampleMemory,  # noqa: ARG001
+    step: int,
+    memory: SampleMemory,
 ) -> bool:
     """The measured total against the predicted one, and the covariances: the Kalman filter's own."""
     cross = innovation.cross_covariance

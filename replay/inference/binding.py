@@ -1,0 +1,232 @@
+"""Where a log has what a model needs: its topics, and the numbers that their channels state.
+
+One binding for all models: the topics of a model are looked for under every prefix that has its prior,
+as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.
+"""
+
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Topic, schemas
+from recorders.parameters import ParametersType, build
+from replay.inference.generate import function_of
+from replay.inference.model import (
+    Model,
+    ModelParameters,
+    Sensor,
+    check_motion,
+    check_sensor,
+    check_state,
+)
+from replay.inference.steps import Stage
+
+Floats = NDArray[np.float64]
+Function = Callable[..., Any]
+
+
+class Found(NamedTuple):
+    """Where a log has what a model needs: the prefix, and the topics of prior, control and sensors."""
+
+    prefix: str
+    prior: Topic
+    control: Topic | None
+    sensors: tuple[tuple[Sensor, Topic], ...]
+
+
+def topics_of(model: Model, topics: Mapping[str, Topic]) -> list[Found]:
+    """Everything in a log that is of this model."""
+    found = []
+    for name, prior in topics.items():
+        prefix, _, leaf = name.rpartition("/")
+        if leaf != model.prior or prior.schema_name != schemas.GAUSSIAN_ESTIMATE.full_name:
+            continue
+        control = None
+        if model.control is not None:
+            control = _topic(topics, prefix, model.control.topic, model.control.schema)
+            if control is None:
+                continue
+        sensors = tuple(
+            (sensor, topic)
+            for sensor in model.sensors
+            if (topic := _topic(topics, prefix, sensor.topic, sensor.schema)) is not None
+            and topic.metadata.get("system", model.system) == model.system
+            and (sensor.about is None or _topic(topics, "", sensor.about.topic, sensor.about.schema))
+        )
+        if sensors or not model.needs_sensor:
+            found.append(Found(prefix, prior, control, sensors))
+    return found
+
+
+def _topic(topics: Mapping[str, Topic], prefix: str, name: str, schema: Schema) -> Topic | None:
+    topic = topics.get(name if name.startswith("/") else f"{prefix}/{name}")
+    return topic if topic is not None and topic.schema_name == schema.full_name else None
+
+
+def needs_of(model: Model) -> str:
+    """What a log has to have for a model, in words."""
+    return "; ".join(part.words for part in _parts(model, {}, "..."))
+
+
+def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
+    """Which of the models comes nearest to fitting a log, and what the log lacks for it."""
+    prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
+    tried = [(name, _parts(model, topics, each)) for name, model in models.items() for each in prefixes]
+    name, parts = max(tried, key=lambda one: sum(1 if part.is_here else -1 for part in one[1]))
+    if not any(part.is_here for part in parts):
+        return f"it has nothing that {' or '.join(models)} needs"
+    missing = "; ".join(part.words for part in parts if not part.is_here)
+    return f"model {name} comes nearest and lacks {missing}"
+
+
+class _Part(NamedTuple):
+    """Something that a model needs, and whether a log has it."""
+
+    words: str
+    is_here: bool
+
+
+def _parts(model: Model, topics: Mapping[str, Topic], prefix: str) -> list[_Part]:
+    """All that a model needs under one prefix."""
+
+    def part(name: str, schema: Schema, system: str = "") -> _Part:
+        place = name if name.startswith("/") else f"{prefix}/{name}"
+        found = _topic(topics, prefix, name, schema)
+        words = f"{place} ({schema.full_name}"
+        words += f" of system {system})" if system else ")"
+        if place in topics and found is None:
+            words += f", which is {topics[place].schema_name} here"
+        return _Part(words, found is not None and found.metadata.get("system", system) == system)
+
+    words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
+    if is_here:
+        is_here = names_state(topics[f"{prefix}/{model.prior}"], model)
+    parts = [_Part(f"{words} of {', '.join(model.state)}", is_here)]
+    if model.control is not None:
+        parts.append(part(model.control.topic, model.control.schema))
+    maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
+    parts += [part(topic, each.schema) for topic, each in maps.items()]
+    sensors = [part(each.topic, each.schema, model.system) for each in model.sensors]
+    if sensors and model.needs_sensor:
+        words = ("one of " if len(sensors) > 1 else "") + ", ".join(each.words for each in sensors)
+        parts.append(_Part(words, any(each.is_here for each in sensors)))
+    return parts
+
+
+def names_state(prior: Topic, model: Model) -> bool:
+    """Whether a prior's channel names all components of a model's state."""
+    return set(model.state) <= set(prior.metadata.get("components", "").split(","))
+
+
+@cache
+def number_fields(parameters: type[ModelParameters]) -> tuple[str, ...]:
+    """The parameters that model functions may read: all that are numbers."""
+    schema = parameters.model_json_schema()["properties"]
+    numeric = ("number", "integer", "boolean", "null")
+    return tuple(
+        name
+        for name, entry in schema.items()
+        if all(each.get("type") in numeric for each in entry.get("anyOf", [entry]))
+    )
+
+
+@lru_cache(maxsize=64)
+def settings_type(names: tuple[str, ...]) -> type[Any]:
+    """The NamedTuple that model functions get as their parameters."""
+    return namedtuple("Settings", names)
+
+
+@lru_cache(maxsize=64)
+def reading_settings(names: tuple[str, ...]) -> Function:
+    """`read(settings, row)`: a row of numbers as the NamedTuple."""
+    entries = ", ".join(f"settings[row, {index}]" for index in range(len(names)))
+    text = f"def read(settings, row):\n    return Settings({entries})\n"
+    return function_of(text, Settings=settings_type(names))
+
+
+class _Recorder:
+    """Parameters that remember which of them were read; what is unset reads as one."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self.read: set[str] = set()
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._values:
+            raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._values)}")
+        self.read.add(name)
+        value = self._values[name]
+        return np.float64(
+            1.0 if value is None else value
+        )  # overflows to infinity, as compiled code does
+
+
+def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:
+    """The numbers (1 + sensors, fields) that motion and sensors get: given, or as channels state them.
+
+    What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
+    looks in its own first. Raises BadInput where none states a number that is used, or one that the
+    parameter does not allow, and where the model is not what it says.
+    """
+    model = stage.model
+    names = number_fields(model.parameters)
+    given = {name: getattr(parameters, name) for name in names}
+    everything = [topic for topic in (found.control, found.prior) if topic is not None]
+    everything += [topic for _, topic in found.sensors]
+    where = f"estimator {label}"
+    check_state(where, model)
+    recorders = [_Recorder(given) for _ in range(1 + len(found.sensors))]
+    check_motion(where, model, stage.motion, recorders[0])
+    for (sensor, _), recorder in zip(found.sensors, recorders[1:], strict=True):
+        check_sensor(where, model, sensor, recorder)
+    own = [[], *([topic] for _, topic in found.sensors)]
+    return np.array(
+        [
+            [
+                stated(model.parameters, [*first, *everything], name, needed=name in recorder.read)
+                if given[name] is None
+                else float(given[name])
+                for name in names
+            ]
+            for first, recorder in zip(own, recorders, strict=True)
+        ]
+    )
+
+
+def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
+    """Why a message was not used, and what would help; "" where no covariance can be missing."""
+    if not sensor.covariance:
+        return ""
+    recorder = _Recorder(dict.fromkeys(number_fields(model.parameters)))
+    if sensor.noise is not None:
+        sensor.noise(recorder)
+    mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))
+    return f"topic {topic}: {sensor.covariance} is missing{mend}"
+
+
+def stated(
+    parameters: type[ParametersType], topics: Sequence[Topic], name: str, *, needed: bool = True
+) -> float:
+    """The first number that one of the channels states for a parameter; NaN where none needs to.
+
+    Raises BadInput where none states it though it is needed, or the parameter does not take it.
+    """
+    for topic in topics:
+        if name in topic.metadata:
+            text = topic.metadata[name]
+            try:
+                value = float(text)
+            except ValueError:
+                raise BadInput(
+                    f"topic {topic.name} states {name} = {text}, which is no number"
+                ) from None
+            build(parameters, {name: value}, f"topic {topic.name}")
+            return value
+    if needed:
+        raise BadInput(f"topic {topics[0].name} does not state {name}; give it with --set {name}=...")
+    return np.nan

@@ -1,0 +1,438 @@
+"""Estimators made of a model and a method, as a replay takes them."""
+
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import create_model
+from scipy.stats import chi2
+
+from recorders.errors import BadInput, choices
+from recorders.log import Topic, schemas
+from recorders.parameters import Parameters, build
+from recorders.registry import available, load
+from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
+from replay.compile import compile_over_runs
+from replay.engine import Bound, Estimator, Recursive
+from replay.failures import reason_stream
+from replay.inference.binding import (
+    Found,
+    complaint_of,
+    names_state,
+    nearest,
+    needs_of,
+    number_fields,
+    reading_settings,
+    settings_of,
+    topics_of,
+)
+from replay.inference.happenings import (
+    Points,
+    data_columns,
+    happenings_of,
+    held,
+    interpolated,
+    joined,
+    points_of,
+    times_alone,
+    with_ticks,
+)
+from replay.inference.methods import METHODS, Method
+from replay.inference.model import Model, ModelParameters, Motion
+from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
+from replay.priors import gaussians
+from replay.results import ALL_WELL, failures_of, innovation_stream, state_stream
+from replay.sampling.samplers import Sampler
+from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Function = Callable[..., Any]
+
+
+def combined(model: Model, method: Method) -> type[ModelParameters]:
+    """The parameters of a model and of a method, in one type."""
+    name = f"{model.parameters.__name__}With{method.parameters.__name__}"
+    return create_model(name, __base__=(method.parameters, model.parameters))  # type: ignore[arg-type]
+
+
+def modelled(model: Model, method: str) -> Estimator[Any]:
+    """The estimator that estimates the state of one model by one method."""
+    chosen = METHODS[method]
+    lacking = chosen.lacks(model)
+    if lacking:
+        raise BadInput(f"method {method} needs {lacking}")
+    return Estimator(
+        f"{model.summary}, {chosen.summary}",
+        needs_of(model),
+        combined(model, chosen),
+        partial(bind_model, model=model, method=chosen),
+        variant=chosen.variant,
+    )
+
+
+def of_any_model(method: str) -> Estimator[Any]:
+    """The estimator that estimates, by one method, the state of the registered model that fits a log."""
+    chosen = METHODS[method]
+    return Estimator(
+        f"{chosen.summary}, of any model (`fuselog models` lists them)",
+        " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items()),
+        _any_parameters(chosen),
+        partial(_bind_fitting, method=chosen),
+        variant=chosen.variant,
+    )
+
+
+def registered_models() -> dict[str, Model]:
+    """The models by name; one that does not load is left out, and says why where it is named."""
+    found = {}
+    for name in available("models"):
+        with suppress(BadInput):
+            found[name] = load("models", name, Model)
+    return found
+
+
+@lru_cache(maxsize=16)
+def _any_parameters(method: Method) -> type[Parameters]:
+    """All parameters of all models, none of them set, with those of a method and the model's name.
+
+    What one model wants of a parameter is checked when the log has told which model it is.
+    """
+    fields: dict[str, Any] = {"model": (str | None, None)}
+    for model in registered_models().values():
+        for name, field in model.parameters.model_fields.items():
+            if name not in method.parameters.model_fields:
+                bounds = tuple(field.metadata)
+                kind = Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+                same = fields.get(name, (kind,))[0] == kind
+                fields[name] = (kind if same else Any, None)
+    return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
+
+
+def _bind_fitting(
+    label: str, topics: Mapping[str, Topic], values: Parameters, *, method: Method
+) -> list[Bound]:
+    """Bind the model that is named, or else the one that fits; nothing where none does.
+
+    Raises BadInput where the one named does not fit, several do, the method cannot serve it, or it has
+    no such parameter.
+    """
+    models = registered_models()
+    given = {name: getattr(values, name) for name in values.model_fields_set}
+    named = given.pop("model", None)
+    if named is not None:
+        models = {named: load("models", named, Model)}
+    found = {name: topics_of(model, topics) for name, model in models.items()}
+    fitting = [name for name in models if found[name]]
+    if len(fitting) > 1:  # then the prior's components tell
+        named_alike = [
+            name
+            for name in fitting
+            if any(names_state(each.prior, models[name]) for each in found[name])
+        ]
+        fitting = named_alike or fitting
+    if len(fitting) > 1:
+        raise BadInput(
+            f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"
+        )
+    if not fitting:
+        which = f"estimator {label}: model {named}" if named else f"estimator {label}"
+        raise BadInput(
+            f"{which} does not fit this log: {nearest(models, topics)}; "
+            f"the log has {', '.join(topics) or 'no topics'}"
+        )
+    (name,) = fitting
+    lacking = method.lacks(models[name])
+    if lacking:
+        raise BadInput(f"estimator {label}: model {name} lacks {lacking}, which this method needs")
+    parameters = build(combined(models[name], method), given, f"estimator {label}, model {name}")
+    return bind_model(label, topics, parameters, model=models[name], method=method)
+
+
+def bind_model(
+    label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
+) -> list[Bound]:
+    """A filter for everything in the log that is of this model."""
+    bound: list[Bound] = []
+    motion = _motion_of(label, model, parameters.mode)
+    for found in topics_of(model, topics):
+        stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors))
+        numbers = settings_of(label, stage, found, parameters)
+        name = label + found.prefix
+        samplers = _samplers_of(stage, method, parameters)
+        filtering = Filter(name, found, stage, method, parameters, numbers, samplers)
+        maps = {sensor.about.topic: sensor.about for sensor in stage.sensors if sensor.about}
+        control = [found.control.name] if found.control else []
+        streams = (*control, *(topic.name for _, topic in found.sensors))
+        whole = (found.prior.name, *maps)
+        priors = {found.prior.name: model.state}
+        start, run, finish = filtering.start, filtering.run, filtering.finish
+        bound.append(Recursive(name, streams, whole, start, run, priors, finish=finish))
+    return bound
+
+
+def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
+    """The motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    if mode is None:
+        return model.motion
+    if not model.modes:
+        raise BadInput(f"estimator {label}: mode = {mode}: the model has one motion; leave out `mode`")
+    if mode not in model.modes:
+        raise BadInput(
+            f"estimator {label}: the model has no mode '{mode}'; {choices(mode, model.modes)}"
+        )
+    return model.modes[mode]
+
+
+# The filter of one thing
+
+
+class State(NamedTuple):
+    """What a filter carries from block to block.
+
+    Attributes:
+        carried: see `recursion.Carried`.
+        points: of every map, by its topic.
+        generators: of the randomised samples, for every sampled function and run.
+        waiting: events that wait for the next message of an interpolated control.
+        tick: (runs,) the number of the next extra estimate.
+    """
+
+    carried: Carried
+    points: Mapping[str, Points]
+    generators: tuple[Any, ...]
+    waiting: Happenings | None
+    tick: Integers
+
+
+@lru_cache(maxsize=64)
+def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
+    """The loop over the runs, and the steps that it was made of."""
+    steps = method.steps(stage)
+    names = number_fields(stage.model.parameters)
+    loop = recursion(stage, steps, reading_settings(names))
+    return compile_over_runs(loop, allocates=False), steps
+
+
+def _samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
+    """Of every sampled function; raises BadInput where the sampling is none of its dimension."""
+    if method.sampling is None:
+        return ()
+    sampling = method.sampling(parameters)
+    return tuple(sampling.at(dimension) for dimension in _compiled(stage, method)[1].sampled)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """One bound filter; `start`, `run` and `finish` are what `replay.engine.Recursive` asks for.
+
+    Attributes:
+        name: what its output topics begin with, after `/estimates/`.
+        found: its topics.
+        stage, method, parameters: what it is made of.
+        settings: (1 + sensors, fields), see `settings_of`.
+        samplers: one for each of `Steps.sampled`.
+    """
+
+    name: str
+    found: Found
+    stage: Stage
+    method: Method
+    parameters: Any
+    settings: Floats
+    samplers: tuple[Sampler, ...]
+
+    def start(self, whole: Mapping[str, Ragged]) -> State:
+        """The state at every run's prior; a run whose prior cannot be used takes no part."""
+        model = self.stage.model
+        time_ns, mean, covariance = gaussians(whole[self.found.prior.name])
+        control = np.tile(np.array(self.initial), (len(mean), 1))
+        started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
+        carried = Carried(Gaussian(mean, covariance), control, time_ns, started)
+        maps = {each.about.topic: each.about for each in self.stage.sensors if each.about}
+        points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
+        waiting = None
+        if model.control is not None and model.control.interpolated:  # what drives from there on
+            runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
+            waiting = times_alone(runs, time_ns.copy(), width, is_due=False)
+        return State(carried, points, (), waiting, np.zeros(len(mean), np.int64))
+
+    def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
+        """Filter a block."""
+        happenings, lacking = happenings_of(self.stage, self.found, block, state.points, self.settings)
+        passed_over = self.passed_over(block, lacking)
+        tick, waiting = state.tick, None
+        if self.parameters.every_s is not None:
+            every_ns = round(self.parameters.every_s * 1e9)
+            happenings, tick = with_ticks(happenings, state.carried.time_ns, tick, every_ns)
+        if state.waiting is not None:
+            happenings = joined(state.waiting, happenings)
+        control = self.stage.model.control
+        if control is not None and control.interpolated:
+            happenings, waiting = interpolated(happenings, len(control.components))
+        after, made = self.follow(state._replace(waiting=waiting, tick=tick), happenings)
+        return after, [*made, *passed_over]
+
+    def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
+        """What was not used since it lacks a covariance, if any topic may."""
+        if not any(sensor.covariance for sensor in self.stage.sensors):
+            return []
+        sensors = {topic.name: sensor for sensor, topic in self.found.sensors}
+        reasons = [
+            complaint_of(self.stage.model, sensors[topic], topic) if topic in sensors else ""
+            for topic in block.streams
+        ]
+        events = block.events
+        stream = reason_stream(
+            f"/estimates/{self.name}/skipped",
+            schemas.SKIPPED,
+            events.time_ns[lacking],
+            events.topic[lacking],
+            reasons,
+        )
+        return [Ragged(stream, ragged_rows(lacking, events.offsets))]
+
+    def finish(self, state: State) -> list[Ragged]:
+        """What still waits for a control that does not come any more."""
+        if state.waiting is None:
+            return []
+        return self.follow(state, held(state.waiting, self.initial))[1]
+
+    @property
+    def initial(self) -> tuple[float, ...]:
+        """What drives the motion before the first message of the control."""
+        control = self.stage.model.control
+        return (control.initial or (0.0,) * len(control.components)) if control else ()
+
+    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+        """Filter events."""
+        model, sensors = self.stage.model, self.stage.sensors
+        loop, steps = _compiled(self.stage, self.method)
+        before, carried = state.carried, copy.deepcopy(state.carried)
+        runs = len(before.time_ns)
+        estimates = Estimates(*_room(happenings.is_due, happenings.offsets, model.size, model.tangent))
+        slots = len(slots_of(sensors))
+        noted = _room(happenings.source >= 0, happenings.offsets, slots, slots)
+        innovations = Innovations(*noted, numbers=np.empty((len(noted[1]), 3)))
+        if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
+            innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
+        starts = estimates.end.copy(), innovations.end.copy()
+        settings = np.broadcast_to(self.settings, (runs, *self.settings.shape)).copy()
+        generators = state.generators
+        if any(each.redrawn for each in self.samplers):
+            generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
+        for part, sets in _sets(self.samplers, generators, happenings.offsets):
+            loop(
+                part.stop - part.start,
+                happenings._replace(offsets=happenings.offsets[part.start : part.stop + 1]),
+                settings[part],
+                self.gates,
+                of_runs(carried, part),
+                estimates._replace(end=estimates.end[part]),
+                innovations._replace(end=innovations.end[part]),
+                scratch=partial(steps.memory, sets),
+            )
+        made = self.outputs(happenings, estimates, innovations, starts)
+        topic = f"/estimates/{self.name}"
+        made.append(failures_of(topic, before.failure, carried.failure, carried.time_ns, FAILURES))
+        return state._replace(carried=carried, generators=generators), made
+
+    @cached_property
+    def gates(self) -> Floats:
+        """Bounds of the NIS (sensors, largest measurement + 1), by the number of components."""
+        largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
+        gates = np.full((max(len(self.stage.sensors), 1), largest + 1), np.inf)
+        probability = self.parameters.gate_probability
+        gates[:, 1:] = chi2.ppf(probability, np.arange(1, largest + 1))
+        return gates
+
+    def outputs(
+        self,
+        happenings: Happenings,
+        estimates: Estimates,
+        innovations: Innovations,
+        starts: tuple[Integers, Integers],
+    ) -> list[Ragged]:
+        """The streams of what the recursion filled in."""
+        model, sensors = self.stage.model, self.stage.sensors
+        prefix = self.found.prefix
+        truth = model.truth if model.truth.startswith("/") else f"{prefix}/{model.truth}"
+        topic = f"/estimates/{self.name}"
+        rows, offsets = filled_rows(np.append(starts[0], len(estimates.event)), estimates.end)
+        state = state_stream(
+            f"{topic}/{model.output}",
+            happenings.time_ns[estimates.event[rows]],
+            model.state,
+            truth,
+            estimates.mean[rows],
+            estimates.covariance[rows],
+        )
+        made = [Ragged(state, offsets)]
+        if not sensors:
+            return made
+        rows, offsets = filled_rows(np.append(starts[1], len(innovations.event)), innovations.end)
+        event, numbers = innovations.event[rows], innovations.numbers[rows]
+        innovation = innovation_stream(
+            f"{topic}/innovation",
+            happenings.time_ns[event],
+            slots_of(sensors),
+            truth,
+            target_id=happenings.target_id[event],
+            accepted=numbers[:, 2].astype(np.int64),
+            innovation=innovations.difference[rows],
+            covariance=innovations.covariance[rows],
+            squared=numbers[:, 0],
+            log_likelihood=numbers[:, 1],
+        )
+        return [*made, Ragged(innovation, offsets)]
+
+
+def _room(
+    wanted: NDArray[np.bool_], offsets: Integers, size: int, spread: int
+) -> tuple[Integers, Integers, Floats, Floats]:
+    """Room for a row of every event that is wanted: where the runs' rows begin, and empty columns."""
+    starts = ragged_rows(wanted, offsets)
+    rows = int(starts[-1])
+    return (
+        starts[:-1].copy(),
+        np.empty(rows, np.int64),
+        np.empty((rows, size)),
+        np.empty((rows, spread, spread)),
+    )
+
+
+def _seeded(
+    generators: tuple[Any, ...], happenings: Happenings, count: int, seed: int
+) -> tuple[Any, ...]:
+    """Generators of every sampled function and run, from the seed and the run's first data."""
+    runs = len(happenings.offsets) - 1
+    before = generators or ((None,) * runs,) * count
+    return tuple(
+        seeded_by_data(each, happenings.data, happenings.offsets, seed, function)
+        for function, each in enumerate(before)
+    )
+
+
+def _sets(
+    samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
+) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
+    """Runs, and the samples of all functions for them; the largest randomised ones say how many runs."""
+    drawn = [index for index, each in enumerate(samplers) if each.redrawn]
+    if not drawn:
+        sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)
+        yield slice(0, len(offsets) - 1), sets
+        return
+    largest = max(drawn, key=lambda index: samplers[index].count * (samplers[index].dimension + 1))
+    for part, most in sets_by_runs(samplers[largest], generators[largest], offsets):
+        span = offsets[part.start : part.stop + 1]
+        others = (
+            most if index == largest else next(sets_by_runs(each, generators[index][part], span))[1]
+            for index, each in enumerate(samplers)
+        )
+        yield part, tuple(others)

@@ -1,0 +1,165 @@
+"""The algebra of recursive Gaussian filters: scalar loops over small arrays, in place.
+
+Means lie in the state's own space, covariances in its tangent space and are symmetric by construction.
+Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.models.planar import wrap_angle
+
+Floats = NDArray[np.float64]
+Function = Callable[..., Any]
+
+LOG_TWO_PI = float(np.log(2.0 * np.pi))
+
+
+class Innovation(NamedTuple):
+    """How a measurement differs from its prediction.
+
+    Attributes:
+        difference: v (m,), NaN where the measurement has no such component.
+        covariance: S (m, m), of v.
+        cross_covariance: C (t, m), of the state with v.
+    """
+
+    difference: Floats
+    covariance: Floats
+    cross_covariance: Floats
+
+
+def no_innovation(states: int, components: int) -> Innovation:
+    """Memory for an innovation."""
+    return Innovation(
+        np.empty(components), np.empty((components, components)), np.empty((states, components))
+    )
+
+
+def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
+    """Fill the lower factor of the leading block; False where it is not positive definite (or NaN).
+
+    Both arguments may be the same array.
+    """
+    for column in range(size):
+        for row in range(column, size):
+            entry = matrix[row, column]
+            for k in range(column):
+                entry -= factor[row, k] * factor[column, k]
+            if row > column:
+                factor[row, column] = entry / factor[column, column]
+            elif entry > 0.0:
+                factor[row, row] = np.sqrt(entry)
+            else:
+                return False
+    return True
+
+
+def wrap(difference: float, is_angle: bool) -> float:
+    """The difference, in [-pi, pi) where it is one of angles."""
+    if is_angle and not abs(difference) < np.pi:
+        return wrap_angle(difference)
+    return difference
+
+
+def keep_measured(innovation: Innovation) -> int:
+    """Move the components that were measured to the front; returns how many there are."""
+    difference, covariance, cross_covariance = innovation
+    size = 0
+    for component in range(len(difference)):
+        if np.isnan(difference[component]):
+            continue
+        if size < component:
+            difference[size] = difference[component]
+            for row in range(len(cross_covariance)):
+                cross_covariance[row, size] = cross_covariance[row, component]
+            for k in range(len(difference)):
+                covariance[size, k] = covariance[component, k]
+            for k in range(len(difference)):
+                covariance[k, size] = covariance[k, component]
+        size += 1
+    return size
+
+
+def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
+    """Turn v into L^-1 v and S into L, S = L L'; returns v' S^-1 v and log det S.
+
+    The first is NaN where S is not positive definite.
+    """
+    difference, factor, _ = innovation
+    if not cholesky(factor, factor, size):
+        return np.nan, np.nan
+    squared, determinant = 0.0, 1.0
+    for i in range(size):
+        entry = difference[i]
+        for k in range(i):
+            entry -= factor[i, k] * difference[k]
+        difference[i] = entry / factor[i, i]
+        squared += difference[i] * difference[i]
+        determinant *= factor[i, i]
+    return squared, 2.0 * np.log(determinant)
+
+
+def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
+    """Fill `step` with K v of a whitened innovation; the cross-covariance C becomes W = C L^-T.
+
+    So K v = W L^-1 v, and K S K' = W W'.
+    """
+    difference, factor, cross = innovation
+    for row in range(len(step)):
+        step[row] = 0.0
+        for i in range(size):
+            entry = cross[row, i]
+            for k in range(i):
+                entry -= factor[i, k] * cross[row, k]
+            cross[row, i] = entry / factor[i, i]
+            step[row] += cross[row, i] * difference[i]
+
+
+def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
+    """P becomes P - W W', with W as `kalman_step` leaves it."""
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            entry = covariance[row, column]
+            for i in range(size):
+                entry -= weighted[row, i] * weighted[column, i]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
+    """P becomes F P F', by way of `product`."""
+    size = len(covariance)
+    for row in range(size):
+        for column in range(size):
+            entry = 0.0
+            for k in range(size):
+                entry += transition[row, k] * covariance[k, column]
+            product[row, column] = entry
+    for row in range(size):
+        for column in range(row + 1):
+            entry = 0.0
+            for k in range(size):
+                entry += product[row, k] * transition[column, k]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
+    """P becomes P + G diag(variances) G', for a gain G whose columns go with the variances."""
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            entry = covariance[row, column]
+            for k in range(len(variances)):
+                entry += gain[row, k] * variances[k] * gain[column, k]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covariance: Floats) -> None:
+    """Copy a mean and its covariance."""
+    for i in range(len(mean)):
+        to_mean[i] = mean[i]
+    for i in range(len(covariance)):
+        for j in range(len(covariance)):
+            to_covariance[i, j] = covariance[i, j]

@@ -1,0 +1,258 @@
+"""A log's messages as the recursion takes them: rows of numbers in time order, whatever the model."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Stream
+from replay.blocks import Block, Ragged, ragged_rows
+from replay.inference.binding import Found, number_fields, reading_settings
+from replay.inference.model import Control, Map, Sensor
+from replay.inference.recursion import CONTROL, NOTHING, Happenings
+from replay.inference.steps import Stage, reading
+from replay.measurements import read_fixes, read_vectors
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Points:
+    """The points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
+
+    keys: Integers
+    places: Floats
+
+    def rows(self, run: Integers, number: Integers) -> Integers:
+        """The rows of the points with these numbers in these runs; -1 where there is none."""
+        keys = (run << 32) + number
+        if len(self.keys) == 0:
+            return np.full(len(keys), -1)
+        rows = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[rows] == keys, rows, -1)
+
+
+def points_of(ragged: Ragged, asked: Map) -> Points:
+    """The points of all runs; raises BadInput where they lack a component."""
+    places = read_vectors(ragged.stream, asked.point, asked.components)
+    run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
+    keys = (run << 32) + ragged[asked.number]
+    order = np.argsort(keys, kind="stable")
+    return Points(keys[order], np.ascontiguousarray(places[order]))
+
+
+def data_columns(stage: Stage) -> tuple[int, int]:
+    """How many numbers an event has, and the first of the control's among them."""
+    width, control = (
+        max((reading(sensor).width for sensor in stage.sensors), default=0),
+        stage.model.control,
+    )
+    start = width if control is not None and control.interpolated else 0
+    return max(width, start + stage.model.controls), start
+
+
+def happenings_of(
+    stage: Stage, found: Found, block: Block, points: Mapping[str, Points], settings: Floats
+) -> tuple[Happenings, NDArray[np.bool_]]:
+    """A block's messages as the recursion takes them, and which of them lack their covariance."""
+    events, control = block.events, stage.model.control
+    width, start = data_columns(stage)
+    tables: list[_Table] = []
+    if control is not None and found.control is not None:
+        tables.append(_control_table(control, block.streams[found.control.name], width, start))
+    first = len(tables)
+    parameters = reading_settings(number_fields(stage.model.parameters))
+    for number, (sensor, topic) in enumerate(found.sensors):
+        own = parameters(settings, number + 1)
+        tables.append(_sensor_table(sensor, number, block.streams[topic.name], points, width, own))
+    data, source, target, lacking = (
+        column[0] if len(column) == 1 else np.concatenate(column)[events.source]
+        for column in zip(*tables, strict=True)
+    )
+    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target)
+    if lacking.any():  # as if these had not come
+        happenings = _of_rows(happenings, ~lacking)
+        happenings = happenings._replace(is_due=last_of_stamps(happenings))
+    if first and not (control is not None and control.estimates) and found.sensors:
+        stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
+        sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+        sensed[stamp[happenings.source != CONTROL]] = True
+        happenings = happenings._replace(is_due=happenings.is_due & sensed[stamp])
+    return happenings, lacking
+
+
+def last_of_stamps(happenings: Happenings) -> NDArray[np.bool_]:
+    """Whether no later event of the run has an event's stamp."""
+    is_last = np.append(np.diff(happenings.time_ns) != 0, True)[: len(happenings.time_ns)]
+    ends = happenings.offsets[1:]
+    is_last[ends[ends > happenings.offsets[:-1]] - 1] = True
+    return is_last
+
+
+class _Table(NamedTuple):
+    """One topic's messages: data (n, width), source, what they are about, who lacks a covariance."""
+
+    data: Floats
+    source: Integers
+    target_id: Integers
+    is_lacking: NDArray[np.bool_]
+
+
+def _control_table(control: Control, ragged: Ragged, width: int, start: int) -> _Table:
+    """The control's numbers in the columns from `start` on."""
+    count = len(ragged)
+    data = np.full((count, width), np.nan)
+    names = control.components
+    read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
+    data[:, start : start + len(names)] = read
+    return _Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
+
+
+def _sensor_table(
+    sensor: Sensor,
+    number: int,
+    ragged: Ragged,
+    points: Mapping[str, Points],
+    width: int,
+    parameters: Any,
+) -> _Table:
+    """A sensor's messages: measured, what it is about, its covariance; see `steps.reading`."""
+    m, stream = len(sensor.measured), ragged.stream
+    source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
+    lacking = np.zeros(len(stream), bool)
+    parts = []
+    if sensor.covariance:
+        fixes = read_fixes(stream, sensor.vector, sensor.covariance, sensor.measured, None)
+        spread, lacking = fixes.covariance, fixes.missing
+        variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
+        if np.isfinite(variances).all():
+            spread[lacking], lacking = np.diag(variances), np.zeros(len(stream), bool)
+        parts = [fixes.value, spread[:, *np.tril_indices(m)]]
+    elif sensor.read:
+        parts = [_computed(sensor.read, ragged, m)]
+    elif sensor.vector:
+        parts = [read_vectors(stream, sensor.vector, sensor.measured)]
+    else:
+        parts = [_fields(stream, tuple(sensor.measured))]
+    if sensor.about is not None:
+        target = stream[sensor.about.of].astype(np.int64)
+        run, places = (
+            np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+            points[sensor.about.topic],
+        )
+        rows = places.rows(run, target)
+        source[rows < 0] = NOTHING
+        nowhere = np.full((1, sensor.about.size), np.nan)  # what is not on the map takes the last row
+        parts.insert(1, np.concatenate([places.places, nowhere])[rows])
+    source[lacking] = NOTHING
+    filled = sum(part.shape[1] for part in parts)
+    if filled < width:
+        parts.append(np.full((len(stream), width - filled), np.nan))
+    data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+    return _Table(np.ascontiguousarray(data), source, target, lacking)
+
+
+def _fields(stream: Stream, names: Sequence[str]) -> Floats:
+    return np.stack([stream[name] for name in names], axis=1)
+
+
+def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:
+    """What a model's own function reads of a topic; BadInput where that is not as wide as it says."""
+    if not len(ragged):  # vectors have no width here
+        return np.empty((0, components))
+    numbers = np.asarray(read(ragged.stream), float)
+    if numbers.shape != (len(ragged), components):
+        raise BadInput(
+            f"topic {ragged.stream.topic}: the model reads an array of shape {numbers.shape} from "
+            f"{len(ragged)} messages; ({len(ragged)}, {components}) is needed"
+        )
+    return numbers
+
+
+def times_alone(offsets: Integers, time_ns: Integers, width: int, *, is_due: bool) -> Happenings:
+    """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
+    count = len(time_ns)
+    nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
+    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), np.zeros(count, np.int64))
+
+
+def joined(first: Happenings, second: Happenings) -> Happenings:
+    """The events of both in time, run by run; at equal stamps those of the first go first."""
+    runs = len(first.offsets) - 1
+    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
+    order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
+    columns: Any = (
+        np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
+    )
+    return Happenings(first.offsets + second.offsets, *columns)
+
+
+def _of_rows(happenings: Happenings, chosen: NDArray[np.bool_]) -> Happenings:
+    columns: Any = (column[chosen] for column in happenings[1:])
+    return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
+
+
+def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Happenings]:
+    """Events with the control at their stamps, linear between messages; and those still to wait.
+
+    What comes after a run's last control message waits for the next, with that message before it.
+    """
+    data, is_control = happenings.data.copy(), happenings.source == CONTROL
+    ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
+    columns = range(data.shape[1] - controls, data.shape[1])
+    for begin, end in pairwise(happenings.offsets):
+        at = begin + np.flatnonzero(is_control[begin:end])
+        if not len(at):
+            continue
+        inside = slice(begin, at[-1] + 1)
+        times_ns, wanted_ns = (
+            happenings.time_ns[rows] - happenings.time_ns[begin] for rows in (at, inside)
+        )
+        for column in columns:
+            data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
+        ready[inside], waiting[begin : at[-1]] = True, False
+    again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
+    return _of_rows(happenings._replace(data=data), ready), _of_rows(again, waiting)
+
+
+def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
+    """Events that wait for a control message that does not come: the last one holds.
+
+    `initial` holds in a run in which there was none.
+    """
+    data = happenings.data.copy()
+    for begin, end in pairwise(happenings.offsets):
+        if begin < end:
+            is_control = happenings.source[begin] == CONTROL
+            control = data[begin, -len(initial) :].copy() if is_control else initial
+            data[begin:end, -len(initial) :] = control
+    return happenings._replace(data=data)
+
+
+def with_ticks(
+    happenings: Happenings, start_ns: Integers, tick: Integers, every_ns: int
+) -> tuple[Happenings, Integers]:
+    """Events, and between them one every so often, at which an estimate is wanted."""
+    times, runs, ticks = [], [], tick.copy()
+    for number, (begin, end) in enumerate(pairwise(happenings.offsets)):
+        if begin == end:
+            continue
+        last_ns = happenings.time_ns[end - 1]
+        first = max(int(tick[number]), -(-int(start_ns[number]) // every_ns))
+        stop = max(int(last_ns) // every_ns + 1, first)
+        wanted = np.arange(first, stop) * every_ns
+        own = happenings.time_ns[begin:end][happenings.is_due[begin:end]]
+        wanted = wanted[~np.isin(wanted, own)]
+        ticks[number] = stop
+        times.append(wanted)
+        runs.append(np.full(len(wanted), number))
+    if not times:
+        return happenings, ticks
+    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(happenings.offsets)))
+    width = happenings.data.shape[1]
+    return joined(happenings, times_alone(offsets, np.concatenate(times), width, is_due=True)), ticks

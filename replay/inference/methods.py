@@ -1,0 +1,331 @@
+"""Methods: how the state of any model is estimated. Each makes the steps of a filter for one model.
+
+`ekf` and `iekf` need nothing but the model's functions; `ukf` and `lrkf:SAMPLING` sample them;
+`analytic` takes the exact moments where the model knows them.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeInt, PositiveFloat
+
+from recorders.parameters import Parameters
+from replay.inference.binding import number_fields, settings_type
+from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
+from replay.inference.generate import is_flat, resetting, retraction, tuple_of
+from replay.inference.model import Model, trial_state
+from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Note,
+    Stage,
+    Steps,
+    Workspace,
+    correcting,
+    gaussian_filter,
+    kalman_update,
+    linear_innovation,
+    linear_motion,
+    linear_sensor,
+    motion_noise,
+    note_numbers,
+    noting,
+    reading,
+    sensor_derivative,
+    workspace,
+)
+from replay.results import ALL_WELL
+from replay.sampling import parse_sampling
+from replay.sampling.names import Sampling, Unscented
+
+Floats = NDArray[np.float64]
+Function = Callable[..., Any]
+
+ITERATIONS = 50
+SETTLED = 1e-12  # of the iterated update: the largest component of the last step
+
+
+class MethodParameters(Parameters):
+    """What every method takes.
+
+    `every_s` asks for estimates every so often, beside those at the stamps of sensors; `mode` is the
+    motion to use of a model that has several.
+    """
+
+    every_s: PositiveFloat | None = None
+    mode: str | None = None
+
+
+class UnscentedParameters(MethodParameters):
+    """The unscented filter's spread: 3 - n is Julier's choice for a Gaussian, 0 the cubature filter."""
+
+    kappa: float = 0.0
+
+
+class RegressionParameters(MethodParameters):
+    """The sampling's name, see `replay.sampling.names`; the seed is for randomised ones."""
+
+    sampling: str = "ukf"
+    seed: NonNegativeInt = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One way to estimate the state of any model.
+
+    Attributes:
+        summary: what it is, in one line.
+        parameters: their type.
+        steps: makes the filter's steps for a model with the sensors at hand.
+        sampling: where the samples come from, for methods that take some.
+        lacks: what a model lacks for it, in words; empty where it will do.
+        variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    """
+
+    summary: str
+    parameters: type[MethodParameters]
+    steps: Callable[[Stage], Steps]
+    sampling: Callable[[Any], Sampling] | None = None
+    lacks: Callable[[Model], str] = lambda _: ""
+    variant: str | None = None
+
+
+def _extended(stage: Stage) -> Steps:
+    updates = (
+        kalman_update(stage, number, linear_sensor(stage, number))
+        for number in range(len(stage.sensors))
+    )
+    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
+
+
+def _iterated(stage: Stage) -> Steps:
+    updates = (iterated_update(stage, number) for number in range(len(stage.sensors)))
+    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
+
+
+def iterated_update(stage: Stage, number: int) -> Function:
+    """The update linearised anew at every iterate, until it settles: Gauss-Newton on the posterior.
+
+    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
+    gate is tested at the prediction; innovation and likelihood are those of the last iterate.
+    """
+    model, sensor = stage.model, stage.sensors[number]
+    n, t, m = model.size, model.tangent, len(sensor.measured)
+    flat = is_flat(model.kinds)
+    read_state, read_about = tuple_of(n), reading(sensor).about
+    linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
+    tell, correct = noting(stage, number), correcting(model)
+    add, turn = retraction(model.kinds), resetting(model.kinds)
+
+    def relinearise(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
+    ) -> None:
+        """The innovation by the Jacobian at mean (+) step, as one about the mean."""
+        innovation, step, rows = work.innovations[number], work.step, work.rows
+        for row in range(n):
+            work.state[row] = mean[row]
+        add(work.state, step)
+        linearise(read_state(work.state), read_about(data), parameters, work)
+        if not flat:
+            for row in range(t):
+                work.turned[row] = -step[row]
+            turn(work.turned, rows[:m].T)
+        compare(covariance, data, parameters, work)
+        for i in range(m):
+            for k in range(t):
+                innovation.difference[i] += rows[i, k] * step[k]
+
+    def update(
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,  # noqa: ARG001
+        work: Workspace,
+        note: Note,
+    ) -> int:
+        present = 0
+        for i in range(m):
+            present += not np.isnan(data[i])
+        if present == 0:
+            return NOTHING_MEASURED
+        innovation, step = work.innovations[number], work.step
+        for row in range(t):
+            step[row] = 0.0
+        for iteration in range(ITERATIONS):
+            relinearise(mean, covariance, data, parameters, work)
+            tell(innovation, note)
+            size = keep_measured(innovation)
+            squared, determinant = whiten(innovation, size)
+            if np.isnan(squared):
+                return NOT_POSITIVE_DEFINITE
+            if iteration == 0 and not squared <= gate[size]:
+                note_numbers(note, squared, determinant, size, False)
+                return ALL_WELL
+            for row in range(t):
+                work.turned[row] = step[row]
+            kalman_step(innovation, size, step)
+            change = 0.0
+            for row in range(t):
+                change = max(change, abs(step[row] - work.turned[row]))
+            if change < SETTLED:
+                break
+        reduce_covariance(covariance, innovation.cross_covariance, size)
+        correct(mean, covariance, work)
+        note_numbers(note, squared, determinant, size, True)
+        return ALL_WELL
+
+    return update
+
+
+def _sampled(stage: Stage) -> Steps:
+    """Regression at samples; what is linear is passed on exactly instead."""
+    model, motion = stage.model, stage.motion
+    dimensions: list[int] = []
+    shapes: list[tuple[int, tuple[str, ...]]] = []
+    predict = linear_motion(stage)
+    if not motion.linear:
+        predict = sampled_motion(stage, 0)
+        dimensions.append(model.tangent + motion.noises)
+        shapes.append((motion.noises, model.kinds))
+    updates = []
+    for number, sensor in enumerate(stage.sensors):
+        innovate = linear_sensor(stage, number)
+        if not sensor.linear:
+            innovate = sampled_sensor(stage, number, len(shapes))
+            dimensions.append(model.tangent + sensor.noises)
+            shapes.append((sensor.noises, tuple(sensor.measured.values())))
+        updates.append(kalman_update(stage, number, innovate))
+
+    def memory(sets: tuple[Any, ...]) -> Workspace:
+        made = (
+            sample_memory(each, model.kinds, noises, outputs)
+            for each, (noises, outputs) in zip(sets, shapes, strict=True)
+        )
+        return workspace(stage, tuple(made))
+
+    return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions))
+
+
+def _analytic(stage: Stage) -> Steps:
+    motion = stage.motion
+    predict = linear_motion(stage)
+    if not motion.linear:
+        predict = _exact_motion(stage)
+    updates = tuple(
+        kalman_update(
+            stage,
+            number,
+            linear_sensor(stage, number) if sensor.linear else _exact_sensor(stage, number),
+        )
+        for number, sensor in enumerate(stage.sensors)
+    )
+    return gaussian_filter(stage, predict, updates)
+
+
+def _exact_motion(stage: Stage) -> Function:
+    model, motion = stage.model, stage.motion
+    moments, add_noise = motion.moments, motion_noise(model, motion)
+    assert moments is not None
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,  # noqa: ARG001
+        work: Workspace,
+    ) -> bool:
+        state = read_state(mean)
+        moments(mean, covariance, read_control(control), duration_s, parameters)
+        add_noise(state, covariance, duration_s, parameters, work)
+        return True
+
+    return predict
+
+
+def _exact_sensor(stage: Stage, number: int) -> Function:
+
+    sensor = stage.sensors[number]
+    moments, read_about = sensor.moments, reading(sensor).about
+    assert moments is not None
+    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
+
+    def innovate(
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        use: int,  # noqa: ARG001
+        work: Workspace,
+    ) -> bool:
+        difference, spread, cross = work.innovations[number]
+        predicted = work.predicted
+        moments(mean, covariance, read_about(data), parameters, predicted, spread, cross)
+        for i in range(m):
+            difference[i] = wrap(data[i] - predicted[i], angular[i])
+        return True
+
+    return innovate
+
+
+def _lacks_slopes(model: Model) -> str:
+    """A sensor whose linearised components depend on one another at every state, in noise and all.
+
+    As those of a point and its square do: the innovation covariance is then singular.
+    """
+    names = number_fields(model.parameters)
+    parameters = settings_type(names)(*(1.0,) * len(names))
+    for sensor in model.sensors:
+        if sensor.noises and sensor.jacobian is None:
+            m, about = len(sensor.measured), (0.7,) * (sensor.about.size if sensor.about else 0)
+            rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
+            work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
+            try:
+                sensor_derivative(model, sensor)(trial_state(model.kinds), about, parameters, work)
+            except Exception:  # is said when the model is bound, see `model.check_sensor`
+                continue
+            if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
+                return f"a regular linearisation of its sensor {sensor.topic}"
+    return ""
+
+
+def _lacks_moments(model: Model) -> str:
+    motions = (model.modes or {"": model.motion}).values()
+    if not all(motion.linear or motion.moments for motion in motions):
+        return "exact moments of its motion"
+    missing = [each.topic for each in model.sensors if not (each.linear or each.moments)]
+    return f"exact moments of its sensor {missing[0]}" if missing else ""
+
+
+METHODS: Mapping[str, Method] = {
+    "ekf": Method("extended Kalman filter", MethodParameters, _extended, lacks=_lacks_slopes),
+    "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated, lacks=_lacks_slopes),
+    "ukf": Method(
+        "unscented Kalman filter",
+        UnscentedParameters,
+        _sampled,
+        sampling=lambda parameters: Unscented(kappa=parameters.kappa),
+    ),
+    "lrkf": Method(
+        "linear regression Kalman filter; the sampling follows the name, as in lrkf:s2kf-50",
+        RegressionParameters,
+        _sampled,
+        sampling=lambda parameters: parse_sampling(parameters.sampling),
+        variant="sampling",
+    ),
+    "analytic": Method(
+        "Kalman filter with the exact moments, which linear regression approximates",
+        MethodParameters,
+        _analytic,
+        lacks=_lacks_moments,
+    ),
+}

@@ -1,0 +1,284 @@
+"""What a model is: how a state moves and what sensors say of it, nothing of how it is estimated.
+
+A model is written once, as plain component-first functions: they take tuples of components and return
+tuples, and run on arrays as well. Every method (see `replay.inference.methods`) estimates the state of
+every model that gives what the method needs.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream
+from recorders.parameters import Parameters
+from replay.components import Components
+from replay.inference.generate import tangent_size
+from replay.tangent import are_kinds
+
+Function = Callable[..., Any]
+Floats = NDArray[np.float64]
+
+
+class ModelParameters(Parameters):
+    """Base of a model's parameters: numbers, which are run-time values of the compiled filter.
+
+    A parameter that is None is what the channels of the log state: a sensor's own first, then those of
+    control, prior and the other sensors.
+    """
+
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """What measurements are about, by number: the fixed points of a topic of the log.
+
+    Attributes:
+        topic: the map's.
+        schema: of its messages.
+        number: the field that numbers them.
+        point: the vector field of the point.
+        components: of the point, by name.
+        of: the measurement's field that says which point; where it names none, the measurement says
+            nothing of the state.
+    """
+
+    topic: str
+    schema: Schema
+    number: str
+    point: str
+    components: Components
+    of: str = "target_id"
+
+    @property
+    def size(self) -> int:
+        """How many components a point has."""
+        return len(self.components)
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """What drives the motion.
+
+    Attributes:
+        topic: its name, under the prefix of what is estimated.
+        schema: of its messages.
+        components: their names, which are the messages' fields unless `read` is given.
+        read: stream -> (n, components).
+        interpolated: the control is linear between two messages, and the motion over a step gets the
+            mean of its two ends; else a message holds until the next one.
+        initial: what holds before the first message; zeros unless given.
+        estimates: whether there are estimates at its stamps too, not at those of sensors alone.
+    """
+
+    topic: str
+    schema: Schema
+    components: tuple[str, ...]
+    read: Callable[[Stream], Floats] | None = None
+    interpolated: bool = False
+    initial: tuple[float, ...] = ()
+    estimates: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How the state moves.
+
+    Attributes:
+        move: (state, control, duration_s, parameters) -> state. Where `noises` says how many numbers of
+            noise enter other than by addition, (state, control, noise, duration_s, parameters).
+        noise: (state, duration_s, parameters) -> the variances of the additive noise in the tangent
+            space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
+        control_noise: (duration_s, parameters) -> the variances of the control's error over the
+            duration; it enters the state through the derivative by the control.
+        linear: whether `move` is linear in the state: sampling methods then need no samples.
+        jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
+            they are written by hand, jets give them else.
+        moments: (mean, covariance, control, duration_s, parameters) moves both in place, exactly and
+            without the additive noise; for the method `analytic`.
+    """
+
+    move: Function
+    noise: Function | None = None
+    noises: int = 0
+    control_noise: Function | None = None
+    linear: bool = False
+    jacobians: Function | None = None
+    moments: Function | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """What a sensor measures of the state.
+
+    Attributes:
+        topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
+        schema: of its messages.
+        measured: the components by name, with their kinds ("linear" or "angle").
+        measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
+            empty. With `noises`, (state, noise, about, parameters).
+        noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
+            with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
+            has neither is passed over, and counted.
+        vector: the field that holds what is measured as a vector, by the names of its components; else
+            every component is a field of its own.
+        covariance: the field that holds the vector's covariance.
+        about: what the message is about.
+        read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
+            message: a pseudo-measurement.
+        linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
+            moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
+            measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
+        log_likelihood: (state, measured, about, parameters) -> log p(measured | state), for methods that
+            can use it.
+    """
+
+    topic: str
+    schema: Schema
+    measured: Components
+    measure: Function
+    noise: Function | None = None
+    noises: int = 0
+    vector: str = ""
+    covariance: str = ""
+    about: Map | None = None
+    read: Callable[[Stream], Floats] | None = None
+    linear: bool = False
+    jacobian: Function | None = None
+    moments: Function | None = None
+    log_likelihood: Function | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model of one kind of thing; a log may hold several of them, each under its own prefix.
+
+    Attributes:
+        summary: what it is, in one line.
+        state: the components by name, with their kinds; the four of a quaternion side by side.
+        parameters: their type.
+        sensors: all it can use; any of them makes a log fit.
+        motion: how the state moves.
+        modes: other motions by name, for methods of several; `motion` is then one of them.
+        control: what drives it; a log without this topic does not fit.
+        prior, truth: topics with the first Gaussian and the reference, under the prefix.
+        output: the last part of the estimates' topic.
+        system: what a channel's metadata has to name as its `system`, if anything.
+        needs_sensor: whether a log without any of its sensors does not fit.
+    """
+
+    summary: str
+    state: Components
+    parameters: type[ModelParameters]
+    sensors: tuple[Sensor, ...]
+    motion: Motion
+    modes: Mapping[str, Motion] | None = None
+    control: Control | None = None
+    prior: str = "prior"
+    truth: str = "truth"
+    output: str = "state"
+    system: str = ""
+    needs_sensor: bool = True
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of the state's components."""
+        return tuple(self.state.values())
+
+    @property
+    def size(self) -> int:
+        """How many components the state has."""
+        return len(self.state)
+
+    @property
+    def tangent(self) -> int:
+        """How many its tangent space has: an orientation has four components and three."""
+        return tangent_size(self.kinds)
+
+    @property
+    def controls(self) -> int:
+        """How many components the control has."""
+        return len(self.control.components) if self.control else 0
+
+
+def check_state(where: str, model: Model) -> None:
+    """Raise BadInput where a state's kinds are none."""
+    if not are_kinds(model.kinds):
+        raise BadInput(
+            f"{where}: a state of kinds {', '.join(model.kinds)}; known are linear, angle, axis (two "
+            "side by side) and quaternion (four side by side)"
+        )
+
+
+def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> None:
+    """Call a motion's functions once, uncompiled.
+
+    `parameters` has a number for every parameter. Raises BadInput where a function fails, or
+    returns what the model denies.
+    """
+    state, control = trial_state(model.kinds), (0.0,) * model.controls
+    sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
+    entering = ((0.0,) * motion.noises,) if motion.noises else ()
+    _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
+    if motion.noises and (motion.noise is None or motion.control_noise is not None):
+        raise BadInput(
+            f"{where}: noise that is not additive needs its variances, `noise`, and takes that of the "
+            "control with it; leave out `control_noise`"
+        )
+    if motion.noise is not None:
+        wanted = (motion.noises,) if motion.noises else sizes
+        _check(where, motion.noise, (state, 1.0, parameters), wanted)
+    if motion.control_noise is not None:
+        _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
+
+
+def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
+    """Call a sensor's functions once, uncompiled; see `check_motion`."""
+    where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
+    unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
+    if unknown:
+        raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
+    state, about = trial_state(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
+    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+    _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
+    if sensor.noise is None and (sensor.noises or not sensor.covariance):
+        raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
+    if sensor.covariance and not sensor.vector:
+        raise BadInput(
+            f"{where}: the covariance {sensor.covariance} is of no vector; give `vector`, a field"
+        )
+    if sensor.noise is not None and not sensor.covariance:
+        wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
+        _check(where, sensor.noise, (parameters,), wanted)
+
+
+def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
+    """A state at which to try functions: numbers that differ, unit vectors."""
+    found: list[float] = []
+    while len(found) < len(kinds):
+        kind = kinds[len(found)]
+        number = 0.1 * (1 + len(found))
+        found += {"axis": [0.6, 0.8], "quaternion": [0.1, 0.5, -0.5, 0.7]}.get(kind, [number])
+    return tuple(found)
+
+
+def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
+    code = function.__code__
+    what = f"{where}: {function.__name__} ({Path(code.co_filename).name}, line {code.co_firstlineno})"
+    with np.errstate(all="ignore"):
+        try:
+            found = function(*arguments)
+        except Exception as error:
+            raise BadInput(f"{what} raised {type(error).__name__}: {error}") from error
+    wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
+    if not isinstance(found, tuple):
+        raise BadInput(f"{what} returns a {type(found).__name__}; return a tuple of {wanted} components")
+    if len(found) not in sizes:
+        raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")

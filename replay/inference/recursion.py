@@ -1,0 +1,217 @@
+"""The one recursion: through the messages of a run in time, whatever the model and the method.
+
+One prediction per distinct stamp, one update per message in the order given; a control message changes
+what drives the next prediction. Messages before the state's own time say nothing. The run ends where its
+belief is no Gaussian any more.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.inference.generate import function_of
+from replay.inference.steps import (
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Note,
+    Stage,
+    Steps,
+)
+from replay.results import ALL_WELL
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Function = Callable[..., Any]
+
+CONTROL = -1  # an event's source; sensors count from zero, and NOTHING is only a time
+NOTHING = -2
+
+
+class Happenings(NamedTuple):
+    """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns: (n,).
+        source: (n,) a sensor's number, CONTROL or NOTHING.
+        data: (n, width) the numbers of the message, see `steps.reading`; the control's where that is
+            interpolated.
+        is_due: (n,) whether the estimate after the event is wanted.
+        target_id: (n,) what the message is about, 0 for nothing.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    source: Integers
+    data: Floats
+    is_due: NDArray[np.bool_]
+    target_id: Integers
+
+
+class Carried(NamedTuple):
+    """What the recursion carries from block to block; first axis = run.
+
+    Attributes:
+        belief: the method's own.
+        control: (runs, controls), what drives the state.
+        time_ns: (runs,), of the belief.
+        failure: (runs,), ALL_WELL or an index of `steps.FAILURES`.
+    """
+
+    belief: Any
+    control: Floats
+    time_ns: Integers
+    failure: Integers
+
+
+class Estimates(NamedTuple):
+    """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
+
+    end: Integers
+    event: Integers
+    mean: Floats
+    covariance: Floats
+
+
+class Innovations(NamedTuple):
+    """The innovations as the recursion fills them in, see `Estimates` and `steps.Note`."""
+
+    end: Integers
+    event: Integers
+    difference: Floats
+    covariance: Floats
+    numbers: Floats
+
+
+def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """The loop over the events of one run, for `replay.compile.compile_over_runs`.
+
+    `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
+    """
+    predict, estimate = steps.predict, steps.estimate
+    update = choosing(steps.updates)
+    interpolated = stage.model.control is not None and stage.model.control.interpolated
+    controls = stage.model.controls
+
+    def drive(run: int, data: Floats, carried: Carried) -> None:
+        """The control from this event on; an interpolated one stands behind the sensors' numbers."""
+        first = len(data) - controls if interpolated else 0
+        for k in range(controls):
+            carried.control[run, k] = data[first + k]
+
+    def advance(
+        run: int,
+        event: int,
+        duration_s: float,
+        happenings: Happenings,
+        settings: Floats,
+        carried: Carried,
+        memory: Any,
+    ) -> bool:
+        """Predict to an event."""
+        control = carried.control[run]
+        first = happenings.data.shape[1] - controls
+        if interpolated:  # the mean of both ends drives the step
+            for k in range(controls):
+                control[k] = 0.5 * (control[k] + happenings.data[event, first + k])
+        parameters = settings_of(settings, 0)
+        return predict(run, carried.belief, control, duration_s, parameters, event, memory)
+
+    def take_in(
+        run: int,
+        event: int,
+        happenings: Happenings,
+        settings: Floats,
+        gates: Floats,
+        carried: Carried,
+        innovations: Innovations,
+        memory: Any,
+    ) -> int:
+        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did."""
+        source, data = happenings.source[event], happenings.data[event]
+        duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
+        if duration_s > 0.0:
+            carried.time_ns[run] = happenings.time_ns[event]
+            if not advance(run, event, duration_s, happenings, settings, carried, memory):
+                return NOT_POSITIVE_DEFINITE
+        if duration_s >= 0.0 if interpolated else source == CONTROL:
+            drive(run, data, carried)
+        if source >= 0 and duration_s >= 0.0:
+            row = innovations.end[run]
+            note = Note(
+                innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
+            )
+            parameters = settings_of(settings, source + 1)
+            told = update(
+                source, run, carried.belief, data, parameters, gates[source], event, memory, note
+            )
+            if told >= 0:
+                return told
+            if told == ALL_WELL:
+                innovations.event[row] = event
+                innovations.end[run] = row + 1
+        return ALL_WELL
+
+    def follow(
+        run: int,
+        happenings: Happenings,
+        settings: Floats,
+        gates: Floats,
+        carried: Carried,
+        estimates: Estimates,
+        innovations: Innovations,
+        memory: Any,
+    ) -> None:
+        """Move what is carried, and fill the results, until the events end or the run fails."""
+        start_ns = carried.time_ns[run]
+        for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
+            if carried.failure[run] != ALL_WELL:
+                break
+            failure = take_in(run, event, happenings, settings[run], gates, carried, innovations, memory)
+            if (
+                failure == ALL_WELL
+                and happenings.is_due[event]
+                and happenings.time_ns[event] >= start_ns
+            ):
+                row = estimates.end[run]
+                mean, covariance = estimates.mean[row], estimates.covariance[row]
+                estimate(run, carried.belief, mean, covariance)
+                failure = fault_of(mean, covariance)
+                if failure == ALL_WELL:
+                    estimates.event[row] = event
+                    estimates.end[run] = row + 1
+            carried.failure[run] = failure
+
+    return follow
+
+
+def fault_of(mean: Floats, covariance: Floats) -> int:
+    """Why an estimate is none: it is not finite, or a variance is negative; ALL_WELL where it is one."""
+    total = 0.0
+    for row in range(len(mean)):
+        total += mean[row]
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            total += covariance[row, column]
+    if not np.isfinite(total):
+        return NOT_FINITE
+    for row in range(len(covariance)):
+        if covariance[row, row] < 0.0:
+            return NOT_POSITIVE_DEFINITE
+    return ALL_WELL
+
+
+def choosing(updates: tuple[Function, ...]) -> Function:
+    """`update(source, ...)`: the update of the sensor with this number."""
+    arguments = "run, belief, data, parameters, gate, use, memory, note"
+    lines = [f"def update(source, {arguments}):"]
+    lines += [
+        f"    if source == {number}:\n        return update_{number}({arguments})"
+        for number in range(len(updates))
+    ]
+    lines.append(f"    return {NOTHING_MEASURED}")
+    text = "\n".join([*lines, ""])
+    return function_of(text, **{f"update_{number}": each for number, each in enumerate(updates)})

@@ -1,0 +1,74 @@
+"""The compiled loops of filters that are made of models, taken out of the replay around them."""
+
+import copy
+from collections.abc import Callable, Sequence
+from time import process_time
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.blocks import filled_rows
+from replay.engine import Bound, replay
+from replay.inference import estimators
+from replay.inference.recursion import Estimates, Innovations
+from replay.sources import Source
+
+Floats = NDArray[np.float64]
+
+
+class Call(NamedTuple):
+    """One call of a loop, its arguments as they were before it."""
+
+    loop: Callable[..., None]
+    runs: int
+    before: tuple[Any, ...]
+    results: tuple[Estimates, Innovations]
+    scratch: Callable[[], Any]
+
+    def __call__(self) -> Floats:
+        """Do it again, into new arrays; returns the means of all runs end to end."""
+        *columns, carried = self.before
+        estimates, innovations = (
+            type(each)(each.end.copy(), *(np.empty_like(column) for column in each[1:]))
+            for each in self.results
+        )
+        arguments = (*columns, copy.deepcopy(carried), estimates, innovations)
+        self.loop(self.runs, *arguments, scratch=self.scratch)
+        rows, _ = filled_rows(np.append(self.results[0].end, len(estimates.event)), estimates.end)
+        return estimates.mean[rows]
+
+
+def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
+    """The calls that a replay makes of the loops; none where no filter is made of a model."""
+    calls: list[Call] = []
+    compiled = estimators._compiled
+
+    def recording(*key: Any) -> Any:
+        loop, steps = compiled(*key)
+
+        def record(runs: int, *arguments: Any, scratch: Callable[[], Any]) -> None:
+            *before, estimates, innovations = arguments
+            kept = copy.deepcopy((estimates.end, innovations.end, before[-1]))
+            results = (estimates._replace(end=kept[0]), innovations._replace(end=kept[1]))
+            calls.append(Call(loop, runs, (*before[:-1], kept[2]), results, scratch))
+            loop(runs, *arguments, scratch=scratch)
+
+        return record, steps
+
+    with patch.object(estimators, "_compiled", recording):
+        for _ in replay(sources, bound, block_messages=1 << 40):
+            pass
+    return calls
+
+
+def first_use_s(bound: Sequence[Bound], sources: Sequence[Source]) -> float:
+    """CPU seconds until the loops are made of their models, compiled or loaded, and have run once."""
+    begin = process_time()
+    calls = calls_of(bound, sources)
+    taken = process_time() - begin
+    begin = process_time()
+    calls_of(bound, sources)
+    assert calls, "no filter is made of a model"
+    return taken - (process_time() - begin)

@@ -1,0 +1,152 @@
+"""The reference sheet's problem of section 5: attitude and a gyro's bias from three sensors."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import make_stream, schemas
+from recorders.log.run import RunMetadata
+from recorders.models.orientation import compose, conjugate, from_rotation_vector, rotate
+from recorders.recording import Recording
+from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.sources import MemorySource, memory_source
+
+Floats = NDArray[np.float64]
+STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {
+    f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"
+}
+EPOCH_NS = 10**9
+STEP_S = 0.02
+
+
+class AttitudeParameters(ModelParameters):
+    """Noise of the gyro and its bias, and of the two vectors that are measured."""
+
+    gyro_density: float = 0.01
+    bias_density: float = 0.001
+    sigma_force: float = 0.3
+    sigma_field: float = 0.05
+
+
+def product(p: Any, q: Any) -> Any:
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    """Q exp((g - b) dt): cos and sinc of the half angle as functions that are smooth at zero."""
+    x = 0.5 * duration_s * (control[0] - state[4])
+    y = 0.5 * duration_s * (control[1] - state[5])
+    z = 0.5 * duration_s * (control[2] - state[6])
+    half = np.sqrt(x * x + y * y + z * z)
+    ratio = np.sinc(half / np.pi)
+    turned = product(state, (np.cos(half), ratio * x, ratio * y, ratio * z))
+    return (turned[0], turned[1], turned[2], turned[3], state[4], state[5], state[6])
+
+
+def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+    gyro, bias = parameters.gyro_density**2 * duration_s, parameters.bias_density**2 * duration_s
+    return gyro, gyro, gyro, bias, bias, bias
+
+
+def seen(state: Any, vector: Any) -> Any:
+    """R(q)'v."""
+    w, x, y, z = state[0], state[1], state[2], state[3]
+    a, b, c = vector
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
+
+
+def feel(state: Any, about: Any, parameters: Any) -> Any:
+    return seen(state, (0.0, 0.0, 9.81))
+
+
+def point(state: Any, about: Any, parameters: Any) -> Any:
+    return seen(state, (0.5, 0.0, -0.4))
+
+
+def feel_noise(parameters: Any) -> Any:
+    return parameters.sigma_force**2, parameters.sigma_force**2, parameters.sigma_force**2
+
+
+def point_noise(parameters: Any) -> Any:
+    return parameters.sigma_field**2, parameters.sigma_field**2, parameters.sigma_field**2
+
+
+def _vector(topic: str, names: str, measure: Any, variance: Any) -> Sensor:
+    return Sensor(
+        topic,
+        schemas.VECTOR_MEASUREMENT,
+        {f"{names}_{axis}": "linear" for axis in "xyz"},
+        measure,
+        variance,
+        read=lambda stream: stream["value"],
+    )
+
+
+ATTITUDE = Model(
+    "attitude from a gyro, an accelerometer and a magnetometer",
+    STATE,
+    AttitudeParameters,
+    (_vector("force", "force", feel, feel_noise), _vector("field", "field", point, point_noise)),
+    Motion(move, noise),
+    control=Control(
+        "gyro",
+        schemas.VECTOR_MEASUREMENT,
+        ("x_radps", "y_radps", "z_radps"),
+        read=lambda stream: stream["value"],
+    ),
+)
+
+
+def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
+    """The log, the true states after every step, and what the gyro said."""
+    rng = np.random.default_rng(seed)
+    start = np.array([0.3] * 3 + [0.02] * 3) * rng.standard_normal(6)
+    q, bias = from_rotation_vector(start[:3]), start[3:]
+    gyro, force, field, truth = [], [], [], []
+    for k in range(500):
+        t = k * STEP_S
+        rate = np.array([0.5 * np.sin(0.7 * t), 0.4 * np.cos(0.5 * t), 0.3])
+        gyro.append(rate + bias + 0.01 / np.sqrt(STEP_S) * rng.standard_normal(3))
+        bias = bias + 0.001 * np.sqrt(STEP_S) * rng.standard_normal(3)
+        q = compose(q, from_rotation_vector(rate * STEP_S))
+        if (k + 1) % 5 == 0:
+            up = rotate(conjugate(q), np.array([0.0, 0.0, 9.81]))
+            force.append((k + 1, up + 0.3 * rng.standard_normal(3)))
+        if (k + 1) % 10 == 0:
+            north = rotate(conjugate(q), np.array([0.5, 0.0, -0.4]))
+            field.append((k + 1, north + 0.05 * rng.standard_normal(3)))
+        truth.append(np.append(q, bias))
+    step_ns = 20_000_000
+    metadata = {"components": ",".join(STATE), "kinds": ",".join(STATE.values())}
+    prior = np.diag([0.3**2] * 3 + [0.02**2] * 3)
+
+    def vectors(topic: str, steps: Any, values: Any) -> Any:
+        stamps = EPOCH_NS + step_ns * np.array(steps)
+        return make_stream(topic, schemas.VECTOR_MEASUREMENT, stamps, value=np.array(values))
+
+    streams = [
+        make_stream(
+            "/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            [EPOCH_NS],
+            metadata=metadata,
+            mean=[[1.0, 0, 0, 0, 0, 0, 0]],
+            covariance=prior.reshape(1, 36),
+        ),
+        vectors("/gyro", np.arange(500), gyro),
+        vectors("/force", *zip(*force, strict=True)),
+        vectors("/field", *zip(*field, strict=True)),
+    ]
+    run = RunMetadata(scenario="attitude", parameters={}, seed=seed, run=0, epoch_ns=EPOCH_NS)
+    states = np.array(truth)
+    return memory_source(Recording(streams), run), states, np.array(gyro)

@@ -1,0 +1,81 @@
+"""Every filled cell of the table of models and methods: it replays logs, and is consistent.
+
+A new model comes here with logs of its own: the table is what is registered.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.ensemble import record_ensemble, replay_ensemble
+from replay.inference.estimators import registered_models
+from replay.inference.methods import METHODS
+from replay.sources import MemorySource
+from tests.replay.inference.wheel import make_wheel
+
+RUNS = 30
+# What simulates logs of a model, near linear where that can be: scenario, parameters.
+SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+    # the prior is wrong by a standard deviation, along what the sum of the pressures does not tell
+    "batch-reactor": ("batch-reactor", {"prior_mean": [2.9, 1.1], "prior_variance": 0.01}),
+    "extended-target": ("extended-target", {}),
+    "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
+    "vehicle": ("vehicles", {"duration_s": 30.0, "stochastic": True}),
+}
+# Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
+NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
+CELLS = [
+    (name, method)
+    for name, model in registered_models().items()
+    for method, each in METHODS.items()
+    if not each.lacks(model)
+]
+
+
+@cache
+def sources(model: str) -> Sequence[MemorySource]:
+    scenario, parameters = SCENARIOS[model]
+    return record_ensemble(scenario, parameters, 3, RUNS)
+
+
+def nees(model: str, method: str, **settings: Any) -> tuple[float, float]:
+    """Mean over steps and runs per component, and its standard error over the runs."""
+    replayed = replay_ensemble(sources(model), {method: {"model": model, **settings}}, gap_limit_s=0.2)
+    assert not replayed.failures
+    assert replayed.errors
+    means = []
+    for errors in replayed.errors:
+        size = len(errors.components)
+        for run in range(RUNS):
+            own = errors.nees[errors.run == run]
+            assert len(own) > 10
+            assert np.isfinite(own).all()
+            means.append(own.mean() / size)
+    return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
+
+
+@pytest.mark.parametrize(("model", "method"), CELLS)
+def test_every_cell_is_consistent(model: str, method: str) -> None:
+    """The mean NEES per component is 1 within 4 standard errors where the model is near linear."""
+    mean, error = nees(model, method)
+    if model in NEAR_LINEAR:
+        assert abs(mean - 1) < 4 * error
+
+
+def test_wrong_noise_is_not_consistent() -> None:
+    """What the test above can tell: sigmas of half their size, and of twice."""
+    for factor, sign in ((0.5, 1), (2.0, -1)):
+        mean, error = nees("robot", "ekf", sigma_range_m=0.1 * factor, sigma_bearing_rad=0.02 * factor)
+        assert sign * (mean - 1) > 4 * error
+
+
+def test_a_sensor_whose_linearisation_is_singular_has_no_extended_filter() -> None:
+    """A point and its square: an innovation covariance of rank two of four, at every state."""
+    model = registered_models()["extended-target"]
+    for method in ("ekf", "iekf"):
+        assert METHODS[method].lacks(model) == "a regular linearisation of its sensor surface_point"
+    assert ("extended-target", "ukf") in CELLS
+    assert METHODS["ekf"].lacks(make_wheel()) == ""

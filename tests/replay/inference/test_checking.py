@@ -1,0 +1,180 @@
+"""The checks of a model for who writes one: right ones pass, every wrong one is found and named."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorders.errors import BadInput
+from replay.inference.checking import check_model
+from replay.inference.estimators import registered_models
+from replay.inference.model import Model, Motion
+from tests.replay.inference import attitude, vehicle_a
+from tests.replay.inference.attitude import ATTITUDE
+from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
+from tests.replay.inference.wheel import make_wheel
+
+MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "wheel": make_wheel()}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_right_models_pass(name: str) -> None:
+    """All that are registered, and those of the tests: angles, an axis, a quaternion, all noises."""
+    check_model(MODELS[name])
+    check_model(MODELS[name], seed=5)
+
+
+def by_hand(
+    state: Any, control: Any, duration_s: Any, parameters: Any, by_state: Any, by_control: Any
+) -> None:
+    _, _, heading, speed, turn = state
+    half, T = 0.5 * turn * duration_s, duration_s
+    chord, c, s = np.sinc(half / np.pi), np.cos(heading + half), np.sin(heading + half)
+    slope = 0.5 * T * (np.cos(half) - chord) / half  # of sinc by the turn
+    by_state[:] = np.eye(5)
+    by_state[0, 2:] = (
+        -speed * T * chord * s,
+        T * chord * c,
+        speed * T * (slope * c - chord * s * 0.5 * T),
+    )
+    by_state[1, 2:] = speed * T * chord * c, T * chord * s, speed * T * (slope * s + chord * c * 0.5 * T)
+    by_state[2, 4] = T
+
+
+def by_a_wrong_hand(*arguments: Any) -> None:
+    by_hand(*arguments)
+    arguments[4][1, 3] *= -1.0
+
+
+def test_a_jacobian_by_hand_is_compared() -> None:
+    motion = replace(VEHICLE_A.motion, jacobians=by_hand)
+    check_model(replace(VEHICLE_A, motion=motion))
+    wrong = replace(VEHICLE_A.motion, jacobians=by_a_wrong_hand)
+    with pytest.raises(AssertionError, match=r"move \(vehicle_a.py, line \d+\): .* of y_m by speed_mps"):
+        check_model(replace(VEHICLE_A, motion=wrong))
+
+
+def rows_by_hand(state: Any, about: Any, parameters: Any, rows: Any) -> None:
+    rows[:] = 0.0
+    rows[0, 4] = 1.0  # the turn rate, where the speed is
+
+
+def half_wrapped(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    x, y, heading, speed, turn = vehicle_a.move(state, control, duration_s, parameters)
+    return x, y, heading - 2 * np.pi * np.round(heading / (2 * np.pi)), speed, turn
+
+
+def as_if_linear(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    x, y, heading, speed, turn = state
+    return x + heading * duration_s, y, heading, speed, turn
+
+
+def growing(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    return (*(1.001 * part for part in state[:4]), *state[4:])
+
+
+def by_math(state: Any, about: Any, parameters: Any) -> Any:
+    return (math.sqrt(abs(state[3])),)
+
+
+def squared(state: Any, about: Any, parameters: Any) -> Any:
+    return (state[3] * state[3],)
+
+
+def first_of_quaternion(state: Any, about: Any, parameters: Any) -> Any:
+    return state[0], state[1], state[2]
+
+
+def pair(state: Any, about: Any, parameters: Any) -> Any:
+    return state[3], state[3]
+
+
+def negative(parameters: Any) -> Any:
+    return (-(parameters.sigma_speed_mps**2),)
+
+
+def indefinite(state: Any, duration_s: Any, parameters: Any) -> Any:
+    return (1.0, 2.0, 1.0, *(0.0, 0.0, 1.0), *(0.0,) * 3, 1.0, *(0.0,) * 4, 1.0)
+
+
+def with_speed(**changes: Any) -> Model:
+    return replace(VEHICLE_A, sensors=(RANGE_BEARING, replace(SPEED, **changes)))
+
+
+def moving(function: Any, **changes: Any) -> Model:
+    return replace(VEHICLE_A, motion=Motion(function, vehicle_a.noise), **changes)
+
+
+LINEAR_HEADING = {**vehicle_a.STATE, "heading_rad": "linear"}
+LINEAR_BEARING = replace(RANGE_BEARING, measured={"range_m": "linear", "bearing_rad": "linear"})
+COMPASS = (replace(ATTITUDE.sensors[0], measure=first_of_quaternion),)
+WRONG: dict[str, tuple[Model, str]] = {
+    "a Jacobian of a sensor": (with_speed(jacobian=rows_by_hand), "read_speed .* as written by hand"),
+    "a measured angle declared linear": (
+        replace(VEHICLE_A, sensors=(LINEAR_BEARING,)),
+        "see .*bearing_rad is declared linear, but jumps by a full turn",
+    ),
+    "a state's angle declared linear": (
+        replace(VEHICLE_A, state=LINEAR_HEADING),
+        "heading_rad is declared linear, but nothing changes when it is a full turn on",
+    ),
+    "a state's angle declared linear, wrapped by its motion": (
+        moving(half_wrapped, state=LINEAR_HEADING),
+        "half_wrapped .*heading_rad is declared linear, but jumps",
+    ),
+    "a number declared an angle": (
+        moving(as_if_linear),
+        "as_if_linear .*heading_rad is of kind angle, but x_m is another a full turn on",
+    ),
+    "a quaternion with a sign": (
+        replace(ATTITUDE, sensors=COMPASS),
+        "orientation_w is of kind quaternion, but force_x is another at its negative",
+    ),
+    "a quaternion that grows": (
+        replace(ATTITUDE, motion=Motion(growing, attitude.noise)),
+        "orientation_w and its neighbours .*length 1.001",
+    ),
+    "a square declared linear": (
+        with_speed(measure=squared),
+        "squared .* declared linear, but the derivative of speed_mps by speed_mps changes",
+    ),
+    "an arc declared linear": (
+        replace(VEHICLE_A, motion=replace(VEHICLE_A.motion, linear=True)),
+        "move .* declared linear",
+    ),
+    "no derivative": (with_speed(measure=by_math), "by_math .* no derivatives by jets"),
+    "too many components": (with_speed(measure=pair), "pair .* returns 2 components; 1 are needed"),
+    "a negative variance": (with_speed(noise=negative), "negative .* gives a negative variance, -0.01"),
+    "an indefinite covariance": (
+        replace(VEHICLE_A, motion=Motion(vehicle_a.move, indefinite)),
+        "indefinite .* gives a negative variance, -1",
+    ),
+    "a kind that does not exist": (
+        replace(VEHICLE_A, state={**vehicle_a.STATE, "x_m": "metres"}),
+        "known are linear",
+    ),
+    "a wrong mode": (
+        replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),
+        "as_if_linear .*heading_rad is of kind angle",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_models_are_found(case: str) -> None:
+    model, words = WRONG[case]
+    for seed in (0, 1):
+        with pytest.raises(AssertionError, match=words) as caught:
+            check_model(model, seed=seed)
+        assert "\n" not in str(caught.value)
+
+
+def test_states_and_parameters_may_be_given() -> None:
+    """Where a model is used; here a number is an angle only beyond what is tried at random."""
+    with pytest.raises(AssertionError, match="negative"):
+        check_model(with_speed(noise=negative), {"sigma_speed_mps": 2.0})
+    with pytest.raises(BadInput, match="no parameter 'sigma'"):
+        check_model(VEHICLE_A, {"sigma": 2.0})
+    check_model(VEHICLE_A, states=[[0.0, 0.0, np.pi, 0.0, 0.0]])  # no speed, no turn, at the cut
