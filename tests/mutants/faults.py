@@ -628,8 +628,8 @@ FAULTS = [
     ),
     Fault(
         "replay/engine.py",
-        "and len(times_ns) and times_ns[0] < source.start_ns:",
-        "and len(times_ns) and times_ns[0] > source.start_ns:",
+        "if len(times_ns) and times_ns[0] < source.start_ns:",
+        "if len(times_ns) and times_ns[0] > source.start_ns:",
         SPANS,
     ),
     # what is written over, and how

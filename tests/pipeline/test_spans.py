@@ -151,22 +151,27 @@ def test_the_truth_starts_a_filter_as_exactly_as_is_stated(run_log: Path, fuselo
 
 
 def test_a_filter_goes_on_from_its_own_estimate_as_if_it_had_never_stopped(fuselog: Fuselog) -> None:
-    """Each of five Kalman filters, from the estimate before the start: to the last bit."""
+    """Each of five Kalman filters, from the estimate before the start: to the last bit.
+
+    An estimate at the start itself holds what is replayed again, and is not the one to start from.
+    """
     assert fuselog("record", "vehicles", "--set", "duration_s=30", "-o", "log.mcap").code == 0
     every = ["replay", "log.mcap", "-e", "vehicle-kalman"]
     assert fuselog(*every, "-o", "whole.mcap").code == 0
     assert fuselog(*every, "--end", "12", "-o", "before.mcap").code == 0
-    later = ["--start", "12", "--start-from", "before.mcap", "-o", "after.mcap"]
-    assert fuselog(*every, *later).code == 0
-    for vehicle in range(1, 6):
-        topic = f"/estimates/vehicle-kalman/vehicle{vehicle}/state"
-        whole, before, after = (
-            read_streams(open_log(f"{name}.mcap"), [topic])[topic]
-            for name in ("whole", "before", "after")
-        )
-        assert len(before) > 10 < len(after)
-        for field in ("mean", "covariance"):
-            assert_array_equal(np.concatenate([before[field], after[field]]), whole[field])
+    for origin in ("before.mcap", "whole.mcap"):
+        later = ["--start", "12", "--start-from", origin, "-o", "after.mcap"]
+        assert fuselog(*every, *later).code == 0
+        for vehicle in range(1, 6):
+            topic = f"/estimates/vehicle-kalman/vehicle{vehicle}/state"
+            whole, before, after = (
+                read_streams(open_log(f"{name}.mcap"), [topic])[topic]
+                for name in ("whole", "before", "after")
+            )
+            assert len(before) > 10 < len(after)
+            assert after.publish_time_ns[0] == SIMULATION_EPOCH_NS + 12 * SECOND
+            for field in ("mean", "covariance"):
+                assert_array_equal(np.concatenate([before[field], after[field]]), whole[field])
 
 
 def test_a_start_by_arrival_is_compared_with_the_priors_arrival(
@@ -177,6 +182,16 @@ def test_a_start_by_arrival_is_compared_with_the_priors_arrival(
     assert fuselog(*late, "--start-from", "truth").code == 0
     first_ns = stamps_of("late.mcap")[0]
     assert WALL + 2 * SECOND <= first_ns < WALL + 2.2 * SECOND
+    swapped = [
+        replace(each, publish_time_ns=each.log_time_ns, log_time_ns=each.publish_time_ns)
+        for each in map(with_two_clocks, landmarks())
+    ]
+    write_log("swapped.mcap", swapped)
+    assert fuselog("replay", "swapped.mcap", *late[2:], "--start-from", "truth").code == 0
+    first = read_streams(open_log("late.mcap"), [POSE])[POSE].take(slice(0, 1))
+    (truth,) = [each for each in swapped if each.topic == "/robot1/truth"]
+    there = truth["state"][np.searchsorted(truth.log_time_ns, first.publish_time_ns[0])]
+    assert_allclose(first["mean"][0, :2], there[:2], atol=0.1)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge, parse_settings
-from recorders.parsing import read_toml
+from recorders.parsing import parse_json, read_toml
 
 
 class Inner(Parameters):
@@ -137,3 +137,9 @@ def test_a_file_that_no_parser_stands_is_told(tmp_path: Path) -> None:
             read_toml(path)
     path.write_text("a = " + "[" * 49 + "]" * 49 + '\nb = "' + "many words. " * 100 + '"')
     assert read_toml(path)["b"].startswith("many words. ")
+
+
+@pytest.mark.parametrize("text", ["NaN", "[-Infinity]", '{"a": 1e999}'])
+def test_what_json_has_no_number_for_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="which is no number of JSON"):
+        parse_json(text)

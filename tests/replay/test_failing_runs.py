@@ -250,6 +250,34 @@ def test_estimators_of_any_make_are_watched() -> None:
     assert sentences_of(whole["/estimates/own/failure"].stream) == ["LinAlgError: Singular matrix"]
 
 
+def test_what_else_is_said_ends_with_the_estimates() -> None:
+    """The innovation of an update whose covariance is none is not told either."""
+
+    def advance(state: int, block: Any) -> tuple[int, list[Ragged]]:
+        seen = block.streams["/bearing"]
+        time_ns, count = seen.stream.publish_time_ns, len(seen)
+        own = make_stream(
+            "/estimates/own/state",
+            schemas.GAUSSIAN_ESTIMATE,
+            time_ns,
+            metadata={"components": "a_m", "kinds": "linear", "truth": ""},
+            mean=np.zeros((count, 1)),
+            covariance=1.0 - 2.0 * (seen["target_id"][:, None] == INDEFINITE),
+        )
+        beside = make_stream(
+            "/estimates/own/solution",
+            schemas.SOLUTION,
+            time_ns,
+            **{name: np.ones(count, np.int64) for name in ("iterations", "converged", "rank", "cost")},
+        )
+        return state, [Ragged(own, seen.offsets), Ragged(beside, seen.offsets)]
+
+    bound = Recursive("own", ("/bearing",), (), len, advance)
+    out = collect(replay([make_run(), make_run(INDEFINITE)], [bound]))
+    for leaf in ("state", "solution"):
+        assert np.diff(out[f"/estimates/own/{leaf}"].offsets).tolist() == [COUNT, AT]
+
+
 def test_reasons_may_hold_anything_and_are_merged() -> None:
     parts = [
         failure_stream("/f", [Failure(1, "one; two"), Failure(2, 'a "quote"')]),
