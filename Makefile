@@ -19,6 +19,7 @@ test: .venv/with-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 	$(BIN)/pytest
 
 mutants: .venv/with-test

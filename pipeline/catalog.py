@@ -15,12 +15,12 @@ from recorders.parameters import build, describe
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
-from replay.engine import Estimator
+from replay.engine.estimator import Estimator
 from replay.inference.binding import needs_of
 from replay.inference.estimators import registered_models
 from replay.inference.methods import METHODS
 from replay.inference.model import Model
-from replay.metrics import Metric
+from replay.judging.metrics import Metric
 
 
 @dataclass(frozen=True)

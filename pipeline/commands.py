@@ -14,17 +14,17 @@ from pipeline.ensemble import Replayed, judge, replay_to_logs
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import plain, result_folder, write_outcome
+from pipeline.starting import Origin, from_estimates, from_truth
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
-from replay.blocks import Ragged, gather
-from replay.engine import configure, find_estimator
-from replay.metrics import Output, find_metrics, measure
-from replay.sources import LogSource
-from replay.starting import Origin, from_estimates, from_truth
+from replay.engine.blocks import Ragged, gather
+from replay.engine.estimator import configure, find_estimator
+from replay.engine.sources import LogSource
+from replay.judging.metrics import Output, find_metrics, measure
 
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
 TOLD = ("failure", "skipped", "coverage")

@@ -20,12 +20,16 @@ from typing import Any
 import numpy as np
 import psutil
 
+from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, schemas
 from recorders.recording import record_run
-from replay.blocks import Ragged
-from replay.engine import BLOCK_MESSAGES, Report, bind, collect, replay
-from replay.evaluation import (
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import bind
+from replay.engine.failures import sentences_of
+from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
+from replay.engine.sources import MemorySource, Source, memory_source
+from replay.judging.evaluation import (
     Errors,
     Innovations,
     errors_of,
@@ -34,11 +38,8 @@ from replay.evaluation import (
     split_topic,
     unjudged,
 )
-from replay.failures import sentences_of
-from replay.metrics import Output, estimated_share
-from replay.set_errors import SetErrors, set_errors
-from replay.sources import MemorySource, Source, memory_source
-from replay.starting import Origin, start_from
+from replay.judging.metrics import Output, estimated_share
+from replay.judging.set_errors import SetErrors, set_errors
 
 # Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128

@@ -16,8 +16,8 @@ from recorders.parameters import Parameters, build, describe, merge
 from recorders.parsing import read_toml
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
-from replay.engine import configure
-from replay.metrics import find_metrics
+from replay.engine.estimator import configure
+from replay.judging.metrics import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
 

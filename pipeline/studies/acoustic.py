@@ -20,8 +20,8 @@ from pipeline.studies.acoustic_cases import (
 from pipeline.studies.acoustic_claims import claims
 from pipeline.studies.acoustic_figures import figures
 from pipeline.studies.repetitions import require_spread
-from replay.consistency import component_error_squared, ellipse_area
-from replay.evaluation import chi_square_interval
+from replay.judging.consistency import component_error_squared, ellipse_area
+from replay.judging.evaluation import chi_square_interval
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:

@@ -14,13 +14,14 @@ from pipeline.studies.repetitions import Floats, by_repetition, errors_named, ro
 from recorders.models.acoustic import local_estimate_covariances, range_from_time_difference
 from recorders.parameters import Parameters, build, merge
 from recorders.simulators.acoustic import AcousticParameters
-from replay.blocks import gather
-from replay.consistency import ellipse_area, normalized_error_squared
-from replay.engine import configure
+from replay.engine.blocks import gather
+from replay.engine.covariances import normalized_error_squared
+from replay.engine.estimator import configure
+from replay.engine.sources import MemorySource
 from replay.estimators import acoustic
 from replay.estimators.acoustic import Detections
 from replay.estimators.acoustic_streams import ShooterParameters, gather_detections
-from replay.sources import MemorySource
+from replay.judging.consistency import ellipse_area
 from replay.timeline.show import show
 
 BEARINGS, LOCAL, NATIVE = "bearings-only", "local-estimates", "native-measurements"

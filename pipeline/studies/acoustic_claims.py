@@ -19,9 +19,9 @@ from pipeline.studies.acoustic_cases import (
     truth_of,
 )
 from pipeline.studies.repetitions import listed, verdict
-from replay.consistency import ellipse_area
 from replay.estimators import acoustic
-from replay.evaluation import chi_square_interval
+from replay.judging.consistency import ellipse_area
+from replay.judging.evaluation import chi_square_interval
 
 # What the paper says of each mode and scenario in figures 15-17.
 EFFICIENT = {

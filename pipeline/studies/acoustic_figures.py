@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from pipeline.studies.acoustic_cases import AcousticOptions, Case, Mode, area_ratios, range_errors_m
 from pipeline.studies.repetitions import draw_interval
-from replay.evaluation import chi_square_interval
+from replay.judging.evaluation import chi_square_interval
 from replay.timeline.plane import ellipses
 
 

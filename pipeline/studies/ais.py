@@ -1,7 +1,7 @@
 """The study of tracks of reports without identities: which vessels kept one track of their own.
 
 The identities that the log has are used to judge alone. A vessel's own track is the one that it is
-assigned when tracks and vessels are paired one to one: see `replay.tracks`.
+assigned when tracks and vessels are paired one to one: see `replay.judging.tracks`.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from pipeline.results import Claim, Outcome, judged
 from pipeline.studies.localization import replay_runs, summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.metrics import Output, find_metrics, measure
-from replay.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, track_tables
+from replay.judging.metrics import Output, find_metrics, measure
+from replay.judging.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, track_tables
 
 
 class AisOptions(Parameters):
@@ -48,7 +48,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def vessel_table(replayed: Replayed) -> pd.DataFrame:
-    """The tables of `replay.tracks.track_table` of all estimators."""
+    """The tables of `replay.judging.tracks.track_table` of all estimators."""
     tables = [
         table.assign(estimator=each.estimator)
         for each in replayed.judged

@@ -26,10 +26,10 @@ from recorders.recording import Recorder
 from recorders.registry import load
 from recorders.simulators.orientation import AxisParameters
 from replay.distributions import bingham
+from replay.engine.sources import MemorySource
 from replay.estimators.bingham import BinghamNoise, make_steps
 from replay.estimators.directional import as_bingham, as_covariance
 from replay.estimators.grid import run_axis_grid_filter
-from replay.sources import MemorySource
 
 Floats = NDArray[np.float64]
 

@@ -26,13 +26,13 @@ from pipeline.studies.biometrics_claims import (
 from pipeline.studies.localization import replay_runs, summary_table
 from recorders.models.scores import TOPIC, comparisons_of, matchers_of
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.engine import configure
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import configure
+from replay.engine.sources import MemorySource
 from replay.estimators.biometrics import LearnerParameters, subsets_of
-from replay.evaluation import split_topic
-from replay.metrics import find_metrics, measure
-from replay.sources import MemorySource
-from replay.verification import (
+from replay.judging.evaluation import split_topic
+from replay.judging.metrics import find_metrics, measure
+from replay.judging.verification import (
     FALSE_ACCEPT_RATES,
     Fused,
     bootstrap_users,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipeline.results import Claim, Verdict
-from replay.verification import relative_rate_increase
+from replay.judging.verification import relative_rate_increase
 
 Values = Mapping[str, float]
 Counts = Mapping[str, Sequence[float]]

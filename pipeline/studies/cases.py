@@ -12,7 +12,7 @@ from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.studies.localization import write_logs
 from recorders.errors import BadInput
 from recorders.parameters import merge
-from replay.evaluation import Errors
+from replay.judging.evaluation import Errors
 from replay.timeline.show import show
 
 

@@ -17,9 +17,9 @@ from pipeline.results import Claim, Outcome
 from pipeline.studies.localization import replay_runs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.evaluation import Errors
-from replay.metrics import find_metrics, measure
-from replay.sources import Source
+from replay.engine.sources import Source
+from replay.judging.evaluation import Errors
+from replay.judging.metrics import find_metrics, measure
 
 
 class InertialOptions(Parameters):

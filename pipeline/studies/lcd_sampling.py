@@ -21,10 +21,10 @@ from pipeline.results import Claim, Outcome, judged
 from recorders.log import LogWriter, RunMetadata, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.blocks import Ragged, gather
+from replay.engine.blocks import Ragged, gather
+from replay.engine.sources import MemorySource
 from replay.sampling import Samples, lcd_distance, lcd_samples, moment_corrected, parse_sampling
 from replay.sampling.samplers import unscented
-from replay.sources import MemorySource
 from replay.timeline.show import show
 
 Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]

@@ -19,8 +19,8 @@ from pipeline.experiment import Experiment, Setting
 from pipeline.studies.localization import obtain, write_logs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.blocks import Ragged, gather
-from replay.sources import MemorySource, Source
+from replay.engine.blocks import Ragged, gather
+from replay.engine.sources import MemorySource, Source
 from replay.timeline.show import show
 
 Floats = NDArray[np.float64]

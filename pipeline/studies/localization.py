@@ -23,9 +23,9 @@ from recorders.errors import BadInput, printable
 from recorders.log import LogWriter
 from recorders.parameters import merge
 from recorders.recording import import_run
-from replay.evaluation import Errors, chi_square_interval, error_table, step_table
-from replay.metrics import find_metrics, measure
-from replay.sources import MemorySource, memory_source
+from replay.engine.sources import MemorySource, memory_source
+from replay.judging.evaluation import Errors, chi_square_interval, error_table, step_table
+from replay.judging.metrics import find_metrics, measure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,17 +15,14 @@ from recorders.errors import BadInput
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters, build, merge
 from recorders.simulators.optical import OpticalParameters
-from replay.consistency import (
-    component_error_squared,
-    dilution_of_precision,
-    normalized_error_squared,
-)
-from replay.engine import configure
+from replay.engine.covariances import normalized_error_squared
+from replay.engine.estimator import configure
+from replay.engine.sources import MemorySource
 from replay.estimators import optical
 from replay.estimators.optical import Observability, Scene
 from replay.estimators.optical_streams import known_biases
-from replay.least_squares import cramer_rao_bound
-from replay.sources import MemorySource
+from replay.inference.least_squares import cramer_rao_bound
+from replay.judging.consistency import component_error_squared, dilution_of_precision
 from replay.timeline.show import show
 
 ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"

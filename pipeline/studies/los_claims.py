@@ -25,7 +25,7 @@ from pipeline.studies.repetitions import (
 )
 from recorders.models.optical import ANGLES
 from replay.estimators import optical
-from replay.evaluation import chi_square_interval
+from replay.judging.evaluation import chi_square_interval
 
 # Printed deviations follow from a condition where all are this near; rounding alone makes 0.3 %.
 SAME = 0.02

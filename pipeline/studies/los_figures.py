@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from pipeline.studies.los_cases import Case, bias_names
 from pipeline.studies.repetitions import draw_groups, draw_interval
-from replay.evaluation import chi_square_interval
+from replay.judging.evaluation import chi_square_interval
 
 
 def figures(cases: Sequence[Case], runs: int) -> dict[str, Figure]:

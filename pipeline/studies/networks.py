@@ -20,11 +20,11 @@ from pipeline.results import Claim, Outcome, judged
 from pipeline.studies.localization import replay_runs, summarise
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, merge
-from replay.blocks import gather
+from replay.engine.blocks import gather
+from replay.engine.sources import MemorySource
 from replay.estimators.covariance_intersection import fuse
 from replay.estimators.networks import ALONE, CENTRALISED, NetworkParameters, message_bytes
-from replay.evaluation import Errors
-from replay.sources import MemorySource
+from replay.judging.evaluation import Errors
 
 CI = "ci-trace"
 

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from pipeline.ensemble import Replayed
 from pipeline.results import Verdict
 from recorders.errors import BadInput
-from replay.evaluation import Errors
+from replay.judging.evaluation import Errors
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_en
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome, judged
 from pipeline.studies.localization import obtain, write_logs
-from replay.evaluation import split_topic
-from replay.set_evaluation import JudgedSets, frames_of, judge_sets
+from replay.judging.evaluation import split_topic
+from replay.judging.set_evaluation import JudgedSets, frames_of, judge_sets
 from replay.timeline.show import show
 
 EXACT, BOX, L4, L8 = "exact", "box", "l4", "l8"

@@ -25,9 +25,9 @@ from recorders.parameters import Parameters
 from recorders.simulators.headings import HeadingsParameters
 from replay.distributions import wrapped_normal
 from replay.distributions.wrapped_normal import Samples, WrappedNormal
+from replay.engine.sources import MemorySource
 from replay.estimators.grid import run_torus_grid_filter, torus_grid
 from replay.estimators.torus import make_heading_model
-from replay.sources import MemorySource
 
 Floats = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from pipeline.studies.vehicles_cases import (
 )
 from pipeline.studies.vehicles_claims import claims
 from recorders.errors import BadInput
+from replay.engine.sources import MemorySource
 from replay.estimators.vehicle_bounds import bounds, exact_total_error
-from replay.sources import MemorySource
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:

@@ -11,12 +11,12 @@ from scipy.spatial.distance import cdist
 
 from recorders.parameters import Parameters
 from recorders.simulators.vehicles import VehiclesParameters
-from replay.blocks import Ragged
+from replay.engine.blocks import Ragged
+from replay.engine.sources import Source
 from replay.estimators.vehicle_streams import vehicle_numbers
 from replay.estimators.vehicle_updates import split_method
-from replay.label_errors import assigned_squared_error, fixed_squared_error, total_error
-from replay.set_errors import CUTOFF_M, SetErrors
-from replay.sources import Source
+from replay.judging.label_errors import assigned_squared_error, fixed_squared_error, total_error
+from replay.judging.set_errors import CUTOFF_M, SetErrors
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from pipeline.results import Claim, Outcome, judged
 from pipeline.studies.vehicles_cases import scores_of
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, merge
-from replay.sources import MemorySource
+from replay.engine.sources import MemorySource
 
 # Of powers of N, no estimator here needs more than this one.
 HIGHEST_POWER = 5.0

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.models.orientation import SIGNS
-from replay.compile import compiled
 from replay.distributions.gaussian_kernels import solve_in_place
+from replay.engine.compile import compiled
 
 Vector = NDArray | tuple[float, ...]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.models.planar import Component, Components, wrap_angle
-from replay.compile import compiled
+from replay.engine.compile import compiled
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.

@@ -17,7 +17,14 @@ from recorders.models import acoustic as model
 from recorders.models.acoustic import Medium, Noise
 from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
-from replay.least_squares import Bound, Linearization, Solution, cramer_rao_bound, mask_missing, solve
+from replay.inference.least_squares import (
+    Bound,
+    Linearization,
+    Solution,
+    cramer_rao_bound,
+    mask_missing,
+    solve,
+)
 
 Array = NDArray[np.float64]
 

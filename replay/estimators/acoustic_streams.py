@@ -9,8 +9,9 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.acoustic import Medium, Noise
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.engine import Batch, Bound, Estimator
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import Batch, Bound, Estimator
+from replay.engine.measurements import PLANE, read_vectors
 from replay.estimators.acoustic import Array, Detections, Mode, Setting, estimate, parameter_names
 from replay.estimators.solutions import (
     Batches,
@@ -20,7 +21,6 @@ from replay.estimators.solutions import (
     stated,
     table_of,
 )
-from replay.measurements import PLANE, read_vectors
 
 
 class ShooterParameters(Parameters):

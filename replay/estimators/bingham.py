@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.models.orientation import require_unit
-from replay.compile import compile_over_runs
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import (
@@ -30,6 +29,7 @@ from replay.distributions.bingham_kernels import (
     weighted_outer,
 )
 from replay.distributions.gaussian_kernels import condition
+from replay.engine.compile import compile_over_runs
 
 
 class Steps(NamedTuple):
@@ -101,7 +101,7 @@ def run_bingham_filter(
         state: the distributions before the first row, batch axis (runs,).
         steps: see there.
         rotations: (rows, t, t), t = 1 or 3, filled if given: the covariances of small rotations about
-            the modes, see `replay.tangent`.
+            the modes, see `replay.engine.tangent`.
 
     Returns:
         The state after the last row, and the estimates of all rows, batch axis (rows,). Where a moment
@@ -219,7 +219,7 @@ def _kalman_run(
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:
     """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
 
-    See `replay.tangent.vector_part_covariance`.
+    See `replay.engine.tangent.vector_part_covariance`.
     """
     t = len(covariance)
     for i in range(t):

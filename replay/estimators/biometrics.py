@@ -24,8 +24,8 @@ from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
 from recorders.parameters import Parameters
-from replay.blocks import Ragged, gather
-from replay.engine import Batch, Bound, Estimator
+from replay.engine.blocks import Ragged, gather
+from replay.engine.estimator import Batch, Bound, Estimator
 from replay.estimators.mixture_hmm import Fit, fit, log_likelihood
 
 Floats = NDArray[np.float64]

@@ -21,12 +21,14 @@ from recorders.errors import BadInput
 from recorders.log import Topic
 from recorders.models.planar import drive, range_bearing
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
-from replay.compile import compile_over_runs
-from replay.engine import Bound, Estimator, Recursive
+from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import compile_over_runs
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.failures import Failure
+from replay.engine.priors import no_priors, read_priors
+from replay.engine.results import ALL_WELL, failures_by_run, failures_of, state_stream
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
 from replay.estimators.landmarks import LANDMARKS, POSE, LocalizationParameters
-from replay.failures import Failure
 from replay.inference.binding import stated
 from replay.inference.gaussian import (
     Floats,
@@ -42,8 +44,6 @@ from replay.inference.gaussian import (
 from replay.inference.generate import Input, derivative
 from replay.inference.happenings import Points, points_of
 from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
-from replay.priors import no_priors, read_priors
-from replay.results import ALL_WELL, failures_by_run, failures_of, state_stream
 
 Integers = NDArray[np.int64]
 Mode = Literal["alone", "naive", "ci", "joint"]
@@ -409,7 +409,7 @@ def run(
     criterion: Criterion,
     settings: Settings,
 ) -> tuple[State, list[Ragged]]:
-    """Filter a block; see `replay.engine.Recursive`."""
+    """Filter a block; see `replay.engine.estimator.Recursive`."""
     before, landmarks, reasons, told = state
     carried = copy.deepcopy(before)
     is_able = reasons == ""

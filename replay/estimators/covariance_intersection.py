@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
-from replay.compile import compile_over_runs
+from replay.engine.compile import compile_over_runs
 from replay.inference.gaussian import Floats, Function, cholesky
 
 Criterion = Literal["trace", "determinant"]

@@ -17,11 +17,13 @@ from recorders.log import Schema, schemas
 from recorders.parameters import Parameters
 from recorders.simulators.headings import Correlation, equal_sigmas
 from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Noise
-from replay.components import Components
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
-from replay.engine import Estimator
+from replay.engine.components import Components
+from replay.engine.estimator import Estimator
+from replay.engine.measurements import Vectors
+from replay.engine.plain import Given, Messages, Results, recursive
 from replay.estimators.bingham import (
     BinghamNoise,
     Gaussian,
@@ -37,8 +39,6 @@ from replay.estimators.torus import (
     run_toroidal_filter,
     run_unscented_filter,
 )
-from replay.measurements import Vectors
-from replay.plain import Given, Messages, Results, recursive
 
 Floats = NDArray[np.float64]
 # The states of all runs and their measurements -> the states after them; fills the results.

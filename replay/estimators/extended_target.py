@@ -13,9 +13,9 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from recorders.log import Stream, schemas
 from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_point
 from recorders.models.planar import Components
+from replay.engine.measurements import PLANE, read_vectors
 from replay.inference.gaussian import Floats
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.measurements import PLANE, read_vectors
 
 STATES = 4
 

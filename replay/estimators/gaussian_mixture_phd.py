@@ -20,15 +20,15 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
-from replay.compile import compile_over_runs
-from replay.components import Components
-from replay.engine import Bound, Estimator, Recursive
+from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import compile_over_runs
+from replay.engine.components import Components
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.measurements import PLANE, read_vectors
+from replay.engine.priors import gaussians
+from replay.engine.results import ALL_WELL, failures_of, state_stream
 from replay.inference.gaussian import cholesky
 from replay.inference.steps import FAILURES, NOT_POSITIVE_DEFINITE
-from replay.measurements import PLANE, read_vectors
-from replay.priors import gaussians
-from replay.results import ALL_WELL, failures_of, state_stream
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -475,7 +475,7 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: Settings) -> Sets:
 def run(
     state: Mixture | None, block: Block, *, settings: Settings, most: int, outputs: "Outputs"
 ) -> tuple[Mixture, list[Ragged]]:
-    """Filter a block; see `replay.engine.Recursive`."""
+    """Filter a block; see `replay.engine.estimator.Recursive`."""
     scans = scans_of(*block.streams.values())
     before = no_components(len(scans.offsets) - 1, most) if state is None else state
     after, sets = filter_scans(before, scans, settings)

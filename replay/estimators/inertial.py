@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from replay.compile import compile_over_runs, compiled
 from replay.distributions.bingham_kernels import (
     Vector,
     compose,
@@ -29,6 +28,7 @@ from replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
+from replay.engine.compile import compile_over_runs, compiled
 
 _NS = 1e-9
 

@@ -11,10 +11,10 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import schemas
 from recorders.models.planar import Components, drive, range_bearing
+from replay.engine.measurements import PLANE
+from replay.engine.tangent import Kind
 from replay.inference.estimators import modelled
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
-from replay.measurements import PLANE
-from replay.tangent import Kind
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)

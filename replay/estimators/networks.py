@@ -18,14 +18,14 @@ from recorders.errors import BadInput
 from recorders.log import Topic
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.compile import compile_over_runs
-from replay.components import components_of
-from replay.engine import Batch, Bound, Estimator
+from replay.engine.blocks import Ragged
+from replay.engine.compile import compile_over_runs
+from replay.engine.components import components_of
+from replay.engine.estimator import Batch, Bound, Estimator
+from replay.engine.priors import gaussians
+from replay.engine.results import ALL_WELL, failures_of, state_stream
 from replay.estimators.covariance_intersection import rule
 from replay.inference.gaussian import Floats, Function
-from replay.priors import gaussians
-from replay.results import ALL_WELL, failures_of, state_stream
 
 Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"

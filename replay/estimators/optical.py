@@ -22,7 +22,7 @@ from recorders.models.optical import (
 )
 from recorders.models.planar import wrap_angle
 from replay.estimators.rays import intersect_rays
-from replay.least_squares import (
+from replay.inference.least_squares import (
     Linearization,
     Solution,
     cramer_rao_bound,

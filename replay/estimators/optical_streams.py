@@ -17,8 +17,9 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.engine import Batch, Bound, Estimator
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import Batch, Bound, Estimator
+from replay.engine.measurements import check_width
 from replay.estimators.optical import Scene, estimate, parameter_names
 from replay.estimators.solutions import (
     Batches,
@@ -28,7 +29,6 @@ from replay.estimators.solutions import (
     stated,
     table_of,
 )
-from replay.measurements import check_width
 
 Array = NDArray[np.float64]
 NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/attitude"

@@ -10,8 +10,10 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import schemas
 from recorders.parameters import Parameters
-from replay.components import Components
-from replay.engine import Estimator
+from replay.engine.components import Components
+from replay.engine.estimator import Estimator
+from replay.engine.measurements import Vectors
+from replay.engine.plain import Given, Messages, Results, recursive
 from replay.estimators.inertial import (
     InertialModel,
     InertialSamples,
@@ -22,8 +24,6 @@ from replay.estimators.inertial import (
     start_inertial_filter,
     start_reckoning,
 )
-from replay.measurements import Vectors
-from replay.plain import Given, Messages, Results, recursive
 
 ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")

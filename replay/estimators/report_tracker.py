@@ -25,10 +25,10 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
-from replay.compile import compile_over_runs
-from replay.engine import Bound, Estimator, Recursive
-from replay.measurements import PLANE, read_vectors
+from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import compile_over_runs
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.measurements import PLANE, read_vectors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -424,7 +424,7 @@ def start(_: Mapping[str, Ragged]) -> None:
 def run(
     state: Tracks | None, block: Block, *, name: str, topic: str, settings: Settings
 ) -> tuple[Tracks, list[Ragged]]:
-    """Track a block; see `replay.engine.Recursive`."""
+    """Track a block; see `replay.engine.estimator.Recursive`."""
     reports = _reports(block, topic, settings)
     most = int(np.diff(reports.offsets).max(initial=0))
     runs = len(reports.offsets) - 1

@@ -18,8 +18,9 @@ from recorders.errors import BadInput
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
-from replay.blocks import Ragged
-from replay.engine import Batch, Bound, Estimator
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import Batch, Bound, Estimator
+from replay.engine.measurements import PLANE, read_vectors
 from replay.estimators.feasible_sets import (
     Arena,
     Floats,
@@ -32,7 +33,6 @@ from replay.estimators.feasible_sets import (
     to_blame,
 )
 from replay.estimators.pseudo_ellipsoids import Weighting, fit, outline
-from replay.measurements import PLANE, read_vectors
 
 LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
@@ -165,7 +165,7 @@ def solve(
     known: Known,
     parameters: SetParameters,
 ) -> list[Ragged]:
-    """A set for every frame of every run; see `replay.engine.Batch`."""
+    """A set for every frame of every run; see `replay.engine.estimator.Batch`."""
     sets, sizes, faults = _Rows(), _Rows(), _Rows()
     landmarks, seen = whole["/landmarks"], whole[topic]
     for run in range(seen.runs):

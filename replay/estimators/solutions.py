@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
-from replay.blocks import Ragged
-from replay.components import components_of
-from replay.failures import reason_stream
-from replay.least_squares import SENTENCES, Solution
-from replay.results import state_stream
+from replay.engine.blocks import Ragged
+from replay.engine.components import components_of
+from replay.engine.failures import reason_stream
+from replay.engine.results import state_stream
+from replay.inference.least_squares import SENTENCES, Solution
 
 
 class Batches(NamedTuple):

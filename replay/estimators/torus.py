@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from recorders.errors import BadInput
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
-from replay.compile import compile_over_runs
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import (
     WrappedNormal,
@@ -25,6 +24,7 @@ from replay.distributions.wrapped_normal import (
     require_central_weight,
 )
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+from replay.engine.compile import compile_over_runs
 
 
 class HeadingModel(NamedTuple):

@@ -12,9 +12,9 @@ from recorders.log import schemas
 from recorders.models.planar import Components
 from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import noise_moments, turn
+from replay.engine.measurements import PLANE
 from replay.inference.estimators import modelled
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.measurements import PLANE
 
 
 class VehicleParameters(ModelParameters):

@@ -20,8 +20,8 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic
 from recorders.models.vehicles import turn
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
-from replay.engine import Bound, Estimator, Recursive
+from replay.engine.blocks import Block, Ragged
+from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.estimators.vehicle_association import (
     all_maps,
     log_likelihoods,
@@ -122,7 +122,7 @@ def _start(setup: Setup, method: Method, whole: Mapping[str, Ragged]) -> Cloud:
 
 
 def _run(setup: Setup, method: Method, before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
-    """Filter a block; see `replay.engine.Recursive`."""
+    """Filter a block; see `replay.engine.estimator.Recursive`."""
     cloud = copy.deepcopy(before)
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape

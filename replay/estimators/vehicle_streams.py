@@ -18,9 +18,13 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
-from replay.blocks import Block, Ragged
-from replay.components import Components, components_of
-from replay.engine import Bound, Estimator, Recursive
+from replay.engine.blocks import Block, Ragged
+from replay.engine.components import Components, components_of
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.failures import Failure, reason_stream
+from replay.engine.measurements import PLANE, read_fixes, read_vectors
+from replay.engine.priors import gaussians
+from replay.engine.results import failures_by_run, innovation_stream, state_stream
 from replay.estimators.vehicle_association import MISSED, Scanning
 from replay.estimators.vehicle_updates import (
     FIXES,
@@ -36,10 +40,6 @@ from replay.estimators.vehicle_updates import (
     where,
 )
 from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
-from replay.failures import Failure, reason_stream
-from replay.measurements import PLANE, read_fixes, read_vectors
-from replay.priors import gaussians
-from replay.results import failures_by_run, innovation_stream, state_stream
 
 Booleans = NDArray[np.bool_]
 
@@ -208,7 +208,7 @@ def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
 
 
 def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Ragged]]:
-    """Filter a block; see `replay.engine.Recursive`."""
+    """Filter a block; see `replay.engine.estimator.Recursive`."""
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
     before = carried.failed

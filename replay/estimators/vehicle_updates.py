@@ -9,6 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.estimators.symmetric_sums import (
+    power_sums,
+    power_sums_at,
+    product_sums,
+    product_sums_at,
+    update_root,
+)
 from replay.estimators.vehicle_association import (
     MISSED,
     Hypotheses,
@@ -33,13 +40,6 @@ from replay.estimators.vehicles import (
     update,
     update_by_scalar,
     update_by_shape,
-)
-from replay.symmetric_sums import (
-    power_sums,
-    power_sums_at,
-    product_sums,
-    product_sums_at,
-    update_root,
 )
 
 Booleans = NDArray[np.bool_]

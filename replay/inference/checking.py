@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
 from recorders.parameters import build
+from replay.engine.tangent import WIDTHS, tangent_components
 from replay.inference.binding import number_fields, settings_type
 from replay.inference.generate import (
     Input,
@@ -33,7 +34,6 @@ from replay.inference.model import (
     check_sensor,
     check_state,
 )
-from replay.tangent import WIDTHS, tangent_components
 
 Floats = NDArray[np.float64]
 

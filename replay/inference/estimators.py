@@ -16,10 +16,12 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters, build
 from recorders.registry import available, load
-from replay.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
-from replay.compile import compile_over_runs
-from replay.engine import Bound, Estimator, Recursive
-from replay.failures import reason_stream
+from replay.engine.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
+from replay.engine.compile import compile_over_runs
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.failures import reason_stream
+from replay.engine.priors import gaussians
+from replay.engine.results import ALL_WELL, failures_of, innovation_stream, state_stream
 from replay.inference.binding import (
     Found,
     complaint_of,
@@ -46,8 +48,6 @@ from replay.inference.methods import METHODS, Method
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
-from replay.priors import gaussians
-from replay.results import ALL_WELL, failures_of, innovation_stream, state_stream
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
@@ -230,7 +230,7 @@ def _samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler
 
 @dataclass(frozen=True)
 class Filter:
-    """One bound filter; `start`, `run` and `finish` are what `replay.engine.Recursive` asks for.
+    """One bound filter: the `start`, `run` and `finish` of a `replay.engine.estimator.Recursive`.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.

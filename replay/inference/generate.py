@@ -3,10 +3,10 @@
 A model is component-first: its functions take and return tuples. numba cannot build a tuple in a loop,
 and constants fold only where they stand in the text: constant seeds make jets three times as fast. So
 the few pieces between arrays and tuples are written as text for the sizes and kinds at hand. Their
-source stays available, so that `replay.compile` bundles them as it does any other function.
+source stays available, so that `replay.engine.compile` bundles them as it does any other function.
 
-Kinds and tangent space as in `replay.tangent`: a quaternion q (Hamilton, w x y z) plus a rotation vector
-d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i angle).
+Kinds and tangent space as in `replay.engine.tangent`: a quaternion q (Hamilton, w x y z) plus a rotation
+vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i angle).
 Hertzberg et al., Information Fusion 14, 2013; Sola, arXiv 1711.02508.
 """
 
@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.models.planar import wrap_angle
+from replay.engine.tangent import WIDTHS
 from replay.inference.jets import jet, slope_of, value_of
-from replay.tangent import WIDTHS
 
 Function = Callable[..., Any]
 TANGENT = {"linear": 1, "angle": 1, "axis": 1, "quaternion": 3}

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Stream
-from replay.blocks import Block, Ragged, ragged_rows
+from replay.engine.blocks import Block, Ragged, ragged_rows
+from replay.engine.measurements import read_fixes, read_vectors
 from replay.inference.binding import Found, number_fields, reading_settings
 from replay.inference.model import Control, Map, Sensor
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
 from replay.inference.steps import Stage, reading
-from replay.measurements import read_fixes, read_vectors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

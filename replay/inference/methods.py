@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt, PositiveFloat
 
 from recorders.parameters import Parameters
+from replay.engine.results import ALL_WELL
 from replay.inference.binding import number_fields, settings_type
 from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
 from replay.inference.generate import is_flat, resetting, retraction, tuple_of
@@ -39,7 +40,6 @@ from replay.inference.steps import (
     sensor_derivative,
     workspace,
 )
-from replay.results import ALL_WELL
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 

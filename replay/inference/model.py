@@ -17,9 +17,9 @@ from pydantic import Field
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream
 from recorders.parameters import Parameters
-from replay.components import Components
+from replay.engine.components import Components
+from replay.engine.tangent import are_kinds
 from replay.inference.generate import tangent_size
-from replay.tangent import are_kinds
 
 Function = Callable[..., Any]
 Floats = NDArray[np.float64]

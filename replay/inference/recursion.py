@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
 from replay.inference.steps import (
     NOT_FINITE,
@@ -20,7 +21,6 @@ from replay.inference.steps import (
     Stage,
     Steps,
 )
-from replay.results import ALL_WELL
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -87,7 +87,7 @@ class Innovations(NamedTuple):
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """The loop over the events of one run, for `replay.compile.compile_over_runs`.
+    """The loop over the events of one run, for `replay.engine.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
     """

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from replay.engine.results import ALL_WELL
 from replay.inference.gaussian import (
     LOG_TWO_PI,
     Innovation,
@@ -36,7 +37,6 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
-from replay.results import ALL_WELL
 
 Floats = NDArray[np.float64]
 Function = Callable[..., Any]

@@ -7,10 +7,10 @@ import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
 from recorders.models.acoustic import Medium, sensor_components
-from replay.blocks import gather
+from replay.engine.blocks import gather
 from replay.estimators.acoustic_streams import gather_detections
 from replay.estimators.solutions import sensor_numbers
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
 from replay.timeline.events import draw_events
 from replay.timeline.plane import (

@@ -11,13 +11,13 @@ from matplotlib.colors import hsv_to_rgb
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
-from replay.blocks import gather
-from replay.evaluation import Floats
-from replay.metrics import Output
+from replay.engine.blocks import gather
+from replay.judging.evaluation import Floats
+from replay.judging.metrics import Output
+from replay.judging.tracks import live_counts, track_tables
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, escaped, thin
 from replay.timeline.plane import ROOT, plane_view, trail_of, turn_up
 from replay.timeline.plots import LINE, plot_view
-from replay.tracks import live_counts, track_tables
 
 REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
 TRAIL_S = 300.0

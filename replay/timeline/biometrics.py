@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from recorders.log import Stream, schemas
 from recorders.models.scores import TOPIC, matchers_of
 from replay.estimators.biometrics import subsets_of
+from replay.judging.verification import Floats, Fused, fused_of
 from replay.timeline.canvas import (
     PALETTE,
     WRONG,
@@ -21,7 +22,6 @@ from replay.timeline.canvas import (
     escaped,
 )
 from replay.timeline.plots import LINE, POINTS, plot_view
-from replay.verification import Floats, Fused, fused_of
 
 GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
 BINS = 60

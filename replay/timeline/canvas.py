@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
-from replay.evaluation import Errors, split_topic
-from replay.sources import Source
+from replay.engine.sources import Source
+from replay.judging.evaluation import Errors, split_topic
 
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]

@@ -17,7 +17,7 @@ from recorders.log import Stream, schemas
 from replay.distributions import bingham, wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal
 from replay.estimators.grid import torus_grid
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
     Canvas,

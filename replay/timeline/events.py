@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
-from replay.failures import sentences_of
+from replay.engine.failures import sentences_of
 from replay.timeline.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
 
 NOT_SENSED = frozenset(

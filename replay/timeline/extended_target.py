@@ -4,7 +4,7 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, WRONG, Canvas, Scene, Timeline, beside
 from replay.timeline.events import draw_events
 from replay.timeline.plane import ROOT, Stroke, draw_dots, draw_outlines, plane_view, turn_up

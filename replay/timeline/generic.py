@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     PALETTE,
     TRUTH,

@@ -9,7 +9,7 @@ import pandas as pd
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
     WRONG,

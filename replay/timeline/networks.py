@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
-from replay.evaluation import Errors, split_topic
+from replay.judging.evaluation import Errors, split_topic
 from replay.timeline.canvas import (
     MUTED,
     TRUTH,

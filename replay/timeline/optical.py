@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from recorders.log import Stream, schemas
 from recorders.models.optical import bias_components, direction
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, WRONG, Canvas, Colour, Scene, Timeline, Times, beside, nice
 from replay.timeline.events import draw_events
 from replay.timeline.plots import draw_quality_in_tabs

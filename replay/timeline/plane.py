@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.stats import chi2
 
-from replay.evaluation import Floats
+from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
     Canvas,

@@ -13,8 +13,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import schemas
-from replay.blocks import gather
-from replay.evaluation import Errors, Floats, chi_square_interval, innovations_of
+from replay.engine.blocks import gather
+from replay.judging.evaluation import Errors, Floats, chi_square_interval, innovations_of
 from replay.timeline.canvas import (
     MUTED,
     TRUTH,

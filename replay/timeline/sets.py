@@ -10,8 +10,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import schemas
-from replay.evaluation import Floats
-from replay.set_evaluation import areas_of, frames_of
+from replay.judging.evaluation import Floats
+from replay.judging.set_evaluation import areas_of, frames_of
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, beside, draw_cases, entity_path
 from replay.timeline.events import draw_events
 from replay.timeline.plane import (

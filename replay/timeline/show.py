@@ -11,9 +11,9 @@ import rerun.blueprint as rrb
 
 from recorders.errors import BadInput, choices, printable
 from recorders.registry import available, load
-from replay.blocks import Ragged, gather
-from replay.evaluation import Errors
-from replay.sources import Source
+from replay.engine.blocks import Ragged, gather
+from replay.engine.sources import Source
+from replay.judging.evaluation import Errors
 from replay.timeline.canvas import Canvas, Scene, Timeline
 from replay.timeline.generic import TIMELINE as GENERIC
 from replay.timeline.sinks import open_recording

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from recorders.models.vehicles import out_of_frame
-from replay.blocks import gather
-from replay.evaluation import Floats
-from replay.label_errors import assigned_squared_error, fixed_squared_error
-from replay.set_errors import CUTOFF_M, set_errors
+from replay.engine.blocks import gather
+from replay.judging.evaluation import Floats
+from replay.judging.label_errors import assigned_squared_error, fixed_squared_error
+from replay.judging.set_errors import CUTOFF_M, set_errors
 from replay.timeline.canvas import (
     MUTED,
     TRUTH,

@@ -27,7 +27,8 @@ from stonesoup.updater.kalman import KalmanUpdater
 
 from pipeline.ensemble import record_ensemble
 from recorders.models.reactor import react
-from replay.engine import bind, collect, replay
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
 from replay.sampling import Samples, parse_sampling
 from tests.bench.reference.reactor import compiled_c
 

@@ -22,8 +22,9 @@ from recorders.simulators.headings import equal_sigmas
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
-from replay.engine import bind, collect, replay
-from replay.sources import MemorySource, memory_source
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import MemorySource, memory_source
 from tests.bench.loops import Call, calls_of
 from tests.bench.reference import bingham as bingham_reference
 from tests.bench.reference import inertial, landmarks, reactor, torus, vehicles

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from pipeline.ensemble import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.blocks import gather
+from replay.engine.blocks import gather
 from replay.estimators.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
@@ -23,9 +23,9 @@ from replay.estimators.gaussian_mixture_phd import (
     settings_of,
     start,
 )
-from replay.set_distances import gospa
-from replay.set_errors import CUTOFF_M, set_errors
-from tests.replay.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
+from replay.judging.set_distances import gospa
+from replay.judging.set_errors import CUTOFF_M, set_errors
+from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS = 6
 REPEATS = 5

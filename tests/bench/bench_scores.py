@@ -4,7 +4,7 @@ import numpy as np
 from sklearn.metrics import roc_curve
 
 from replay.estimators.biometrics import RULES, normalise
-from replay.verification import Floats, genuine_accept_at, roc
+from replay.judging.verification import Floats, genuine_accept_at, roc
 from tests.bench.timing import median_seconds
 
 USERS, MATCHERS = 517, 4

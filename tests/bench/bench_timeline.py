@@ -9,9 +9,10 @@ import rerun as rr
 import rerun.chunk as rc
 
 from recorders.recording import record_run
-from replay.engine import bind, collect, replay
-from replay.evaluation import errors_of, gaussian_estimates
-from replay.sources import memory_source
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import memory_source
+from replay.judging.evaluation import errors_of, gaussian_estimates
 from replay.timeline.show import show
 
 SCENARIO = {"duration_s": 250.0, "range_bearing": {"rate_hz": 5.0, "outlier_probability": 0.02}}

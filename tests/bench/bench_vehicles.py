@@ -20,8 +20,9 @@ from stonesoup.updater.kalman import KalmanUpdater
 
 from pipeline.ensemble import record_ensemble
 from recorders.models.vehicles import noise_moments, turn
-from replay.engine import bind, collect, replay
-from replay.sources import MemorySource
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import MemorySource
 
 RUNS = 200
 REPEATS = 5

@@ -9,11 +9,12 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.blocks import filled_rows
-from replay.engine import Bound, replay
+from replay.engine.blocks import filled_rows
+from replay.engine.estimator import Bound
+from replay.engine.replaying import replay
+from replay.engine.sources import Source
 from replay.inference import estimators
 from replay.inference.recursion import Estimates, Innovations
-from replay.sources import Source
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.experiment import Experiment, load_experiment, load_scenario, shipped
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
-from replay.sources import MemorySource, memory_source
+from replay.engine.sources import MemorySource, memory_source
 
 # Of each importer: what to give it in the folder of real data, and the archive that this is in.
 DATA = {

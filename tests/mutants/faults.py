@@ -31,12 +31,12 @@ VEHICLES = "tests/recorders/test_vehicles.py"
 SCORES = "tests/recorders/test_biometrics.py"
 READING = "tests/recorders/test_log_reading.py"
 WRITING = "tests/recorders/test_log_writing.py"
-ENGINE = "tests/replay/test_engine.py"
-EVALUATION = "tests/replay/test_evaluation.py"
-FUSION = "tests/replay/test_biometrics.py"
-VECTORS = "tests/replay/test_reading_streams.py"
+ENGINE = "tests/replay/engine/test_engine.py"
+EVALUATION = "tests/replay/judging/test_evaluation.py"
+FUSION = "tests/replay/estimators/test_biometrics.py"
+VECTORS = "tests/replay/engine/test_reading_streams.py"
 SPANS = "tests/pipeline/test_spans.py"
-FAILING = "tests/replay/test_failing_runs.py"
+FAILING = "tests/replay/engine/test_failing_runs.py"
 OUTPUTS = "tests/pipeline/test_outputs.py"
 
 FAULTS = [
@@ -245,207 +245,207 @@ FAULTS = [
     ),
     # blocks, engine, sources
     Fault(
-        "replay/blocks.py",
+        "replay/engine/blocks.py",
         "positions[heads[k]] < positions[heads[first]]",
         "positions[heads[k]] > positions[heads[first]]",
         ENGINE,
     ),
     Fault(
-        "replay/blocks.py",
+        "replay/engine/blocks.py",
         'clock = "publish_time_ns" if order == "publish_time" else "log_time_ns"',
         'clock = "publish_time_ns"',
         ENGINE,
     ),
     Fault(
-        "replay/blocks.py",
+        "replay/engine/blocks.py",
         "events.is_last[event - 1] = False",
         "events.is_last[event - 1] = True",
         ENGINE,
     ),
     Fault(
-        "replay/engine.py",
+        "replay/engine/estimator.py",
         "if there is None or _stated(there) != _stated(here):",
         "if there is None:",
         ENGINE,
     ),
     Fault(
-        "replay/sources.py",
+        "replay/engine/sources.py",
         'kind="stable")] = np.arange(len(ranks))',
         'kind="stable")[::-1]] = np.arange(len(ranks))',
         ENGINE,
     ),
     # the caches
     Fault(
-        "replay/cache.py",
+        "replay/engine/cache.py",
         "return content if header.startswith(_digest(content)) else None",
         "return content",
-        "tests/replay/test_compile.py",
+        "tests/replay/engine/test_compile.py",
     ),
     Fault(
-        "replay/compile.py",
+        "replay/engine/compile.py",
         "{getattr(kind, 'fields', '')} ",
         "",
-        "tests/replay/test_compile.py",
+        "tests/replay/engine/test_compile.py",
     ),
     # evaluation, consistency, metrics
     Fault(
-        "replay/evaluation.py",
+        "replay/judging/evaluation.py",
         "(stream.publish_time_ns - epochs[run])[known] * 1e-9",
         "(stream.publish_time_ns - epochs[0])[known] * 1e-9",
         EVALUATION,
     ),
     Fault(
-        "replay/evaluation.py",
+        "replay/judging/evaluation.py",
         "(span <= gap_limit_s * 1e9)",
         "(span < gap_limit_s * 1e9)",
         EVALUATION,
     ),
     Fault(
-        "replay/evaluation.py",
+        "replay/judging/evaluation.py",
         "tail = 0.5 * (1 - probability)",
         "tail = 1 - probability",
         EVALUATION,
     ),
     Fault(
-        "replay/evaluation.py",
+        "replay/judging/evaluation.py",
         "sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))",
         "sigma = np.diagonal(errors.covariance, axis1=1, axis2=2)",
         EVALUATION,
     ),
     Fault(
-        "replay/consistency.py",
+        "replay/judging/consistency.py",
         "return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)",
         "return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1) ** 2",
-        "tests/replay/test_consistency.py",
+        "tests/replay/judging/test_consistency.py",
     ),
     Fault(
-        "replay/consistency.py",
+        "replay/judging/consistency.py",
         "np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)",
         "np.pi * stats.chi2.ppf(probability, 2) * squared",
-        "tests/replay/test_consistency.py",
+        "tests/replay/judging/test_consistency.py",
     ),
     Fault(
-        "replay/metrics.py",
+        "replay/judging/metrics.py",
         "innovations.squared.sum() / innovations.degrees.sum()",
         "(innovations.squared / innovations.degrees).mean()",
-        f"{EVALUATION} tests/replay/test_metrics.py",
+        f"{EVALUATION} tests/replay/judging/test_metrics.py",
     ),
     Fault(
-        "replay/metrics.py",
+        "replay/judging/metrics.py",
         "float(1 - innovations.accepted.mean())",
         "float(innovations.accepted.mean())",
-        f"{EVALUATION} tests/replay/test_metrics.py",
+        f"{EVALUATION} tests/replay/judging/test_metrics.py",
     ),
     # tracks, sets, verification
     Fault(
-        "replay/tracks.py",
+        "replay/judging/tracks.py",
         "rows, columns = linear_sum_assignment(counts, maximize=True)",
         "rows, columns = np.arange(len(thing)), counts.argmax(axis=1)",
-        "tests/replay/test_report_tracker.py tests/replay/test_metrics.py",
+        "tests/replay/estimators/test_report_tracker.py tests/replay/judging/test_metrics.py",
     ),
     Fault(
-        "replay/tracks.py",
+        "replay/judging/tracks.py",
         'shares = table.loc[table["reports"] > reports, column]',
         'shares = table.loc[table["reports"] >= reports, column]',
-        "tests/replay/test_report_tracker.py tests/replay/test_metrics.py",
+        "tests/replay/estimators/test_report_tracker.py tests/replay/judging/test_metrics.py",
     ),
     Fault(
-        "replay/set_distances.py",
+        "replay/judging/set_distances.py",
         "costs = np.minimum(cdist(first, second), cutoff) ** order",
         "costs = np.minimum(cdist(first, second) ** order, cutoff)",
-        "tests/replay/test_set_distances.py",
+        "tests/replay/judging/test_set_distances.py",
     ),
     Fault(
-        "replay/set_distances.py",
+        "replay/judging/set_distances.py",
         "pairs = pairs[pairs < cutoff**order]",
         "pairs = pairs[pairs <= cutoff**order]",
-        "tests/replay/test_set_distances.py",
+        "tests/replay/judging/test_set_distances.py",
     ),
     Fault(
-        "replay/set_errors.py",
+        "replay/judging/set_errors.py",
         'elements["mean"][end - sizes["elements"][step] : end]',
         'elements["mean"][end - sizes["elements"][0] : end]',
-        "tests/replay/test_set_errors.py",
+        "tests/replay/judging/test_set_errors.py",
     ),
     Fault(
-        "replay/verification.py",
+        "replay/judging/verification.py",
         "last = np.append(falling[1:] != falling[:-1], True)",
         "last = np.ones(len(falling), bool)",
         FUSION,
     ),
     Fault(
-        "replay/verification.py",
+        "replay/judging/verification.py",
         'np.searchsorted(curve.false_accept, false_accept, side="right") - 1',
         'np.searchsorted(curve.false_accept, false_accept, side="left") - 1',
         FUSION,
     ),
     Fault(
-        "replay/verification.py",
+        "replay/judging/verification.py",
         "right = (fused.score > (fused.threshold or 0.0)) == fused.genuine",
         "right = (fused.score >= (fused.threshold or 0.0)) == fused.genuine",
         FUSION,
     ),
     Fault(
-        "replay/verification.py",
+        "replay/judging/verification.py",
         "weight = np.where(genuine, drawn[probe], drawn[probe] * drawn[gallery])",
         "weight = drawn[probe] * drawn[gallery]",
         FUSION,
     ),
     # the tangent space, distributions, samplings
     Fault(
-        "replay/tangent.py",
+        "replay/engine/tangent.py",
         "relative = compose(conjugate(truth[:, columns]), estimate[:, columns])",
         "relative = compose(estimate[:, columns], conjugate(truth[:, columns]))",
-        "tests/replay/test_tangent.py",
+        "tests/replay/engine/test_tangent.py",
     ),
     Fault(
-        "replay/tangent.py",
+        "replay/engine/tangent.py",
         "return (1.0 if x.shape[1] == 2 else 4.0) * local[:, 1:, 1:]",
         "return (1.0 if x.shape[1] == 2 else 2.0) * local[:, 1:, 1:]",
-        "tests/replay/test_tangent.py",
+        "tests/replay/engine/test_tangent.py",
     ),
     Fault(
         "replay/distributions/wrapped_normal_kernels.py",
         "variances[k] = min(spread[k, k] - 2.0 * math.log1p",
         "variances[k] = min(spread[k, k] - math.log1p",
-        "tests/replay/test_wrapped_normal.py",
+        "tests/replay/distributions/test_wrapped_normal.py",
     ),
     Fault(
         "replay/distributions/bingham_kernels.py",
         "z -= z[len(z) - 1]",
         "z -= z[0]",
-        "tests/replay/test_bingham_filter.py",
+        "tests/replay/estimators/test_bingham_filter.py",
     ),
     Fault(
         "replay/sampling/samplers.py",
         "weights[0] = kappa / spread",
         "weights[0] = 1 / (2 * spread)",
-        "tests/replay/test_samplings.py",
+        "tests/replay/sampling/test_samplings.py",
     ),
     Fault(
         "replay/sampling/samplers.py",
         "return q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]",
         "return q",
-        "tests/replay/test_samplings.py",
+        "tests/replay/sampling/test_samplings.py",
     ),
     # estimators
     Fault(
         "replay/estimators/covariance_intersection.py",
         "entry = information[i, row, k] - shares[i] * common[row, k]",
         "entry = information[i, row, k] - shares[1 - i] * common[row, k]",
-        "tests/replay/test_covariance_intersection.py",
+        "tests/replay/estimators/test_covariance_intersection.py",
     ),
     Fault(
         "replay/estimators/inertial.py",
         "integrate(_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s)), moments, work)",
         "integrate(_isotropic(model.drift_sigma_rad * elapsed_s), moments, work)",
-        "tests/replay/test_inertial.py",
+        "tests/replay/estimators/test_inertial.py",
     ),
     Fault(
         "replay/estimators/inertial.py",
         "covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s",
         "covariance[i, i] += model.drift_sigma_rad**2",
-        "tests/replay/test_inertial.py",
+        "tests/replay/estimators/test_inertial.py",
     ),
     Fault(
         "replay/estimators/biometrics.py",
@@ -466,16 +466,16 @@ FAULTS = [
         FUSION,
     ),
     Fault(
-        "replay/tracks.py",
+        "replay/judging/tracks.py",
         "live_ns = round(live_s * 1e9)",
         "live_ns = round(live_s * 1e6)",
-        "tests/replay/test_report_tracker.py",
+        "tests/replay/estimators/test_report_tracker.py",
     ),
     Fault(
         "replay/timeline/show.py",
         "return digest.hexdigest()[:16]",
         'return "0" * 16',
-        "tests/replay/test_timeline.py",
+        "tests/replay/timeline/test_timeline.py",
     ),
     # the pipeline
     Fault(
@@ -522,51 +522,51 @@ FAULTS = [
     ),
     # what is read, what a replay starts from, how runs fail
     Fault(
-        "replay/components.py",
+        "replay/engine/components.py",
         "return [names.index(name) for name in wanted]",
         "return [*range(len(wanted))]",
-        "tests/replay/test_components.py",
+        "tests/replay/engine/test_components.py",
     ),
     Fault(
-        "replay/components.py",
+        "replay/engine/components.py",
         "end, end + TANGENT_WIDTHS[kind]",
         "end, end + numbers.stop - numbers.start",
-        "tests/replay/test_components.py",
+        "tests/replay/engine/test_components.py",
     ),
     Fault(
-        "replay/measurements.py",
+        "replay/engine/measurements.py",
         "found[missing] = sigma**2 * np.eye(len(rows))",
         "found[missing] = sigma * np.eye(len(rows))",
         VECTORS,
     ),
     Fault(
-        "replay/measurements.py",
+        "replay/engine/measurements.py",
         "np.isnan(found).any(axis=(1, 2))",
         "np.isnan(found).all(axis=(1, 2))",
         VECTORS,
     ),
     Fault(
-        "replay/measurements.py",
+        "replay/engine/measurements.py",
         "np.ascontiguousarray(stream[field][:, columns])",
         "np.ascontiguousarray(stream[field][:, : len(columns)])",
         VECTORS,
     ),
-    Fault("replay/priors.py", "whole[:, rows][:, :, rows]", "whole[:, rows]", VECTORS),
-    Fault("replay/starting.py", 'start_ns, side="left"', 'start_ns, side="right"', SPANS),
+    Fault("replay/engine/priors.py", "whole[:, rows][:, :, rows]", "whole[:, rows]", VECTORS),
+    Fault("pipeline/starting.py", 'start_ns, side="left"', 'start_ns, side="right"', SPANS),
     Fault(
-        "replay/starting.py",
+        "pipeline/starting.py",
         "covariance[own, own] = sigma**2",
         "covariance[own, own] = sigma",
         SPANS,
     ),
     Fault(
-        "replay/starting.py",
+        "pipeline/starting.py",
         "is_late = source.start_ns is not None and len(prior) and prior.times(order)[0]",
         "is_late = source.start_ns is not None and len(prior) and prior.publish_time_ns[0]",
         SPANS,
     ),
     Fault(
-        "replay/starting.py",
+        "pipeline/starting.py",
         'mean, covariance = stream["mean"][before - 1], stream["covariance"][before - 1]',
         'mean, covariance = stream["mean"][-1], stream["covariance"][-1]',
         SPANS,
@@ -578,32 +578,37 @@ FAULTS = [
         SPANS,
     ),
     Fault(
-        "replay/failures.py",
+        "replay/engine/failures.py",
         "places = np.array([*map(merged.index, _reasons(part)), len(merged)])",
         "places = np.array([*range(len(_reasons(part))), len(merged)])",
         FAILING,
     ),
     Fault(
-        "replay/supervision.py",
+        "replay/engine/supervision.py",
         "output.stream.publish_time_ns < self._end_ns[run]",
         "output.stream.publish_time_ns <= self._end_ns[run]",
         FAILING,
     ),
-    Fault("replay/supervision.py", "if time_ns[row] < last_ns:", "if time_ns[row] <= last_ns:", FAILING),
     Fault(
-        "replay/supervision.py",
+        "replay/engine/supervision.py",
+        "if time_ns[row] < last_ns:",
+        "if time_ns[row] <= last_ns:",
+        FAILING,
+    ),
+    Fault(
+        "replay/engine/supervision.py",
         "factor[i, column] = entry / factor[column, column]",
         "factor[i, column] = entry",
         FAILING,
     ),
     Fault(
-        "replay/supervision.py",
+        "replay/engine/supervision.py",
         "median = np.argmax(2 * reached >= reached[:, -1:], axis=1)",
         "median = np.argmax(reached >= reached[:, -1:], axis=1)",
         FAILING,
     ),
     Fault(
-        "replay/metrics.py",
+        "replay/judging/metrics.py",
         'coverage["estimated_s"].sum() / spans_s',
         'coverage["estimated_s"].mean() / spans_s',
         FAILING,
@@ -618,16 +623,16 @@ FAULTS = [
         "replay/estimators/solutions.py",
         "in_order = np.lexsort((last, run))",
         "in_order = np.arange(len(run))",
-        "tests/replay/test_angle_streams.py",
+        "tests/replay/estimators/test_angle_streams.py",
     ),
     Fault(
-        "replay/set_evaluation.py",
+        "replay/judging/set_evaluation.py",
         "self.bound_holds & self.in_arena & ~self.inside",
         "self.bound_holds & ~self.inside",
-        "tests/replay/test_set_membership.py",
+        "tests/replay/estimators/test_set_membership.py",
     ),
     Fault(
-        "replay/engine.py",
+        "replay/engine/replaying.py",
         "if len(times_ns) and times_ns[0] < source.start_ns:",
         "if len(times_ns) and times_ns[0] > source.start_ns:",
         SPANS,

@@ -5,7 +5,7 @@ import pytest
 import rerun.chunk as rc
 
 from pipeline.experiment import load_experiment, run_experiment
-from replay.verification import relative_rate_increase
+from replay.judging.verification import relative_rate_increase
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,8 @@ from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
 from recorders.recording import Recording
-from replay.blocks import gather
-from replay.sources import memory_source
+from replay.engine.blocks import gather
+from replay.engine.sources import memory_source
 
 Fuselog = Callable[..., Any]
 RUN = ["run", "landmarks", "--set", "duration_s=2", "--runs", "3", "--seed", "5"]

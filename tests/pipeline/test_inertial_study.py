@@ -8,7 +8,7 @@ from pipeline.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.sources import memory_source
+from replay.engine.sources import memory_source
 
 
 def test_broad_reaches_its_target(real_data, tmp_path):

@@ -20,7 +20,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "own-estimator.md").read_text()
 # More entry points, for what goes wrong in the code of others.
 BROKEN = """
 from recorders.recording import Simulator
-from replay.plain import Estimates, batch, each_run
+from replay.engine.plain import Estimates, batch, each_run
 from radio import LOCATE, BeaconsParameters, LocateParameters, SIGNAL_STRENGTH, locate, schemas, simulate
 from recorders.errors import BadInput
 from recorders.log import make_stream

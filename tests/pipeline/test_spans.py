@@ -13,7 +13,7 @@ from pipeline.ensemble import replay_to_logs
 from recorders.errors import BadInput
 from recorders.log import Stream, open_log, read_streams, write_log
 from recorders.recording import SIMULATION_EPOCH_NS, record_run
-from replay.sources import LogSource
+from replay.engine.sources import LogSource
 
 Fuselog = Callable[..., Any]
 SECOND = 10**9

@@ -9,7 +9,7 @@ from recorders.models.scores import comparisons_of
 from recorders.parameters import build
 from recorders.recording import record_run
 from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
-from replay.verification import identified
+from replay.judging.verification import identified
 
 TWO = Matchers.model_validate(
     {"matchers": [{"name": "face", "modality": "face"}, {"name": "finger", "modality": "finger"}]}

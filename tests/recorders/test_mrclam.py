@@ -11,10 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.recording import Recording, import_run
-from replay.engine import bind, collect, replay
-from replay.evaluation import errors_of
-from replay.metrics import accuracy, consistency
-from replay.sources import MemorySource, memory_source
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import MemorySource, memory_source
+from replay.judging.evaluation import errors_of
+from replay.judging.metrics import accuracy, consistency
 
 # A set of one robot: two barcodes known, one not; times out of order; comments as in the real files.
 SMALL = {

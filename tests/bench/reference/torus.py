@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.compile import compile_over_runs
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import WrappedNormal
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+from replay.engine.compile import compile_over_runs
 from tests.bench.reference.gaussian import wrap_angle
 
 

@@ -9,8 +9,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate, from_rotation_vector, rotate
 from recorders.recording import Recording
+from replay.engine.sources import MemorySource, memory_source
 from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
-from replay.sources import MemorySource, memory_source
 
 Floats = NDArray[np.float64]
 STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {

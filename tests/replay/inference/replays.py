@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from recorders.parameters import build
-from replay.blocks import Ragged
-from replay.engine import Bound, collect, replay
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import Bound
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import Source
 from replay.inference.estimators import bind_model, combined
 from replay.inference.methods import METHODS
 from replay.inference.model import Model
-from replay.sources import Source
 
 
 def bound(model: Model, method: str, sources: Sequence[Source], **values: Any) -> list[Bound]:

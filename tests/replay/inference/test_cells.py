@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pipeline.ensemble import record_ensemble, replay_ensemble
+from replay.engine.sources import MemorySource
 from replay.inference.estimators import registered_models
 from replay.inference.methods import METHODS
-from replay.sources import MemorySource
 from tests.replay.inference.wheel import make_wheel
 
 RUNS = 30

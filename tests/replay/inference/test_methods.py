@@ -8,10 +8,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from recorders.models.orientation import compose, conjugate
+from replay.engine.tangent import rotation_vector
 from replay.inference.generate import resetting
 from replay.inference.regression import regression, sample_memory
 from replay.sampling.sets import SampleSets
-from replay.tangent import rotation_vector
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import outputs

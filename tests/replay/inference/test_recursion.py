@@ -14,8 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
-from replay.blocks import Ragged
-from replay.sources import LogSource, MemorySource, memory_source
+from replay.engine.blocks import Ragged
+from replay.engine.sources import LogSource, MemorySource, memory_source
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A

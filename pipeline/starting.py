@@ -1,0 +1,183 @@
+"""Where a replay starts that does not begin at the log's own prior.
+
+An estimator with a prior begins there. Where the replayed span begins later, that prior is of another
+time, and the state must come from elsewhere: from the truth, or from what an earlier replay estimated.
+The estimator is handed a prior made of that, and need not know.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput, choices
+from recorders.log import Clock, Stream, make_stream, schemas
+from replay.engine.blocks import gather
+from replay.engine.components import match_components, match_tangent, stated_components
+from replay.engine.estimator import Bound
+from replay.engine.sources import Source
+from replay.engine.tangent import tangent_components
+from replay.judging.evaluation import split_topic, truth_at
+
+Floats = NDArray[np.float64]
+# A run's prior at a time in ns, from an estimator's label and the log's own prior.
+Origin = Callable[[str, Stream, int], Stream]
+
+
+def start_from(
+    bound: Bound, sources: Sequence[Source], origins: Sequence[Origin], order: Clock
+) -> Bound:
+    """The estimator, begun from each run's origin where that run's span begins after its prior.
+
+    Raises BadInput where an origin has no state for a prior at the beginning of the span.
+    """
+    label = bound.name.partition("/")[0]
+    priors = {
+        topic: gather(
+            [
+                _prior(source, source.read([topic])[topic], origin, label, order)
+                for source, origin in zip(sources, origins, strict=True)
+            ]
+        )
+        for topic in bound.priors
+    }
+    return replace(bound, given=priors)
+
+
+def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clock) -> Stream:
+    is_late = source.start_ns is not None and len(prior) and prior.times(order)[0] < source.start_ns
+    return origin(label, prior, source.start_ns) if is_late and source.start_ns else prior
+
+
+def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
+    """Start a run from its truth.
+
+    The covariance is that of the log's prior; `sigmas` are standard deviations of some of its components
+    in their place, which are then correlated with nothing.
+    """
+    return partial(_true_state, source, order, gap_limit_s, sigmas)
+
+
+def from_estimates(estimates: Source) -> Origin:
+    """Start a run from mean and covariance that an earlier replay of it estimated last before.
+
+    It is the estimate of the same label, else the only one that has the prior's components.
+    """
+    return partial(_estimated_state, estimates)
+
+
+def _true_state(
+    source: Source,
+    order: Clock,
+    gap_limit_s: float,
+    sigmas: Mapping[str, float],
+    label: str,  # noqa: ARG001
+    prior: Stream,
+    start_ns: int,
+) -> Stream:
+    topic = f"{prior.topic.rpartition('/')[0]}/truth"
+    if topic not in source.topics:
+        raise BadInput(f"{source.name}: no topic {topic} to start from; give --start-from ESTIMATES")
+    truth = source.read([topic])[topic]
+    where = f"{source.name}: topic {topic}, to start from"
+    components = _components(prior, source.name)
+    columns = match_components(truth.metadata, components, where)
+    rows = np.argsort(truth.times(order), kind="stable") if len(truth) else np.empty(0, np.int64)
+    timed = replace(
+        truth,
+        publish_time_ns=truth.times(order)[rows],
+        columns={"state": truth["state"][rows].reshape(len(rows), -1)[:, columns]},
+    )
+    mean = truth_at(timed, np.array([start_ns]), list(components.values()), gap_limit_s)
+    if not np.isfinite(mean).all():
+        raise BadInput(
+            f"{where}: is not known at the start within {gap_limit_s:g} s; give another --start, a "
+            "longer --gap-limit or --start-from ESTIMATES"
+        )
+    covariance = _with_sigmas(prior, components, sigmas)
+    return _made(prior, start_ns, mean, covariance)
+
+
+def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[str, float]) -> Floats:
+    """The covariance (t, t) of a prior with some of its components' standard deviations replaced."""
+    names = [name for name, _ in tangent_components(list(components), list(components.values()))]
+    covariance = prior["covariance"][0].reshape(len(names), len(names)).copy()
+    for name, sigma in sigmas.items():
+        if name not in names:
+            raise BadInput(
+                f"--start-sigma {name}: {prior.topic} has no such component; {choices(name, names)}"
+            )
+        own = names.index(name)
+        covariance[own, :] = covariance[:, own] = 0.0
+        covariance[own, own] = sigma**2
+    return covariance
+
+
+def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int) -> Stream:
+    components = _components(prior, estimates.name)
+    topic = _estimate_topic(estimates, label, prior, components)
+    stream = estimates.read([topic])[topic]
+    where = f"{estimates.name}: topic {topic}, to start from"
+    columns = match_components(stream.metadata, components, where)
+    tangent = match_tangent(stream.metadata, components, where)
+    times_ns = stream.publish_time_ns
+    # what has the stamp of the start is replayed, and must not be in the prior already
+    before = int(np.searchsorted(times_ns, start_ns, side="left"))
+    if before == 0:
+        raise BadInput(f"{where}: has no estimate before the start; give a later --start")
+    last_ns = int(times_ns[before - 1])
+    is_over = before == len(stream)
+    if is_over and start_ns - last_ns > np.diff(times_ns).max(initial=0):
+        raise BadInput(
+            f"{where}: ends {(start_ns - last_ns) * 1e-9:g} s before the start; give an earlier --start"
+        )
+    mean, covariance = stream["mean"][before - 1], stream["covariance"][before - 1]
+    size = round(len(covariance) ** 0.5)
+    block = covariance.reshape(size, size)[np.ix_(tangent, tangent)]
+    return _made(prior, last_ns, mean[None, columns], block)
+
+
+def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
+    """The estimate to begin a prior from: of the same thing, with all its components."""
+    case = prior.topic.rpartition("/")[0].removeprefix("/")
+    found = [
+        name
+        for name, topic in estimates.topics.items()
+        if name.startswith("/estimates/")
+        and topic.schema_name == schemas.GAUSSIAN_ESTIMATE.full_name
+        and split_topic(name)[1] == case
+        and components.keys() <= set(topic.metadata.get("components", "").split(","))
+    ]
+    own = [name for name in found if split_topic(name)[0] == label] or found
+    if len(own) != 1:
+        listed = f"has several: {', '.join(own)}" if own else f"has {', '.join(estimates.topics)}"
+        raise BadInput(
+            f"{estimates.name}: one estimate of {', '.join(components)} is needed to start {label} from "
+            f"instead of {prior.topic}; the log {listed}"
+        )
+    return own[0]
+
+
+def _components(prior: Stream, name: str) -> dict[str, Any]:
+    """Names and kinds of a prior's components; raises BadInput where it names none."""
+    found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
+    if not found:
+        raise BadInput(
+            f"{name}: topic {prior.topic} names no components, so that no state can replace it; "
+            "state them in the channel's metadata"
+        )
+    return found
+
+
+def _made(prior: Stream, time_ns: int, mean: Floats, covariance: Floats) -> Stream:
+    return make_stream(
+        prior.topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        [time_ns],
+        metadata=prior.metadata,
+        mean=mean,
+        covariance=covariance.reshape(1, -1),
+    )

@@ -1,0 +1,457 @@
+"""Compiles a kernel together with the model functions it is made of, once per source text.
+
+numba's own disk cache finds module-level functions only, does not notice that a function from another
+file has changed, and stops on a damaged file. So the sources of a kernel and of everything it calls
+become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
+model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
+which also run uncompiled.
+"""
+
+import ast
+import inspect
+import logging
+import os
+import pickle
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, lru_cache, partial, wraps
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from threading import Timer
+from types import FunctionType, ModuleType
+from typing import Any, ParamSpec, TypeGuard, TypeVar
+
+import numba
+import numpy as np
+from numba.core import types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
+from numba.core.errors import NumbaError
+from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
+
+from recorders.errors import BadInput
+from replay.engine.cache import cache_folder, is_private, read_checked, say_once, write_checked
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+# What a version names, which is part of every key; of any other module the sources are needed.
+_VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}
+# What compiles in less time is not told of.
+_PATIENCE_S = 1.0
+
+
+class DoesNotCompile(BadInput):
+    """What numba says of a function that it cannot compile, and of which line."""
+
+
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a function of arrays and numbers, with all that it calls, when it is first called.
+
+    For what Python calls as it stands; inside another kernel it is compiled with the rest. Its arguments
+    are given by position. Raises BadInput, when called, where a source is not at hand.
+    """
+
+    @cache
+    def kernel() -> Callable[Parameters, Result]:
+        if _is_uncompiled():
+            return np.errstate(all="ignore")(function)
+        bundle = _Bundle()
+        name = bundle.add(function.__name__, function)
+        names = ", ".join(inspect.signature(function).parameters)
+        text = f"def kernel({names}):\n    return {name}({names})"
+        return _compile(bundle, text, function)
+
+    @wraps(function)
+    def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        return kernel()(*arguments, **named)
+
+    return call
+
+
+def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) -> Callable[..., None]:
+    """Compile a function of one run into a loop over all runs, on all cores.
+
+    Args:
+        run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
+            belongs to that run. It may be a closure over model functions and numbers: that is how it is
+            specialised. It may use NumPy and functions that keep to the same.
+        allocates: whether it makes arrays. A kernel that does not is compiled without the counting of
+            references to arrays, and is several times as fast.
+
+    Returns `loop(runs, *arguments, scratch=None, own=None)`; its results do not depend on the number of
+    runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
+    `run_once`: arrays that one run after another may work in. Or that is `own[run]`, such as the run's
+    generator of random numbers; a run whose own is None is left out.
+    Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
+    """
+    if _is_uncompiled():
+        return uncompiled_over_runs(run_once)
+    bundle = _Bundle(allocates)
+    kernel = bundle.add("run_once", run_once)
+    names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
+    loop = _compile(
+        bundle,
+        f"def kernel(first, end, {names}):\n"
+        "    for run in range(first, end):\n"
+        f"        {kernel}(run, {names})",
+        run_once,
+    )
+    hint = "" if allocates else " (a kernel that makes arrays is compiled with allocates=True)"
+    return partial(_over_runs, name=run_once.__name__, loop=loop, places=bundle.places, hint=hint)
+
+
+class _InlinedLibrary(JITCodeLibrary):
+    """The code of one function that is inlined where it is called.
+
+    It is optimised there, once; numba would optimise it at every level of calls above it, which takes
+    half of the time that a kernel of many small functions needs to compile.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+
+class Inlined(Compiler):
+    """The compiler of functions that end up within another one, see `numba.njit(pipeline_class=...)`."""
+
+    def define_pipelines(self) -> Any:
+        """The usual passes, into a library of another kind."""
+        codegen = self.state.targetctx.codegen()
+        library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        self.state.library = library
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
+
+
+def _is_uncompiled() -> bool:
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"
+
+
+def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """What `compile_over_runs` returns, in plain Python; NaN and infinity raise nothing here either."""
+
+    def loop(
+        runs: int,
+        *arguments: Any,
+        scratch: Callable[[], Any] | None = None,
+        own: Sequence[Any] | None = None,
+    ) -> None:
+        memory = [scratch()] if scratch else []
+        with np.errstate(all="ignore"):
+            for run in range(runs):
+                if own is None:
+                    run_once(run, *arguments, *memory)
+                elif own[run] is not None:
+                    run_once(run, *arguments, own[run])
+
+    return loop
+
+
+def _over_runs(
+    runs: int,
+    *arguments: Any,
+    scratch: Callable[[], Any] | None = None,
+    own: Sequence[Any] | None = None,
+    name: str,
+    loop: Callable[..., None],
+    places: Mapping[int, str],
+    hint: str,
+) -> None:
+    """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+
+    def work(first: int, end: int) -> None:
+        if own is None:
+            loop(first, end, *arguments, *([scratch()] if scratch else []))
+            return
+        mine = next((each for each in own if each is not None), None)
+        for run in range(first, end):
+            if own[run] is not None:
+                loop(run, run + 1, *arguments, own[run])
+        if first == end and mine is not None:
+            loop(first, end, *arguments, mine)
+
+    cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    try:
+        if cores > 1:
+            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+            with ThreadPoolExecutor(cores) as pool:
+                list(pool.map(work, cuts[:-1], cuts[1:]))
+        else:
+            work(0, runs)
+    except NumbaError as error:
+        loop._cache.ended()  # type: ignore[attr-defined]
+        said = str(error)
+        reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
+        reason = re.sub(r",? ?(defined )?at kernel_\w+ \(\d+\)", "", reason)
+        line = re.search(r'File "kernel_\w+", line (\d+)', said)
+        place = places.get(int(line[1]), "") if line else ""
+        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{place}{hint}") from error
+
+
+class _Bundle:
+    """Sources in the order they are needed, and the imports above them.
+
+    Everything gets a name of its own: two closures of one function, over different models, are two.
+    """
+
+    def __init__(self, allocates: bool = True) -> None:
+        # a division by zero gives infinity, which is a failure of its run, and no exception
+        inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
+        bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
+        self.options = f"_nrt={allocates}{bounds}"
+        self.imports = {"import numba", "import numpy"}
+        if not allocates:  # one piece is faster where no counting of references stands in the way
+            inner += ", forceinline=True, pipeline_class=Inlined"
+            self.imports.add("from replay.engine.compile import Inlined")
+        self._decorator = f"@numba.njit({inner}, {self.options})"
+        self.definitions: list[str] = []
+        # where the lines of the module come from, in words
+        self.places: dict[int, str] = {}
+        self._origins: dict[int, dict[int, str]] = {}
+        self._names: dict[Any, str] = {}
+
+    def add(self, name: str, value: Any) -> str:
+        """Define a value, called `name` where it is used, and before it what it needs; its own name."""
+        value = inspect.unwrap(value)  # what has been compiled already is compiled with the rest
+        literal = _literal(value)
+        origin = getattr(value, "__qualname__", "<locals>")
+        if literal is None and "<locals>" in origin and not isinstance(value, FunctionType | ModuleType):
+            raise BadInput(
+                f"a kernel uses '{name}', a {type(value).__name__}, which is neither function, number "
+                "nor tuple, nor can be imported by name: hand it in as an argument"
+            )
+        key = value if literal is None else (name, literal)
+        if key in self._names:
+            return self._names[key]
+        own = self._names[key] = f"{name}_{len(self._names)}"
+        if isinstance(value, FunctionType) and not _is_known_to_numba(value):
+            source, lines = self._source(own, value)
+            self._origins[len(self.definitions)] = lines
+            self.definitions.append(f"{self._decorator}\n{source}")
+        elif isinstance(value, ModuleType):
+            if value.__name__.partition(".")[0] not in _VERSIONED:
+                raise BadInput(
+                    f"a kernel uses the module {value.__name__}: import what it needs of it by name, "
+                    "so that a change there is noticed"
+                )
+            self.imports.add(f"import {value.__name__} as {own}")
+        elif literal is not None:
+            self.definitions.append(f"{own} = {literal}")
+        elif _is_made_here(value):
+            self.imports.add("import collections")
+            self.definitions.append(f"{own} = collections.namedtuple({own!r}, {value._fields})")
+        else:
+            self.imports.add(f"from {value.__module__} import {origin} as {own}  # {_stamp(value)}")
+        return own
+
+    def placed(self, first: int) -> list[str]:
+        """The definitions, which begin at line `first` of a module; fills in `places`."""
+        for index, definition in enumerate(self.definitions):
+            lines = self._origins.get(index, {})
+            self.places |= {first + line: place for line, place in lines.items()}
+            first += definition.count("\n") + 1
+        return self.definitions
+
+    def _source(self, own: str, function: FunctionType) -> tuple[str, dict[int, str]]:
+        """A function under a name of its own, and where its lines, counted from 1, come from."""
+        closure = inspect.getclosurevars(function)
+        needed = {**closure.globals, **closure.nonlocals}
+        definition = _definition(function)
+        file, above = function.__code__.co_filename, function.__code__.co_firstlineno - 1
+        for node in ast.walk(definition):
+            if _is_global_random(node, needed):
+                raise DoesNotCompile(
+                    f"{function.__qualname__} uses np.random ({file}, line {above + node.lineno}): its "
+                    "numbers would depend on how runs are shared among cores; draw from the generator "
+                    "that the run is given (draws=True)"
+                )
+        names = {name: self.add(name, value) for name, value in needed.items()}
+        definition.name = own
+        for node in ast.walk(definition):
+            if isinstance(node, ast.Name):
+                node.id = names.get(node.id, node.id)
+        source = ast.unparse(definition)
+        before, after = (
+            [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
+            for tree in (definition, ast.parse(source).body[0])
+        )
+        return source, {
+            new.lineno: f" ({file}, line {above + old.lineno})"
+            for old, new in zip(before, after, strict=True)
+        }
+
+
+def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast.expr]:
+    """Whether an expression is NumPy's module of generators that are nobody's own."""
+    if isinstance(node, ast.Attribute) and node.attr == "random":
+        return isinstance(node.value, ast.Name) and needed.get(node.value.id) is np
+    if isinstance(node, ast.Name):
+        found = needed.get(node.id)
+        return found is np.random or getattr(found, "__self__", None) is np.random.mtrand._rand
+    return False
+
+
+def _is_made_here(value: Any) -> bool:
+    """Whether it is a NamedTuple that was made at run time, which no import by name finds."""
+    made = isinstance(value, type) and issubclass(value, tuple) and hasattr(value, "_fields")
+    return made and getattr(sys.modules.get(value.__module__), value.__name__, None) is not value
+
+
+def _is_known_to_numba(function: FunctionType) -> bool:
+    """Whether numba has an implementation of its own for it (`numba.extending.overload`)."""
+    context = cpu_target.typing_context
+    context.refresh()
+    try:
+        context.resolve_value_type(function)
+    except ValueError:
+        return False
+    return True
+
+
+def _stamp(value: Any) -> str:
+    """What changes with a thing that is imported by name, and so makes another kernel.
+
+    Of a NamedTuple the order of its fields; of what numba has an implementation of, the module's source.
+    """
+    if hasattr(value, "_fields"):
+        return " ".join(value._fields)
+    if value.__module__.partition(".")[0] in _VERSIONED:
+        return ""
+    try:
+        return sha256(inspect.getsource(sys.modules[value.__module__]).encode()).hexdigest()
+    except (OSError, TypeError):  # written in C
+        return ""
+
+
+def _literal(value: Any) -> str | None:
+    """A number, text, tuple of these or read-only array as source; None for anything else."""
+    if isinstance(value, float):
+        return f"float('{float(value)!r}')"  # infinity and NaN too
+    if isinstance(value, tuple):
+        entries = [_literal(entry) for entry in value]
+        return None if None in entries else f"({''.join(f'{entry}, ' for entry in entries)})"
+    if isinstance(value, np.ndarray) and not value.flags.writeable and not value.dtype.hasobject:
+        content = f"bytes.fromhex('{value.tobytes().hex()}'), '{value.dtype.str}'"
+        return f"numpy.frombuffer({content}).reshape({value.shape})"
+    return repr(value) if isinstance(value, bool | int | str) else None
+
+
+def _definition(function: FunctionType) -> ast.FunctionDef:
+    """A function's source without its decorators and docstring."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError) as error:
+        raise BadInput(
+            f"the source of {function.__qualname__} is not at hand ({error}); "
+            "define it as a function in a file"
+        ) from error
+    definition = tree.body[0]
+    if not isinstance(definition, ast.FunctionDef):
+        raise BadInput(f"{function.__qualname__} is no `def` function; kernels are made of these")
+    definition.decorator_list = []
+    if ast.get_docstring(definition) is not None:
+        definition.body = definition.body[1:]
+    return definition
+
+
+def _compile(bundle: _Bundle, definition: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function `kernel` that is defined over what a bundle holds, made of `function`."""
+    above = ["from __future__ import annotations", *sorted(bundle.imports)]
+    below = [f"@numba.njit(nogil=True, {bundle.options})", definition, ""]
+    text = "\n".join([*above, *bundle.placed(len(above) + 1), *below])
+    return _load(text, f"{function.__module__}.{function.__name__}")
+
+
+@lru_cache(maxsize=64)
+def _load(text: str, title: str) -> Callable[..., Any]:
+    """The function `kernel` of a module with this text; `title` is what to call it to a user."""
+    versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
+    name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
+    module = ModuleType(name)
+    sys.modules[name] = module  # compiled code that was kept looks for it there
+    exec(compile(text, name, "exec"), module.__dict__)
+    module.kernel._cache = _CompiledCode(name, title)
+    return module.kernel
+
+
+class _CompiledCode:
+    """Keeps the compiled code of one kernel, in the place of numba's own cache.
+
+    A file is checked before it is executed. Nothing about the disk stops the work: what cannot be loaded
+    is compiled anew and replaced.
+    """
+
+    cache_path = None
+
+    def __init__(self, name: str, title: str) -> None:
+        self._name = name
+        self._title = title
+        self._patience: Timer | None = None
+
+    def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
+        """The code, or None: it is compiled then, which is said where it takes long."""
+        found = self._loaded(signature, target)
+        log = logging.getLogger("fuselog")
+        if found is None and log.isEnabledFor(logging.INFO):
+            self._patience = Timer(_PATIENCE_S, log.info, (f"compiling {self._title}, once",))
+            self._patience.daemon = True
+            self._patience.start()
+        return found
+
+    def ended(self) -> None:
+        """It is compiled now, or cannot be."""
+        if self._patience:
+            self._patience.cancel()
+
+    def _loaded(self, signature: Any, target: Any) -> CompileResult | None:
+        target.refresh()  # numba's own cache says: "to ensure it is initialized"
+        path = self._path(signature, target)
+        if path is None or not is_private(path.parent):
+            return None
+        content = read_checked(path)
+        if content is None:
+            return None
+        try:
+            name, parts = pickle.loads(content)
+            return CompileResult._rebuild(target, *parts) if name == path.name else None
+        except Exception:  # whatever a file of other versions, or of a class that has moved, leads to
+            return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep the code."""
+        self.ended()
+        path = self._path(signature, result.target_context)
+        # an address in the code is worth nothing in another process
+        if path is None or result.library.has_dynamic_globals or not is_private(path.parent):
+            return
+        try:
+            write_checked(path, dumps((path.name, result._reduce())), "a kernel that fuselog compiled")
+        except BadInput as error:
+            why = str(error).removeprefix(f"{path}: ")
+            say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
+
+    def _path(self, signature: Any, target: Any) -> Path | None:
+        """The file for one processor and these types of arguments."""
+        key = "\n".join([*map(str, target.codegen().magic_tuple()), *map(_described, signature)])
+        try:
+            folder = cache_folder()
+        except RuntimeError:  # a user without a home
+            return None
+        return folder / "kernels" / f"{self._name}-{sha256(key.encode()).hexdigest()[:24]}.bin"
+
+
+def _described(kind: Any) -> str:
+    """The name of a type, and the fields of a named tuple, which numba knows by its class alone."""
+    if not isinstance(kind, types.BaseTuple):
+        return str(kind)
+    entries = ", ".join(map(_described, kind.types))  # type: ignore[attr-defined]
+    return f"{getattr(kind, 'instance_class', tuple)} {getattr(kind, 'fields', '')} ({entries})"

@@ -1,0 +1,45 @@
+"""Covariances: whether they are any, and errors measured by them (NEES, NIS).
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# A share of a variance below this is rounding.
+ROUNDING = 1e-14
+
+
+def normalized_error_squared(error: Array, covariance: Array) -> Array:
+    """NEES or NIS e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
+
+    A component of infinite variance counts nothing. NaN where there are no components, where an error or
+    a covariance is NaN, or where a covariance is not positive definite.
+    """
+    size = error.shape[-1]
+    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
+    both = finite[..., :, None] & finite[..., None, :]
+    covariance = np.where(both, covariance, np.eye(size))
+    error = np.where(finite, error, 0.0)
+    # |L^-1 e|^2 by the Cholesky factors L of all P at once
+    factor, whitened = np.empty_like(covariance), np.empty_like(error)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for row in range(size):
+            for column in range(row + 1):
+                reached = np.sum(factor[..., row, :column] * factor[..., column, :column], axis=-1)
+                entry = covariance[..., row, column] - reached
+                if column < row:
+                    factor[..., row, column] = entry / factor[..., column, column]
+                else:
+                    is_sound = entry > ROUNDING * covariance[..., row, row]
+                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
+            reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
+            whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
+    return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
+
+
+def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
+    """Whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
+    return np.isfinite(normalized_error_squared(np.zeros(covariance.shape[:-1]), covariance))

@@ -1,0 +1,147 @@
+"""What an estimator is to a replay: its parameters, the topics it binds to, and what is asked of it.
+
+An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
+the blocks of its topics one after another and carries a state from block to block; a batch one gets
+whole streams and is done. The same call serves one run and many, so an ensemble's results are those of
+the runs replayed one by one, bit for bit.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic
+
+from recorders.errors import BadInput
+from recorders.log import Topic
+from recorders.parameters import Parameters, ParametersType, build
+from recorders.registry import foreign_code, load
+from replay.engine.blocks import Block, Ragged
+from replay.engine.components import Components
+from replay.engine.sources import Source
+
+
+@dataclass(frozen=True)
+class Recursive:
+    """An estimator that goes through its topics in time.
+
+    Attributes:
+        name: what its output topics begin with, `/estimates/` + name.
+        streams: the topics that `run` is handed, in the order its `Events.topic` counts them.
+        whole: the topics that `start` needs whole, such as a map or a prior.
+        start: whole topics -> the state before the first block.
+        run: state and block -> the state after it, and the output streams. States are values: `run`
+            never changes the one it is handed.
+        priors: the whole topics that are Gaussian priors, and the components that are wanted of each.
+            `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
+            see `replay.engine.priors`.
+        given: whole topics that are not read from the runs, see `pipeline.starting`.
+        finish: the state after the last block -> the outputs that waited for messages which did not
+            come any more.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    start: Callable[[dict[str, Ragged]], Any]
+    run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
+    finish: Callable[[Any], list[Ragged]] | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """An estimator that needs everything at once: `solve` turns its topics into output streams.
+
+    `streams` are the measurements, within the span that is replayed; `whole` and `priors` as for
+    `Recursive`.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    solve: Callable[[dict[str, Ragged]], list[Ragged]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
+
+
+Bound = Recursive | Batch
+
+
+@dataclass(frozen=True)
+class Estimator(Generic[ParametersType]):
+    """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
+
+    `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
+    for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    """
+
+    summary: str
+    needs: str
+    parameters: type[ParametersType]
+    bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
+    variant: str | None = None
+
+
+def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
+    """The registered estimator of `name`, and the parameter that a `name:variant` sets.
+
+    Raises BadInput where there is none, or it has no variants.
+    """
+    kind, _, variant = name.partition(":")
+    estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    if not variant:
+        return estimator, {}
+    if estimator.variant is None:
+        raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
+    return estimator, {estimator.variant: variant}
+
+
+def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
+    """The estimator of a label, and its parameters.
+
+    `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
+    estimator can be replayed with several settings at once. The other settings are its parameters.
+
+    Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+    """
+    if not re.fullmatch(r"[\w:=-]+", label):
+        raise BadInput(f"estimator '{label}': a label is made of letters, digits and '-', '_', ':', '='")
+    values = dict(settings)
+    estimator, variant = find_estimator(str(values.pop("kind", label)))
+    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+
+
+def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+    """Bind an estimator to an ensemble; see `configure`.
+
+    Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
+    of them must be stated alike.
+    """
+    estimator, parameters = configure(label, settings)
+    first = sources[0]
+    try:
+        with foreign_code(f"estimator {label}"):
+            bound = estimator.bind(label, first.topics, parameters)
+    except BadInput as error:
+        raise BadInput(f"{first.name}: {error}") from error
+    if not bound:
+        raise BadInput(
+            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
+            f"the log has {', '.join(first.topics) or 'no topics'}"
+        )
+    for source in sources[1:]:
+        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
+            here, there = first.topics[topic], source.topics.get(topic)
+            if there is None or _stated(there) != _stated(here):
+                raise BadInput(
+                    f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
+                    "ensemble hold the same topics, replay this one on its own"
+                )
+    return bound
+
+
+def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
+    """What an estimator is told of a topic when it is bound."""
+    return topic.schema_name, topic.metadata

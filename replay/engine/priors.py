@@ -1,0 +1,142 @@
+"""The prior rule: components by name, and a run without a usable prior fails alone."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from replay.engine.blocks import Ragged
+from replay.engine.components import Components, match_components, match_tangent, stated_components
+from replay.engine.covariances import is_positive_definite
+from replay.engine.tangent import tangent_components
+
+MISSING = "there is no prior message"
+NOT_FINITE = "the prior is not finite"
+NOT_POSITIVE_DEFINITE = "the prior's covariance is not positive definite"
+
+
+class Priors(NamedTuple):
+    """The first Gaussian of every run, its components in the order in which they were wanted.
+
+    Attributes:
+        time_ns: (runs,) stamps.
+        mean: (runs, d).
+        covariance: (runs, t, t) in the tangent space.
+        reasons: (runs,) why a prior cannot be used, "" where it can; then its numbers are NaN.
+    """
+
+    time_ns: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    reasons: tuple[str, ...]
+
+
+def read_priors(prior: Ragged, components: Components) -> Priors:
+    """The priors of all runs; see `Priors`.
+
+    Raises BadInput where the channel does not state the components (see `match_components`), the
+    vectors have other widths than it states, or no run has a prior that can be used.
+    """
+    priors = _priors_of(prior, components)
+    if all(priors.reasons):
+        raise BadInput(f"{priors.reasons[0]}; the filter cannot start")
+    return priors
+
+
+def _priors_of(prior: Ragged, components: Components) -> Priors:
+    """As `read_priors`, where no run may have one that can be used."""
+    stream, runs = prior.stream, prior.runs
+    where = f"topic {stream.topic}"
+    columns = match_components(stream.metadata, components, where)
+    rows = match_tangent(stream.metadata, components, where)
+    stated = stated_components(stream.metadata, components, where)
+    size = len(match_tangent(stream.metadata, stated, where))
+    present = np.flatnonzero(np.diff(prior.offsets))
+    first = prior.offsets[present]
+    time_ns, mean, covariance, _ = no_priors(runs, components, MISSING)
+    reasons = np.full(runs, MISSING, object)
+    if len(present):
+        widths = stream["mean"].shape[1], stream["covariance"].shape[1]
+        if widths != (len(stated), size**2):
+            raise BadInput(
+                f"{where}: {len(stated)} components are stated, mean and covariance have {widths[0]} "
+                f"and {widths[1]} numbers; {len(stated)} and {size**2} are needed"
+            )
+        time_ns[present] = stream.publish_time_ns[first]
+        mean[present] = stream["mean"][first][:, columns]
+        whole = stream["covariance"][first].reshape(-1, size, size)
+        covariance[present] = whole[:, rows][:, :, rows]
+        finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
+        definite = is_positive_definite(covariance)
+        reasons[present] = np.where(definite, "", NOT_POSITIVE_DEFINITE)[present]
+        reasons[present[~finite[present]]] = NOT_FINITE
+    unusable = reasons != ""
+    mean[unusable], covariance[unusable] = np.nan, np.nan
+    wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
+    told = tuple(f"{wanted}: {reason}" if reason else "" for reason in reasons.tolist())
+    return Priors(time_ns, mean, covariance, told)
+
+
+def no_priors(runs: int, components: Components, reason: str) -> Priors:
+    """Priors that cannot be used, all for one reason."""
+    size = len(tangent_components(list(components), list(components.values())))
+    return Priors(
+        np.zeros(runs, np.int64),
+        np.full((runs, len(components)), np.nan),
+        np.full((runs, size, size), np.nan),
+        (reason,) * runs,
+    )
+
+
+def start_of_runs(
+    whole: Mapping[str, Ragged], priors: Mapping[str, Components]
+) -> tuple[dict[str, Ragged], dict[int, str]]:
+    """What an estimator starts from, and why some runs cannot start.
+
+    Args:
+        whole: whole topics of all runs.
+        priors: which of them are priors, and the components that are wanted of each.
+
+    Returns the topics, where a prior is now one message for every run, of the wanted components in their
+    order, NaN where the run cannot start; and the reasons by run, which may be all of them.
+    Raises BadInput where a topic is no such prior, see `read_priors`.
+    """
+    found, failed = dict(whole), dict[int, str]()
+    for topic, components in priors.items():
+        read = _priors_of(whole[topic], components)
+        for run, reason in enumerate(read.reasons):
+            if reason:
+                failed.setdefault(run, reason)
+        found[topic] = _one_each(topic, read)
+    return found, failed
+
+
+def gaussians(
+    prior: Ragged,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """What an estimator starts from a prior of `start_of_runs`.
+
+    Stamps (runs,), means (runs, d), covariances (runs, t, t), to be changed at will.
+    """
+    size = isqrt(prior["covariance"].shape[1])
+    covariance = prior["covariance"].reshape(-1, size, size)
+    return prior.stream.publish_time_ns.copy(), prior["mean"].copy(), covariance.copy()
+
+
+def _one_each(topic: str, priors: Priors) -> Ragged:
+    runs = len(priors.mean)
+    blank = make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        priors.time_ns,
+        mean=np.zeros_like(priors.mean),
+        covariance=np.zeros((runs, priors.covariance.shape[1] ** 2)),
+    )
+    covariance = priors.covariance.reshape(blank["covariance"].shape)
+    columns = {**blank.columns, "mean": priors.mean, "covariance": covariance}
+    return Ragged(replace(blank, columns=columns), np.arange(runs + 1))

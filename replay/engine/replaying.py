@@ -1,0 +1,207 @@
+"""The replay: one time-ordered pass over the runs of an ensemble, several estimators at once."""
+
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import zip_longest
+from typing import Any
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream
+from recorders.registry import foreign_code
+from replay.engine.blocks import Block, Ragged, gather, join, merge_events
+from replay.engine.estimator import Batch, Bound, Recursive
+from replay.engine.priors import start_of_runs
+from replay.engine.sources import Source
+from replay.engine.supervision import Watch
+
+BLOCK_MESSAGES = 1 << 18
+# The state of what can start in no run.
+_REFUSED = object()
+
+
+@dataclass
+class Report:
+    """What there is to say of a replay beside its outputs.
+
+    Attributes:
+        seconds: how long each estimator worked, by label; compiling is part of a first use.
+        coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
+        refused: by estimator, why no run of a part can be replayed.
+    """
+
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    coverage: list[Ragged] = field(default_factory=list)
+    refused: dict[str, BadInput] = field(default_factory=dict)
+
+
+def replay(
+    sources: Sequence[Source],
+    estimators: Sequence[Bound],
+    *,
+    order: Clock = "publish_time",
+    block_messages: int = BLOCK_MESSAGES,
+    report: Report | None = None,
+    is_part: bool = False,
+) -> Iterator[list[Ragged]]:
+    """Replay an ensemble; yields the output streams of all estimators, block by block.
+
+    Args:
+        sources: the runs, holding the same topics; their schedules may differ.
+        estimators: bound estimators with different names.
+        order: the clock to go by, publish time or (as it arrived) log time.
+        block_messages: about how many messages of a run are in memory at once.
+        report: filled with what there is to say when all is done.
+        is_part: whether there are more runs than these. Then it is no bad input that an estimator can
+            follow none of them: they fail, and the report says so.
+
+    A run that an estimator cannot follow fails alone, see `replay.engine.supervision`; the failures
+    come last.
+    Raises BadInput where an estimator can follow no run, no run has a message for it, or a run's span
+    begins after the prior of an estimator (see `pipeline.starting`).
+    """
+    read = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
+    for bound, whole in zip(estimators, wholes, strict=True):
+        _refuse_old_priors(bound, sources, whole, order)
+    watches = [
+        Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch), is_part=is_part)
+        for bound in estimators
+    ]
+    states, refused = _start(estimators, watches, wholes)
+    if refused and not is_part:
+        raise next(iter(refused.values()))
+    for bound, watch, given in zip(estimators, watches, states, strict=True):
+        if isinstance(bound, Batch):
+            for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
+                yield watch.receive(watch.take(partial(_solve, bound, given), block))
+    streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
+    for block in _ensemble_blocks(sources, sorted(streamed), order, block_messages):
+        outputs: list[Ragged] = []
+        for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
+            if isinstance(bound, Recursive):
+                streams = {topic: block[topic] for topic in bound.streams}
+                work = partial(_advance, bound, states[index], order)
+                states[index], produced = watch.take(work, streams)
+                outputs += watch.receive(produced)
+        yield outputs
+    for bound, watch, state in zip(estimators, watches, states, strict=True):
+        if isinstance(bound, Recursive) and bound.finish is not None and state is not _REFUSED:
+            yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
+    yield [failures for watch in watches for failures in watch.finish()]
+    if report is not None:
+        report.refused |= refused
+        for watch in watches:
+            if watch.refused is not None:
+                report.refused[watch.name] = watch.refused
+            report.seconds[watch.name.partition("/")[0]] += watch.seconds
+            report.coverage += watch.coverage()
+
+
+def _start(
+    estimators: Sequence[Bound], watches: Sequence[Watch], wholes: Sequence[Mapping[str, Ragged]]
+) -> tuple[list[Any], dict[str, BadInput]]:
+    """The states of recursions and what batches are given; _REFUSED where there is none.
+
+    Of what one estimator estimates (each robot, say), what cannot start fails alone. Where that is all,
+    there is also the reason, by the estimator's label.
+    """
+    states: list[Any] = []
+    told_of: dict[str, list[BadInput | None]] = {}
+    for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
+        told = told_of.setdefault(bound.name.partition("/")[0], [])
+        try:
+            given, unable = start_of_runs(whole, bound.priors)
+            watch.exclude(unable)
+            with foreign_code(f"estimator {bound.name}"):
+                states.append(given if isinstance(bound, Batch) else bound.start(given))
+            starts = len(unable) < watch.runs
+            told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
+        except BadInput as error:
+            watch.exclude(dict.fromkeys(range(watch.runs), str(error)))
+            states.append(_REFUSED)
+            told.append(error)
+    refused = {
+        label: errors[0] for label, errors in told_of.items() if errors[0] is not None and all(errors)
+    }
+    return states, refused
+
+
+def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
+    if given is _REFUSED:
+        return []
+    with foreign_code(f"estimator {bound.name}"):
+        return bound.solve(given | streams)
+
+
+def _advance(
+    bound: Recursive, state: Any, order: Clock, streams: dict[str, Ragged]
+) -> tuple[Any, list[Ragged]]:
+    if state is _REFUSED:
+        return state, []
+    events = merge_events(streams, order)
+    with foreign_code(f"estimator {bound.name}"):
+        return bound.run(state, Block(streams, events))
+
+
+def _finish(
+    bound: Recursive,
+    finish: Callable[[Any], list[Ragged]],
+    state: Any,
+    _: dict[str, Ragged],
+) -> list[Ragged]:
+    with foreign_code(f"estimator {bound.name}"):
+        return finish(state)
+
+
+def _refuse_old_priors(
+    bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
+) -> None:
+    """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
+    for topic in bound.priors.keys() - bound.given.keys():
+        for run, source in enumerate(sources):
+            if source.start_ns is None:
+                continue
+            times_ns = whole[topic].of_run(run).times(order)[:1]
+            if len(times_ns) and times_ns[0] < source.start_ns:
+                raise BadInput(
+                    f"{source.name}: the replay would start {bound.name} from {topic}, which is "
+                    f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
+                    "to start from with --start-from truth or --start-from ESTIMATES"
+                )
+
+
+def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, Ragged]:
+    runs = [source.read(topics) for source in sources]
+    return {topic: gather([run[topic] for run in runs]) for topic in topics}
+
+
+def _ensemble_blocks(
+    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
+) -> Iterator[dict[str, Ragged]]:
+    """The next block of every run, until all runs are at their end.
+
+    The runs need not be at the same time: each has its own state.
+    """
+    if not topics:
+        return
+    empty = {topic: sources[0].empty(topic) for topic in topics}
+    ended: dict[str, Stream] = {}
+    is_empty = True
+    runs = [source.blocks(topics, order, block_messages) for source in sources]
+    for blocks in zip_longest(*runs, fillvalue=ended):
+        yield {topic: gather([block.get(topic, empty[topic]) for block in blocks]) for topic in topics}
+        is_empty = False
+    if is_empty:
+        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
+
+
+def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:
+    """Join a replay's blocks into whole output streams by topic, each run's rows together."""
+    parts: dict[str, list[Ragged]] = {}
+    for block in outputs:
+        for ragged in block:
+            parts.setdefault(ragged.stream.topic, []).append(ragged)
+    return {topic: join(found) for topic, found in parts.items()}

@@ -1,0 +1,29 @@
+"""Errors against the covariance that was promised: by component, ellipses, dilution of precision.
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+
+def component_error_squared(error: Array, covariance: Array) -> Array:
+    """Each component's own normalized squared error, (..., n)."""
+    return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)
+
+
+def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
+    """Area of the error ellipse of covariances (..., 2, 2) that holds this probability.
+
+    Zero where rounding makes the determinant of a singular one negative.
+    """
+    squared = np.maximum(np.linalg.det(covariance), 0.0)
+    return np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)
+
+
+def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
+    """GDOP, position error by range and noise of both angles (..., 2); Belfadel et al. 2014, eq (32)."""
+    return np.asarray(position_error_m) / (range_m * np.linalg.norm(sigma_rad, axis=-1))

@@ -1,0 +1,136 @@
+"""Tracks against the things they should follow: which reports of a thing went to one track.
+
+A thing's own track is found by assigning tracks to things one to one, so that as many reports as can be
+are in the track of their thing: a track that swallows two things counts for one of them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from recorders.errors import BadInput
+from recorders.log import schemas
+from replay.judging.metrics import Metric, Output
+
+Integers = NDArray[np.int64]
+IDENTITY = "identity"
+# Things with more reports than that are judged: a few reports say little of a track.
+MANY_REPORTS = 50
+# A thing has kept its track with this share of its reports.
+KEPT_SHARE = 0.95
+
+
+class Kept(NamedTuple):
+    """How many things are judged, what share of them kept a track, and their mean share in it."""
+
+    things: int
+    kept_share: float
+    mean_share: float
+
+
+def track_table(things: Integers, tracks: Integers) -> pd.DataFrame:
+    """One row per thing of reports (n,), most reports first.
+
+    Columns: thing, reports; track, its own, -1 for none; share of its reports in that; largest_share in
+    any track; tracks, how many have a report of it; switches, how often successive reports of it are in
+    different ones; others, how many reports of other things its own track has.
+    """
+    thing, of_thing = np.unique(things, return_inverse=True)
+    track, of_track = np.unique(tracks, return_inverse=True)
+    counts = np.zeros((len(thing), len(track)), np.int64)
+    np.add.at(counts, (of_thing, of_track), 1)
+    rows, columns = linear_sum_assignment(counts, maximize=True)
+    own = np.full(len(thing), -1)
+    own[rows] = np.where(counts[rows, columns] > 0, columns, -1)
+    has_one = own >= 0
+    reports = counts.sum(axis=1)
+    in_own = np.where(has_one, counts[np.arange(len(thing)), own], 0)
+    order = np.argsort(of_thing, kind="stable")
+    changes = (np.diff(of_track[order]) != 0) & (np.diff(of_thing[order]) == 0)
+    table = pd.DataFrame(
+        {
+            "thing": thing,
+            "reports": reports,
+            "track": np.where(has_one, track[own], -1),
+            "share": in_own / reports,
+            "largest_share": counts.max(axis=1) / reports,
+            "tracks": (counts > 0).sum(axis=1),
+            "switches": np.bincount(of_thing[order][1:][changes], minlength=len(thing)),
+            "others": np.where(has_one, counts.sum(axis=0)[own] - in_own, 0),
+        }
+    )
+    return table.sort_values("reports", ascending=False, kind="stable", ignore_index=True)
+
+
+def kept(table: pd.DataFrame, column: str = "share", reports: int = MANY_REPORTS) -> Kept:
+    """How the things with more than so many reports kept their tracks."""
+    shares = table.loc[table["reports"] > reports, column].to_numpy()
+    if len(shares) == 0:
+        return Kept(0, np.nan, np.nan)
+    return Kept(len(shares), float((shares >= KEPT_SHARE).mean()), float(shares.mean()))
+
+
+def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:
+    """How many numbers spoke within the last `live_s`: times (m,) at which that changes, counts (m,).
+
+    Times (n,) are sorted.
+    """
+    order = np.lexsort((time_ns, numbers))
+    sorted_ns, sorted_numbers = time_ns[order], numbers[order]
+    live_ns = round(live_s * 1e9)
+    begins = np.append(True, (np.diff(sorted_numbers) != 0) | (np.diff(sorted_ns) > live_ns))
+    begin_ns = sorted_ns[begins]
+    end_ns = sorted_ns[np.append(begins[1:], True)] + live_ns
+    at_ns = np.unique(np.concatenate([begin_ns, end_ns]))
+    at_ns = at_ns[at_ns <= time_ns[-1]]
+    began = np.searchsorted(np.sort(begin_ns), at_ns, side="right")
+    return at_ns, began - np.searchsorted(np.sort(end_ns), at_ns, side="right")
+
+
+def track_tables(output: Output) -> list[pd.DataFrame]:
+    """A table per run of a stream of tracks; none where the log does not say whose the reports are.
+
+    The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
+    """
+    stream = output.rows.stream
+    if stream.schema.full_name != schemas.TRACK_ESTIMATE.full_name:
+        return []
+    topic = f"{stream.metadata.get('reports', '').rpartition('/')[0]}/{IDENTITY}"
+    tables = []
+    for run, source in enumerate(output.sources):
+        if topic not in source.topics or output.rows.offsets[run] == output.rows.offsets[run + 1]:
+            return []
+        tracks = output.rows.of_run(run)
+        identity = source.read([topic])[topic]
+        times, [first_ns, last_ns] = identity.publish_time_ns, tracks.publish_time_ns[[0, -1]]
+        things = identity["thing_id"][(times >= first_ns) & (times <= last_ns)]
+        if len(things) != len(tracks):
+            raise BadInput(
+                f"{source.name}: {len(things)} identities for {len(tracks)} reports on {stream.topic}; "
+                "give the log that these are estimates of"
+            )
+        tables.append(track_table(things.astype(np.int64), tracks["track_id"].astype(np.int64)))
+    return tables
+
+
+def _measure(output: Output) -> dict[str, float]:
+    tables = track_tables(output)
+    if not tables:
+        return {}
+    found = pd.concat(tables)
+    own, largest = kept(found), kept(found, "largest_share")
+    return {
+        "judged_things": own.things,
+        "kept_track_percent": 100.0 * own.kept_share,
+        "kept_largest_percent": 100.0 * largest.kept_share,
+        "own_track_mean_percent": 100.0 * own.mean_share,
+        "largest_track_mean_percent": 100.0 * largest.mean_share,
+        "tracks": float(np.unique(output.rows["track_id"]).size),
+        "switches": float(found["switches"].sum()),
+    }
+
+
+TRACKS = Metric("how things with more than 50 reports kept one track of their own", Output, _measure)

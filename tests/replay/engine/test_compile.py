@@ -1,0 +1,431 @@
+"""Kernels are compiled once per source text, wherever they come from and whatever the cache allows."""
+
+import ast
+import inspect
+import os
+import stat
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import replay.engine.compile
+from recorders.errors import BadInput
+from recorders.log import loops
+from replay.engine.compile import _load, cache_folder, compile_over_runs, compiled
+
+# A module with models and a kernel of its own, as a third party would write them: plain functions.
+MODULE = """
+    import numpy as np
+    from typing import NamedTuple
+    from replay.engine.compile import compile_over_runs
+
+    GAIN = 3.0
+
+    class Columns(NamedTuple):
+        given: np.ndarray
+        found: np.ndarray
+
+    def model(value):
+        "A docstring is no part of the kernel."
+        return GAIN * value + 1.0
+
+    def kernel(sensor):
+        def one(run, columns):
+            columns.found[run] = sensor(columns.given[run])
+        return one
+
+    columns = Columns(np.arange(3.0), np.zeros(3))
+    loop = compile_over_runs(kernel(model), allocates=False)
+    loop(3, columns)
+    compiled = loop.keywords["loop"]
+    print(*columns.found, "cached" if compiled.stats.cache_hits else "compiled")
+"""
+
+
+def imported(module: str, folder: Path, cache: Path) -> list[str]:
+    """What the module prints when a new process imports it."""
+    (folder / "third_party.py").write_text(textwrap.dedent(module))
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "import third_party"],
+        cwd=folder,
+        env={
+            "HOME": str(folder),
+            "FUSELOG_CACHE": str(cache),
+            "PYTHONPATH": str(
+                Path(replay.engine.compile.__file__).parents[2]
+            ),  # the tree that is under test
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp_path: Path):
+    """Neither a compilation at every start, nor the old model after a change."""
+    cache = tmp_path / "cache"
+    assert imported(MODULE, tmp_path, cache)[0] == "1.0 4.0 7.0 compiled"
+    assert imported(MODULE, tmp_path, cache)[0] == "1.0 4.0 7.0 cached"
+    changed = MODULE.replace("value + 1.0", "value - 1.0")
+    assert imported(changed, tmp_path, cache)[0] == "-1.0 2.0 5.0 compiled"
+
+
+# A function that numba compiles by what another module says of it, as jets are.
+EXTENSION = """
+    from numba.extending import overload
+
+    def gain(value):
+        raise NotImplementedError("never called: numba is told below what it does")
+
+    @overload(gain)
+    def compiled_gain(value):
+        return lambda value: 3.0 * value
+"""
+
+
+def test_what_is_imported_by_name_is_compiled_anew_when_its_module_changes(tmp_path: Path):
+    """By itself numba goes on with the old one: it looks at the file of the kernel alone."""
+    cache = tmp_path / "cache"
+    user = MODULE.replace("GAIN = 3.0", "from extension import gain").replace(
+        "GAIN * value", "gain(value)"
+    )
+    for extension, expected in (
+        (EXTENSION, "1.0 4.0 7.0 compiled"),
+        (EXTENSION, "1.0 4.0 7.0 cached"),
+        (EXTENSION.replace("3.0", "5.00"), "1.0 6.0 11.0 compiled"),
+    ):
+        (tmp_path / "extension.py").write_text(textwrap.dedent(extension))
+        assert imported(user, tmp_path, cache)[0] == expected
+
+
+CALLED_FROM_PYTHON = """
+    import numpy as np
+    from model import moved
+    from replay.engine.compile import compiled
+
+    @compiled
+    def kernel(given, found):
+        for k in range(len(given)):
+            found[k] = moved(given[k])
+
+    found = np.zeros(3)
+    kernel(np.arange(3.0), found)
+    print(*found)
+"""
+
+
+def test_a_change_in_another_file_is_noticed(tmp_path: Path):
+    """Of a function, and of the order of a named tuple's fields: numba sees neither."""
+    cache = tmp_path / "cache"
+    for change, expected in ((1.0, "1.0 2.0 3.0"), (2.0, "2.0 3.0 4.0")):
+        (tmp_path / "model.py").write_text(f"def moved(x):\n    return x + {change}\n")
+        assert imported(CALLED_FROM_PYTHON, tmp_path, cache) == [expected]
+    head, fields = MODULE.split("class Columns(NamedTuple):")[0], ("given", "found")
+    rest = MODULE.split("found: np.ndarray", 1)[1].replace(
+        "Columns(np.arange(3.0), np.zeros(3))", "MADE"
+    )
+    rest = rest.replace("MADE", "Columns(given=np.arange(3.0), found=np.zeros(3))")
+    for names in (fields, fields[::-1]):
+        body = "".join(f"    {name}: np.ndarray\n" for name in names)
+        text = f"import numpy as np\nfrom typing import NamedTuple\nclass Columns(NamedTuple):\n{body}"
+        (tmp_path / "columns.py").write_text(text)
+        assert imported(f"{head}from columns import Columns{rest}", tmp_path, cache)[0] == (
+            "1.0 4.0 7.0 compiled"
+        )
+
+
+def test_a_cache_that_cannot_be_written_does_not_stop_the_work(tmp_path: Path):
+    """The kernel is compiled for this process alone, and nothing is left behind."""
+    (tmp_path / "file").touch()
+    assert imported(MODULE, tmp_path, tmp_path / "file" / "cache") == ["1.0 4.0 7.0 compiled"]
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "third_party.py", "__pycache__"}
+
+
+@pytest.fixture
+def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache; where its kernels will lie."""
+    monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "kernels"
+
+
+def found_in_the_cache() -> bool:
+    """Whether a kernel, which gives the right number, is loaded rather than compiled."""
+    _load.cache_clear()
+    loop, found = compile_over_runs(divide, allocates=False), np.zeros(1)
+    loop(1, np.array([4.0]), found)
+    assert found[0] == 0.25
+    return bool(loop.keywords["loop"].stats.cache_hits)
+
+
+@pytest.mark.parametrize(
+    "damage", ["emptied", "cut", "flipped", "unlike its checksum", "not ours", "another kernel's"]
+)
+def test_a_damaged_file_is_compiled_anew_and_replaced(kernels: Path, damage: str):
+    """As a loss of power leaves it; what is executed has to be what was written."""
+    assert not found_in_the_cache()
+    assert found_in_the_cache()
+    (path,) = kernels.iterdir()
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    changed = {
+        "emptied": b"",
+        "cut": whole[:middle],
+        "flipped": whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :],
+        "unlike its checksum": bytes([whole[0] ^ 1]) + whole[1:],
+        "not ours": b"\x80\x04.",
+    }
+    path.write_bytes(changed.get(damage, whole))
+    if damage == "another kernel's":
+        loop = compile_over_runs(sorted_copy)
+        loop(1, np.array([[3.0, 1.0]]), np.zeros(1))
+        (other,) = set(kernels.iterdir()) - {path}
+        other.replace(path)
+    assert not found_in_the_cache()
+    assert found_in_the_cache()
+    assert list(kernels.iterdir()) == [path]
+
+
+@pytest.mark.usefixtures("kernels")
+def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
+    """A whole file that cannot be loaded all the same."""
+    assert not found_in_the_cache()
+    with monkeypatch.context() as broken:
+        broken.setattr("replay.engine.compile.pickle.loads", lambda _: 1 / 0)
+        assert not found_in_the_cache()
+    assert found_in_the_cache()
+
+
+def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    assert not found_in_the_cache()
+    assert not found_in_the_cache()
+    assert list(kernels.iterdir()) == []
+    assert caplog.messages == [
+        f"the cache {kernels} cannot be written (No space left on device): "
+        "what is compiled now is not kept"
+    ]
+
+
+def test_only_a_folder_of_this_user_alone_is_used(
+    kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog
+):
+    """The cache executes what it finds. Windows, which has no user numbers, uses its folder as it is."""
+    before = os.umask(0)
+    try:
+        assert not found_in_the_cache()
+    finally:
+        os.umask(before)
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (kernels.parent, kernels)] == [0o700] * 2
+    for folder in (kernels, kernels.parent):
+        folder.chmod(0o770)
+        assert not found_in_the_cache()
+        assert not found_in_the_cache()
+        folder.chmod(0o755)
+        assert found_in_the_cache()
+    user = os.getuid()
+    with monkeypatch.context() as another:
+        another.setattr(os, "getuid", lambda: user + 1)
+        assert not found_in_the_cache()
+    monkeypatch.delattr(os, "getuid")
+    assert found_in_the_cache()
+    assert caplog.messages == [
+        f"the cache {kernels} is not used: other users may write to it; chmod go-w mends that",
+        f"the cache {kernels.parent} is not used: other users may write to it; chmod go-w mends that",
+        f"the cache {kernels.parent} is not used: another user owns it; set FUSELOG_CACHE to your own",
+    ]
+
+
+def test_every_kernel_of_replay_is_compiled_here():
+    """A raw `njit(cache=True)` would not notice a change in another file."""
+    users = {path.name: path for path in Path("replay").rglob("*.py") if "numba" in imports_of(path)}
+    assert users.keys() == {"compile.py", "jets.py"}
+    # jets are a type of their own to numba; a kernel that uses them has a hash of that file in its key
+    assert "njit" not in users["jets.py"].read_text(encoding="utf-8")
+
+
+def test_the_loops_of_the_log_call_nothing_outside_their_file():
+    """Numba caches them, since recorders know no replay, and notices a change in their own file only."""
+    users = [path for path in Path("recorders").rglob("*.py") if "numba" in imports_of(path)]
+    assert users == [Path("recorders/log/loops.py")]
+    kernels = [each for each in vars(loops).values() if hasattr(each, "py_func")]
+    assert {kernel.py_func.__name__ for kernel in kernels} == {"_scan", "_agree"}
+    for kernel in kernels:
+        outside = dict(inspect.getclosurevars(kernel.py_func).globals)
+        assert outside.pop("np") is np
+        assert set(outside) <= {"MESSAGE_HEAD_BYTES", "HEAD_BYTES", "_MESSAGE", "_SCHEMA", "_CHANNEL"}
+        assert all(type(value) is int for value in outside.values())
+
+
+def imports_of(path: Path) -> set[str]:
+    """The top-level names of the modules that a file imports."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    named = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    taken = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+    return {name.partition(".")[0] for name in named + taken}
+
+
+def test_the_cache_folder_can_be_moved(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("FUSELOG_CACHE", "/elsewhere")
+    assert cache_folder() == Path("/elsewhere")
+    monkeypatch.delenv("FUSELOG_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/xdg")
+    assert cache_folder() == Path("/xdg/fuselog")
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert cache_folder() == Path.home() / ".cache" / "fuselog"
+
+
+def twice(value: float) -> float:
+    return 2.0 * value
+
+
+def fill(run: int, values: np.ndarray, found: np.ndarray, work: np.ndarray) -> None:
+    """Plain Python too: the same function, uncompiled, says what the compiled one must."""
+    total = 0.0
+    for k in range(len(work)):
+        work[k] = twice(values[run, k])
+        total += np.sqrt(work[k])
+    found[run] = total
+
+
+def test_the_loop_does_every_run_once_whatever_the_cores(monkeypatch: pytest.MonkeyPatch):
+    """Scratch memory is each core's own: a race would mix the runs."""
+    loop = compile_over_runs(fill, allocates=False)
+    values = np.random.default_rng(1).uniform(size=(503, 200))
+    expected = np.empty(503)
+    for run in range(503):
+        fill(run, values, expected, np.empty(200))
+    for cores in (1, 2, 7, 1000):
+        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", cores)
+        found = np.full(503, np.nan)
+        loop(503, values, found, scratch=lambda: np.empty(200))
+        assert_array_equal(found, expected)
+    loop(0, values, found, scratch=lambda: np.empty(200))
+
+
+def sorted_copy(run: int, values: np.ndarray, found: np.ndarray) -> None:
+    found[run] = np.sort(values[run])[:2] @ np.ones(2)
+
+
+def test_a_kernel_that_allocates_says_so():
+    """With the default it may use what makes arrays; one that says that it makes none must not."""
+    values, found = np.array([[3.0, 1.0, 2.0]]), np.zeros(1)
+    compile_over_runs(sorted_copy)(1, values, found)
+    assert found[0] == 3.0
+    with pytest.raises(BadInput, match="a kernel that makes arrays is compiled with allocates=True"):
+        compile_over_runs(sorted_copy, allocates=False)(1, values, found)
+
+
+def divide(run: int, values: np.ndarray, found: np.ndarray) -> None:
+    found[run] = 1.0 / values[run]
+
+
+def test_a_division_by_zero_is_infinity_and_stops_no_other_run():
+    found = np.zeros(3)
+    compile_over_runs(divide, allocates=False)(3, np.array([2.0, 0.0, 4.0]), found)
+    assert_array_equal(found, [0.5, np.inf, 0.25])
+
+
+def kernel_of(*models: Callable[[float], float]) -> Callable[..., None]:
+    first, second = models[0], models[-1]
+
+    def one(run: int, found: np.ndarray) -> None:
+        found[run] = first(run) + second(run)
+
+    return one
+
+
+def scaled_by(scale: float) -> Callable[[float], float]:
+    def scaled(value: float) -> float:
+        return scale * value
+
+    return scaled
+
+
+def test_numbers_that_a_kernel_closes_over_are_part_of_it():
+    """The same source around another number is another kernel; infinity and NumPy's numbers are fine."""
+    scales = (2.0, 3.0, np.float64(0.5), -np.inf)
+    found = np.zeros((len(scales), 2))
+    for row, scale in enumerate(scales):
+        compile_over_runs(kernel_of(scaled_by(scale)), allocates=False)(2, found[row])
+    assert_array_equal(found[:, 1], [4, 6, 1, -np.inf])
+
+
+def offset_by(scale: float) -> Callable[[float], float]:
+    def offset(value: float) -> float:
+        return scale + value
+
+    return offset
+
+
+@pytest.mark.parametrize("second", [1.5, 2.5])
+def test_numbers_of_one_name_are_each_models_own(second: float):
+    """Two models may each close over a `scale`, equal or not, and each keeps its own."""
+    found = np.zeros(2)
+    compile_over_runs(kernel_of(scaled_by(1.5), offset_by(second)), allocates=False)(2, found)
+    assert_array_equal(found, [second, 1.5 + (second + 1)])
+
+
+def test_what_numba_has_compiled_already_is_compiled_with_the_rest():
+    found = np.zeros(2)
+    compile_over_runs(kernel_of(numba.njit(twice)), allocates=False)(2, found)
+    assert_array_equal(found, [0, 4])
+
+
+TABLE = np.array([[1.0 + 2.0j, 3.0], [0.1, -np.inf]])
+TABLE.setflags(write=False)
+
+
+@compiled
+def from_table(row: int, column: int) -> complex:
+    """A kernel that other kernels use, around a table that nobody can change."""
+    return TABLE[row, column]
+
+
+@compiled
+def columns_of(row: int) -> np.ndarray:
+    return np.array([from_table(row, 0), from_table(row, 1)])
+
+
+def test_a_compiled_function_serves_python_and_other_kernels():
+    assert from_table(0, 0) == 1.0 + 2.0j
+    assert_array_equal(columns_of(1), TABLE[1])
+    with pytest.raises(ValueError, match="read-only"):
+        TABLE[0, 0] = 0.0
+
+
+def through_a_module(run: int, found: np.ndarray) -> None:
+    found[run] = loops.HEAD_BYTES
+
+
+def test_two_closures_of_one_function_stay_two():
+    """A filter regresses its motion and its sensor by one function: the names must not run together."""
+    found = np.zeros(3)
+    compile_over_runs(kernel_of(scaled_by(2.0), scaled_by(3.0)), allocates=False)(3, found)
+    assert_array_equal(found, [0, 5, 10])
+
+
+def test_what_cannot_be_compiled_is_told_in_one_sentence():
+    typed: dict[str, Callable] = {}
+    exec("def typed(value): return value", typed)
+    with pytest.raises(BadInput, match="the source of typed is not at hand"):
+        compile_over_runs(kernel_of(typed["typed"]))
+    with pytest.raises(BadInput, match="is no `def` function; kernels are made of these"):
+        compile_over_runs(kernel_of(lambda value: value))
+    with pytest.raises(BadInput, match=r"uses 'scale', a ndarray, .* hand it in as an argument"):
+        compile_over_runs(kernel_of(scaled_by(np.ones(3))))
+    with pytest.raises(BadInput, match=r"the module recorders.log.loops: import what it needs of it by"):
+        compile_over_runs(through_a_module)
+    with pytest.raises(BadInput, match="kernel 'one' does not compile: No implementation of function"):
+        compile_over_runs(kernel_of(twice))(1, "text")

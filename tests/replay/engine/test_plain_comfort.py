@@ -1,0 +1,334 @@
+"""What estimators of third parties can ask for: outputs, topics, random numbers, small matrices."""
+
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from recorders.errors import BadInput
+from recorders.log import Field, RunMetadata, Schema, Stream, make_stream, schemas
+from recorders.parameters import Parameters
+from recorders.recording import Recording
+from replay.engine.blocks import Ragged
+from replay.engine.compile import _load, compile_over_runs
+from replay.engine.estimator import Estimator
+from replay.engine.plain import (
+    Estimates,
+    Floats,
+    Given,
+    Innovations,
+    Messages,
+    OneRun,
+    Results,
+    Told,
+    batch,
+    each_run,
+    recursive,
+)
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import MemorySource, memory_source
+from replay.inference.small_matrices import predict, solve, update, update_memory
+
+DETOUR = Schema(
+    "Detour",
+    "How far it was.",
+    (Field("sensor_time_ns", "time_ns"), Field("by", "identifier"), Field("metres", "real")),
+    package="test",
+)
+X = {"x_m": "linear"}
+
+
+class SeededParameters(Parameters):
+    """None takes what the channel states."""
+
+    seed: int = 0
+    sigma_m: float | None = None
+
+
+class State(NamedTuple):
+    """Where it is, (runs, 1)."""
+
+    x: Floats
+
+
+def make_run(values: list[float], *, odometry: bool = True) -> MemorySource:
+    times_ns = np.arange(len(values)) * 10 + 100
+    streams: list[Stream] = [
+        make_stream(
+            "/a/range",
+            schemas.RANGE,
+            times_ns,
+            target_id=np.arange(len(values)),
+            range_m=np.array(values),
+        ),
+        make_stream(
+            "/a/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            [0],
+            metadata={"components": "y_m,x_m", "kinds": "linear,linear", "sigma_m": "0.5"},
+            mean=[[7.0, values[0]]],
+            covariance=np.diag([2.0, 3.0]).reshape(1, 4),
+        ),
+    ]
+    if odometry:
+        streams.append(
+            make_stream(
+                "/a/odometry",
+                schemas.ODOMETRY,
+                times_ns + 5,
+                forward_mps=times_ns * 1.0,
+                turn_radps=times_ns,
+            )
+        )
+    return memory_source(Recording(streams, 0), RunMetadata("test"))
+
+
+def run(estimator: Estimator[Any], runs: list[MemorySource], **values: Any) -> dict[str, Ragged]:
+    block = values.pop("block_messages", 1 << 18)
+    bound = estimator.bind("m", runs[0].topics, estimator.parameters(**values))
+    return collect(replay(runs, bound, block_messages=block))
+
+
+def start(given: Given[Any]) -> tuple[tuple[()], State]:
+    return (), State(given.prior("prior")[1])
+
+
+def walk(
+    run: int, settings: Any, messages: Messages, state: State, results: Results, generator: Any
+) -> None:
+    """Draws; tells of every second message."""
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        state.x[run, 0] += generator.standard_normal()
+        results.mean[row, 0] = state.x[run, 0]
+        results.covariance[row, 0, 0] = 1.0
+        if messages.topic[row] == 1:
+            results.further[row, 0] = 3
+            results.further[row, 1] = messages.value[row, 0]
+
+
+def walking(**more: Any) -> Estimator[Any]:
+    return recursive(
+        "walks at random",
+        parameters=SeededParameters,
+        streams={"range": schemas.RANGE, "odometry": schemas.ODOMETRY},
+        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        components=X,  # type: ignore[arg-type]
+        optional=("odometry",),
+        outputs={"detour": DETOUR},
+        draws=True,
+        start=start,
+        follow=walk,
+        **more,
+    )
+
+
+def test_random_numbers_are_a_runs_own() -> None:
+    """Neither other runs nor blocks nor the compiler change them; the seed does."""
+    runs = [make_run([1.0, 2.0, 5.0]), make_run([4.0]), make_run([2.0, 1.0])]
+    together = run(walking(), runs)["/estimates/m/a/state"]
+    for number, source in enumerate(runs):
+        alone = run(walking(compiled=False), [source])["/estimates/m/a/state"]
+        assert np.array_equal(together.of_run(number)["mean"], alone["mean"])
+    in_blocks = run(walking(), runs, block_messages=1)["/estimates/m/a/state"]
+    assert np.array_equal(together["mean"], in_blocks["mean"])
+    steps = [np.diff(together.of_run(number)["mean"][:, 0], prepend=0.0) for number in range(3)]
+    assert len(np.unique(np.concatenate(steps))) == 12
+    other = run(walking(), runs, seed=1)["/estimates/m/a/state"]
+    assert not np.any(other["mean"] == together["mean"])
+
+
+def test_further_outputs_and_topics_that_may_be_absent() -> None:
+    told = run(walking(), [make_run([1.0, 2.0]), make_run([3.0])])["/estimates/m/a/detour"]
+    assert told.offsets.tolist() == [0, 2, 3]
+    assert told["by"].tolist() == [3, 3, 3]
+    assert told["metres"].tolist() == [100.0, 110.0, 100.0]
+    assert told.stream.publish_time_ns.tolist() == [105, 115, 105]
+    without = run(walking(), [make_run([1.0, 2.0], odometry=False)])
+    assert len(without["/estimates/m/a/state"]) == 2
+    assert len(without["/estimates/m/a/detour"]) == 0
+    assert "odometry (fuselog.Odometry, optional)" in walking().needs
+    vector = Schema("V", "v", (Field("sensor_time_ns", "time_ns"), Field("v", "vector")), package="t")
+    with pytest.raises(BadInput, match="field v of its output extra is a vector"):
+        recursive(
+            "v",
+            parameters=Parameters,
+            streams={},
+            whole={},
+            components=X,  # type: ignore[arg-type]
+            outputs={"extra": vector},
+            start=start,
+            follow=walk,
+        )
+
+
+def careless(run: int, values: Floats) -> None:
+    values[run] = np.random.normal()  # noqa: NPY002
+
+
+def slips(run: int, settings: Any, messages: Messages, state: State, results: Results) -> None:
+    state.x[run, 0] = 0.0
+    results.mean[0, 0] = messages.nothing  # type: ignore[attr-defined]
+
+
+def test_what_cannot_be_compiled_is_named_with_its_line() -> None:
+    """A generator that is nobody's own, and what numba complains of."""
+    with pytest.raises(BadInput, match=rf"careless uses np.random \({__file__}, line \d+\)"):
+        compile_over_runs(careless)
+    if os.environ.get("FUSELOG_UNCOMPILED"):
+        return
+    wrong = recursive(
+        "wrong",
+        parameters=Parameters,
+        streams={"range": schemas.RANGE},
+        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        components=X,  # type: ignore[arg-type]
+        start=start,
+        follow=slips,
+    )
+    line = slips.__code__.co_firstlineno + 2
+    expected = (
+        rf"estimator m/a: kernel 'slips' does not compile: .*nothing.* \({__file__}, line {line}\)"
+    )
+    with pytest.raises(BadInput, match=expected):
+        run(wrong, [make_run([1.0])])
+
+
+def solved(shape: tuple[int, ...]) -> Estimator[Any]:
+    def solve_one(streams: OneRun, parameters: SeededParameters) -> Estimates:
+        _, mean, covariance = streams.prior("prior")
+        assert streams.stated("prior", "sigma_m") == 0.5
+        seen = streams["range"]
+        mean = mean + streams.generator.normal()
+        innovation = seen["range_m"][:, None] - mean
+        told = Told(seen.publish_time_ns[:1], {"by": np.array([2]), "metres": np.array([0.5])})
+        spread = np.full((len(seen), 1, 1), 4.0)
+        return Estimates(
+            seen.publish_time_ns[-1:],
+            mean[None],
+            np.broadcast_to(covariance[0, 0], shape),
+            innovations=Innovations(seen.publish_time_ns, innovation, spread, seen["target_id"]),
+            further={"detour": told},
+        )
+
+    return batch(
+        "solves",
+        parameters=SeededParameters,
+        streams={"range": schemas.RANGE},
+        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        components=X,  # type: ignore[arg-type]
+        measured={"range_m": "linear"},
+        outputs={"detour": DETOUR},
+        solve=each_run(solve_one),
+    )
+
+
+def test_a_batch_has_priors_generators_innovations_and_further_outputs() -> None:
+    runs = [make_run([1.0, 2.0]), make_run([5.0])]
+    out: Mapping[str, Ragged] = run(solved((1, 1, 1)), runs)
+    assert out["/estimates/m/a/state"]["covariance"].tolist() == [[3.0], [3.0]]
+    mean = out["/estimates/m/a/state"]["mean"][:, 0]
+    assert mean[0] - 1.0 != mean[1] - 5.0
+    alone = run(solved((1, 1, 1)), runs[1:])["/estimates/m/a/state"]
+    assert alone["mean"][0, 0] == mean[1]
+    innovation = out["/estimates/m/a/innovation"]
+    assert innovation.offsets.tolist() == [0, 2, 3]
+    assert innovation["target_id"].tolist() == [0, 1, 0]
+    squared = (np.array([1.0, 2.0, 5.0]) - mean[[0, 0, 1]]) ** 2 / 4.0
+    np.testing.assert_allclose(innovation["normalised_innovation_squared"], squared)
+    assert out["/estimates/m/a/detour"]["by"].tolist() == [2, 2]
+
+
+def test_a_batch_of_the_wrong_shape_is_told_in_one_sentence() -> None:
+    words = r"estimator m/a: covariance has the shape \(1, 2, 2\); \(1, 1, 1\) is wanted"
+    with pytest.raises(BadInput, match=words):
+        run(solved((1, 2, 2)), [make_run([1.0])])
+
+
+def test_small_matrices_are_numpys() -> None:
+    """The filter's two steps and Cholesky's solution, beside linear algebra; a component is missing."""
+    rng = np.random.default_rng(1)
+
+    def definite(size: int) -> Floats:
+        root = rng.normal(size=(size, size))
+        return root @ root.T + 0.1 * np.eye(size)
+
+    x, p, f, q = rng.normal(size=3), definite(3), rng.normal(size=(3, 3)), definite(3)
+    h, r, v = rng.normal(size=(2, 3)), definite(2), np.array([0.5, np.nan])
+    mean, covariance = x.copy(), p.copy()
+    predict(mean, covariance, f, q, np.empty((3, 3)))
+    np.testing.assert_allclose(mean, f @ x)
+    np.testing.assert_allclose(covariance, f @ p @ f.T + q)
+    squared = update(mean, covariance, v, h, r, update_memory(3, 2))
+    before = f @ p @ f.T + q
+    s = h[0] @ before @ h[0] + r[0, 0]
+    gain = before @ h[0] / s
+    np.testing.assert_allclose(mean, f @ x + gain * v[0])
+    np.testing.assert_allclose(covariance, before - s * np.outer(gain, gain))
+    assert squared == pytest.approx(v[0] ** 2 / s)
+    right = rng.normal(size=3)
+    expected = np.linalg.solve(q, right)
+    assert solve(q, right, 3)
+    np.testing.assert_allclose(right, expected)
+    assert not solve(-np.eye(3), right, 3)
+    assert np.isnan(update(mean, covariance, v, h, -1e6 * np.eye(2), update_memory(3, 2)))
+
+
+def tracked(run: int, mean: Floats, covariance: Floats, noise: Floats, squared: Floats) -> None:
+    memory, product = update_memory(2, 2), np.empty((2, 2))
+    transition, rows, difference = np.eye(2), np.eye(2), np.ones(2)
+    for _ in range(3):
+        predict(mean[run], covariance[run], transition, noise, product)
+        squared[run] += update(mean[run], covariance[run], difference, rows, noise, memory)
+
+
+def test_small_matrices_compile() -> None:
+    compiled, plain = (
+        (np.ones((2, 2)), np.stack([np.eye(2)] * 2), 0.5 * np.eye(2), np.zeros(2)) for _ in range(2)
+    )
+    compile_over_runs(tracked, allocates=True)(2, *compiled)
+    tracked(0, *plain)
+    np.testing.assert_allclose(compiled[0][0], plain[0][0])
+    np.testing.assert_allclose(compiled[1][1], plain[1][0])
+    assert compiled[3][1] == pytest.approx(plain[3][0])
+
+
+def test_all_runs_at_once_are_one_call() -> None:
+    """`follow_all` sees the whole ensemble; neither it nor `follow` is bad input."""
+    seen: list[int] = []
+
+    def settle(settings: Any, messages: Messages, state: State, results: Results) -> None:
+        seen.append(len(messages.offsets) - 1)
+        results.mean[:, 0], results.covariance[:] = messages.value[:, 1], 1.0
+
+    given: dict[str, Any] = {
+        "parameters": Parameters,
+        "streams": {"range": schemas.RANGE},
+        "whole": {"prior": schemas.GAUSSIAN_ESTIMATE},
+        "components": X,
+        "start": start,
+    }
+    out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
+    assert seen == [2]
+    assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(BadInput, match="give follow or follow_all"):
+        recursive("none", **given)
+
+
+@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
+def test_long_compiling_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """While it happens, and not where the code was kept."""
+    monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
+    monkeypatch.setattr("replay.engine.compile._PATIENCE_S", 0.0)
+    caplog.set_level(logging.INFO, logger="fuselog")
+    arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
+    for _ in range(2):
+        _load.cache_clear()
+        compile_over_runs(tracked)(2, *arguments)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [f"compiling {tracked.__module__}.tracked, once"]

@@ -1,0 +1,136 @@
+"""Errors and interpolation on the circle, of axes and of orientations."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from recorders.log.run import RunMetadata
+from recorders.recording import Recording
+from replay.engine.blocks import gather
+from replay.engine.sources import memory_source
+from replay.engine.tangent import (
+    are_kinds,
+    between,
+    difference,
+    tangent_components,
+    vector_part_covariance,
+)
+from replay.judging.evaluation import errors_of, truth_at
+from replay.judging.metrics import accuracy
+
+QUATERNION = ["quaternion"] * 4
+
+
+def as_array(rotation: Rotation) -> np.ndarray:
+    return rotation.as_quat(scalar_first=True)
+
+
+def test_errors_of_orientations_are_rotation_vectors_in_the_body_frame():
+    """Against SciPy, for either sign of each quaternion."""
+    generator = np.random.default_rng(0)
+    truth = Rotation.random(50, rng=generator)
+    error = generator.uniform(-1.7, 1.7, (50, 3))
+    estimate = truth * Rotation.from_rotvec(error)
+    signs = generator.choice([-1.0, 1.0], (2, 50, 1))
+    found = difference(signs[0] * as_array(estimate), signs[1] * as_array(truth), QUATERNION)
+    np.testing.assert_allclose(found, error, atol=1e-12)
+
+
+def test_tiny_errors_keep_their_digits():
+    turn = np.array([[1.0, 1e-9, 0.0, 0.0]])
+    np.testing.assert_allclose(
+        difference(turn, np.eye(4)[:1], QUATERNION), [[2e-9, 0.0, 0.0]], rtol=1e-12
+    )
+
+
+def test_an_axis_equals_its_negative():
+    angle = np.array([0.1, 1.5, -1.5, 3.0])
+    axes = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    truth = np.tile([-1.0, 0.0], (4, 1))
+    expected = [[0.1], [1.5], [-1.5], [3.0 - np.pi]]
+    np.testing.assert_allclose(difference(axes, truth, ["axis", "axis"]), expected, atol=1e-12)
+
+
+def test_interpolation_is_slerp_by_the_short_way():
+    generator = np.random.default_rng(1)
+    ends = Rotation.random(2, rng=generator)
+    weight = np.linspace(0.0, 1.0, 7)
+    left, right = (np.tile(end, (7, 1)) for end in as_array(ends))
+    expected = as_array(Slerp([0.0, 1.0], ends)(weight))
+    for sign in (1.0, -1.0):
+        found = between(left, sign * right, weight, QUATERNION)
+        np.testing.assert_allclose(np.abs((found * expected).sum(axis=1)), 1.0, atol=1e-14)
+
+
+def test_kinds_of_one_state_stand_side_by_side():
+    mixed = ["linear", *QUATERNION, "angle", "axis", "axis"]
+    names = ["x_m", "body_w", "body_x", "body_y", "body_z", "heading_rad", "line_x", "line_y"]
+    assert are_kinds(mixed)
+    assert not are_kinds(["quaternion"] * 3)
+    assert not are_kinds(["axis", "linear", "axis"])
+    assert [name for name, _ in tangent_components(names, mixed)] == [
+        "x_m",
+        "body_x_rad",
+        "body_y_rad",
+        "body_z_rad",
+        "heading_rad",
+        "line_rad",
+    ]
+    states = np.array([[1.0, 1, 0, 0, 0, 3.0, 1, 0], [3.0, 0, 1, 0, 0, -3.0, 0, 1]])
+    half = between(states[:1], states[1:], np.array([0.5]), mixed)[0]
+    np.testing.assert_allclose(half[:5], [2.0, 0.5**0.5, 0.5**0.5, 0, 0], atol=1e-12)
+    assert abs(half[5]) == pytest.approx(np.pi)
+
+
+def test_covariance_of_the_vector_part_is_that_of_small_rotations():
+    generator = np.random.default_rng(2)
+    truth = Rotation.random(rng=generator)
+    covariance = 1e-6 * np.array([[4.0, 1, 0], [1, 2, 0], [0, 0, 1]])
+    errors = generator.multivariate_normal(np.zeros(3), covariance, 200_000)
+    drawn = as_array(truth * Rotation.from_rotvec(errors))
+    moment = drawn.T @ drawn / len(drawn)
+    found = vector_part_covariance(as_array(truth)[None], moment[None])[0]
+    np.testing.assert_allclose(found, covariance, atol=5e-8)
+
+
+def test_truth_over_a_gap_is_unknown():
+    states = as_array(Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4]]))
+    truth = make_stream("/truth", schemas.TRUTH_STATE, [0, 10**8, 10**9], state=states)
+    found = truth_at(truth, np.array([5 * 10**7, 5 * 10**8]), QUATERNION, 0.2)
+    np.testing.assert_allclose(Rotation.from_quat(found[0], scalar_first=True).magnitude(), 0.1)
+    assert np.isnan(found[1]).all()
+
+
+def judged(kinds: list[str]):
+    """Errors of estimates that are off by (.01, -.02, .02) rad sigma .01 rad each."""
+    named = {"components": ",".join(f"body_{part}" for part in "wxyz"), "kinds": ",".join(kinds)}
+    truth = Rotation.random(20, rng=np.random.default_rng(3))
+    estimate = truth * Rotation.from_rotvec([0.01, -0.02, 0.02])
+    time_ns = np.arange(20) * 10**7
+    recording = Recording(
+        [make_stream("/truth", schemas.TRUTH_STATE, time_ns, metadata=named, state=as_array(truth))], 0
+    )
+    estimates = make_stream(
+        "/estimates/one/state",
+        schemas.GAUSSIAN_ESTIMATE,
+        time_ns,
+        metadata={**named, "truth": "/truth"},
+        mean=-as_array(estimate),
+        covariance=np.tile(1e-4 * np.eye(3).ravel(), (20, 1)),
+    )
+    return errors_of(gather([estimates]), [memory_source(recording, RunMetadata("none"))])
+
+
+def test_nees_and_total_error_are_those_of_the_rotation():
+    errors = judged(QUATERNION)
+    np.testing.assert_allclose(errors.nees, 9.0, rtol=1e-9)
+    numbers = accuracy(errors)
+    assert numbers["orientation_rmse_deg"] == pytest.approx(np.degrees(0.03))
+    assert numbers["body_y_rmse_rad"] == pytest.approx(0.02)
+
+
+def test_half_a_quaternion_is_bad_input():
+    with pytest.raises(BadInput, match="a quaternion four"):
+        judged(["quaternion", "quaternion", "quaternion", "linear"])

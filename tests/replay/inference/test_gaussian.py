@@ -1,0 +1,253 @@
+"""The parts of Gaussian filters, uncompiled and in sizes of no family, beside NumPy's algebra."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+
+from recorders.log import schemas
+from replay.engine.results import ALL_WELL
+from replay.inference.gaussian import cholesky
+from replay.inference.methods import METHODS
+from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.recursion import fault_of
+from replay.inference.steps import (
+    NOT_FINITE,
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Gaussian,
+    Note,
+    Stage,
+    Workspace,
+    kalman_update,
+    workspace,
+)
+from replay.sampling.samplers import unscented
+from replay.sampling.sets import SampleSets
+
+Floats = NDArray[np.float64]
+seeds = st.integers(0, 2**32 - 1)
+
+
+def positive_definite(generator: np.random.Generator, size: int) -> Floats:
+    root = generator.normal(size=(size, size))
+    return root @ root.T + 0.1 * np.eye(size)
+
+
+@given(st.integers(1, 5), seeds)
+def test_cholesky_is_numpys_in_place_too(size: int, seed: int):
+    matrix = positive_definite(np.random.default_rng(seed), size)
+    factor = np.zeros((size, size))
+    assert cholesky(factor, matrix, size)
+    assert_allclose(factor, np.linalg.cholesky(matrix), atol=1e-12)
+    assert cholesky(matrix, matrix, size)
+    assert_allclose(np.tril(matrix), factor, atol=1e-12)
+
+
+@pytest.mark.parametrize("last", [0.0, -1.0, np.nan, 0.25])
+def test_cholesky_refuses_what_is_not_positive_definite(last: float):
+    matrix = np.array([[4.0, 1.0], [1.0, last]])
+    assert not cholesky(np.zeros((2, 2)), matrix, 2)
+
+
+def names(letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}{index}" for index in range(count))
+
+
+def all_linear(letter: str, count: int) -> dict[str, Any]:
+    return dict.fromkeys(names(letter, count), "linear")
+
+
+def nothing(*_: Any) -> tuple[float, ...]:
+    raise AssertionError
+
+
+def empty_note(components: int) -> Note:
+    return Note(np.empty(components), np.empty((components, components)), np.empty(3))
+
+
+def correct(
+    mean: Floats, covariance: Floats, v: Floats, s: Floats, c: Floats, gate: Floats
+) -> tuple[int, Note]:
+    """The Kalman update by an innovation v with covariance S and cross-covariance C."""
+    sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, all_linear("z", len(v)), nothing)
+    motion = Motion(nothing)
+    stage = Stage(
+        Model("", all_linear("x", len(mean)), ModelParameters, (sensor,), motion), motion, (sensor,)
+    )
+
+    def innovate(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+    ) -> bool:
+        for place, value in zip(work.innovations[0], (data, s, c), strict=True):
+            place[:] = value
+        return True
+
+    note = empty_note(len(v))
+    update = kalman_update(stage, 0, innovate)
+    return update(mean, covariance, v, (), gate, 0, workspace(stage), note), note
+
+
+@given(st.integers(1, 5), st.integers(1, 4), seeds)
+def test_correct_is_the_kalman_update_by_what_was_measured(states: int, components: int, seed: int):
+    """Any components may be missing; the covariance stays exactly symmetric."""
+    generator = np.random.default_rng(seed)
+    joint = positive_definite(generator, states + components)
+    p, s, c = joint[:states, :states].copy(), joint[states:, states:], joint[:states, states:]
+    x, v = generator.normal(size=states), generator.normal(size=components)
+    kept = generator.uniform(size=components) < 0.7
+    kept[generator.integers(components)] = True
+    gain = c[:, kept] @ np.linalg.inv(s[np.ix_(kept, kept)])
+    mean, covariance = x.copy(), p.copy()
+    told, note = correct(
+        mean, covariance, np.where(kept, v, np.nan), s, c, np.full(components + 1, np.inf)
+    )
+    squared, log_likelihood, accepted = note.numbers
+    assert told == ALL_WELL
+    assert accepted
+    assert_allclose(squared, v[kept] @ np.linalg.solve(s[np.ix_(kept, kept)], v[kept]), rtol=1e-6)
+    assert_allclose(log_likelihood, multivariate_normal.logpdf(v[kept], cov=s[np.ix_(kept, kept)]))
+    assert_allclose(mean, x + gain @ v[kept], atol=1e-7)
+    assert_allclose(covariance, p - gain @ c[:, kept].T, atol=1e-7)
+    assert_array_equal(covariance, covariance.T)
+    assert_array_equal(note.difference, np.where(kept, v, np.nan))
+    assert_array_equal(note.covariance, np.where(np.outer(kept, kept), s, np.nan))
+
+
+def test_a_shut_gate_and_a_broken_innovation_change_nothing():
+    shut, broken = (np.eye(2), 1.99, ALL_WELL), (-np.eye(2), np.inf, NOT_POSITIVE_DEFINITE)
+    for s, gate, expected in (shut, broken):
+        mean, covariance = np.zeros(3), np.eye(3)
+        gates = np.array([0, 0, gate])
+        told, note = correct(mean, covariance, np.ones(2), s, np.ones((3, 2)), gates)
+        assert told == expected
+        if told == ALL_WELL:
+            assert_array_equal(note.numbers, [2.0, 0.0, 0.0])
+        assert_array_equal(mean, 0)
+        assert_array_equal(covariance, np.eye(3))
+    taken = np.zeros(3), np.eye(3), np.ones(2), np.eye(2), np.ones((3, 2)), np.full(3, 2.0)
+    assert correct(*taken)[1].numbers[2]
+    nothing_there = np.zeros(3), np.eye(3), np.full(2, np.nan), np.eye(2), np.ones((3, 2)), np.ones(3)
+    assert correct(*nothing_there)[0] == NOTHING_MEASURED
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_every_entry_of_an_estimate_is_looked_at(bad: float):
+    assert fault_of(np.ones(2), np.eye(2)) == ALL_WELL
+    assert fault_of(np.array([1.0, bad]), np.eye(2)) == NOT_FINITE
+    assert fault_of(np.ones(2), np.array([[1.0, 0.0], [bad, 1.0]])) == NOT_FINITE
+    assert fault_of(np.ones(2), np.diag([1.0, -1e-9])) == NOT_POSITIVE_DEFINITE
+
+
+# Linear models: every filter is exact, whatever its samples.
+
+
+class Noise(NamedTuple):
+    """What the functions of `Linear` get as parameters."""
+
+    density: Floats
+    variance: Floats
+
+
+def times(matrix: Floats, vector: Any) -> tuple[Any, ...]:
+    """Component-first, so that it takes derivatives as well."""
+    return tuple(
+        sum(entry * each for entry, each in zip(row, vector, strict=True)) for row in matrix.tolist()
+    )
+
+
+class Linear(NamedTuple):
+    """x' = F x + T B u and z = H (x - target), the last component an angle."""
+
+    transition: Floats
+    control: Floats
+    look: Floats
+
+    def stage(self) -> Stage:
+        """As component-first functions."""
+        states, controls, components = len(self.transition), self.control.shape[1], len(self.look)
+
+        def move(x: Any, u: Any, duration: float, _: Noise) -> tuple[Any, ...]:
+            driven = times(duration * self.control, u)
+            return tuple(a + b for a, b in zip(times(self.transition, x), driven, strict=True))
+
+        def measure(x: Any, target: Any, _: Noise) -> tuple[Any, ...]:
+            return times(self.look, [a - b for a, b in zip(x, target, strict=True)])
+
+        def control_noise(duration: float, noise: Noise) -> tuple[float, ...]:
+            return tuple(noise.density**2 / duration)
+
+        def variances(noise: Noise) -> tuple[float, ...]:
+            return tuple(noise.variance)
+
+        measured = {**all_linear("z", components), f"z{components - 1}": "angle"}
+        targets = Map("/targets", schemas.LANDMARK, "landmark_id", "position_m", all_linear("p", states))
+        schema = schemas.VECTOR_MEASUREMENT
+        sensor = Sensor("sensor", schema, measured, measure, variances, about=targets)
+        motion = Motion(move, control_noise=control_noise)
+        control = Control("control", schema, names("u", controls))
+        state = all_linear("x", states)
+        model = Model("", state, ModelParameters, (sensor,), motion, control=control)
+        return Stage(model, motion, (sensor,))
+
+
+def one_set(dimension: int, kappa: float) -> SampleSets:
+    """The unscented samples, for every step."""
+    samples = unscented(dimension, kappa)
+    return SampleSets(samples.points[None], samples.weights[None], 0, 0)
+
+
+@pytest.mark.parametrize(("method", "kappa"), [("ekf", 0.0), ("iekf", 0.0), ("ukf", 0.0), ("ukf", 1.7)])
+@given(st.integers(1, 4), st.integers(1, 3), st.integers(1, 5), seeds)
+def test_filters_are_exact_for_linear_models_of_any_size(
+    method: str, kappa: float, states: int, controls: int, components: int, seed: int
+):
+    """Sizes that no family has: nothing in the parts knows of three states and two components."""
+    generator = np.random.default_rng(seed)
+    linear = Linear(
+        generator.normal(size=(states, states)),
+        generator.normal(size=(states, controls)),
+        0.1 * generator.normal(size=(components, states)),
+    )
+    linear.look[-1] *= 0.01  # the samples of an angle stay within half a turn
+    steps = METHODS[method].steps(linear.stage())
+    work = steps.memory((one_set(states, kappa),) * len(steps.sampled))
+    x, p = generator.normal(size=states), positive_definite(generator, states)
+    u, density = generator.normal(size=controls), generator.uniform(size=controls)
+    variance = generator.uniform(0.01, 1.0, size=components)
+    noise = Noise(density, variance)
+    belief = Gaussian(x[None].copy(), p[None].copy())
+    assert steps.predict(0, belief, u, 0.5, noise, 0, work)
+    gain = 0.5 * linear.control
+    p = linear.transition @ p @ linear.transition.T + gain @ np.diag(density**2 / 0.5) @ gain.T
+    x = linear.transition @ x + gain @ u
+    assert_allclose(belief.mean[0], x, atol=1e-9)
+    assert_allclose(belief.covariance[0], p, atol=1e-9)
+    target = generator.normal(size=states)
+    measured = linear.look @ (x - target) + 0.1
+    measured[-1] += 2 * np.pi  # a turn more is the same angle
+    data, note = np.append(measured, target), empty_note(components)
+    gate = np.full(components + 1, np.inf)
+    assert steps.updates[0](0, belief, data, noise, gate, 0, work, note) == ALL_WELL
+    spread = linear.look @ p @ linear.look.T + np.diag(variance)
+    assert_allclose(note.difference, 0.1, atol=1e-9)
+    assert_allclose(note.covariance, spread, atol=1e-9)
+    gain = p @ linear.look.T @ np.linalg.inv(spread)
+    assert_allclose(belief.mean[0], x + gain @ np.full(components, 0.1), atol=1e-7)
+    assert_allclose(belief.covariance[0], p - gain @ linear.look @ p, atol=1e-7)
+
+
+def test_sampling_says_where_the_covariance_is_none():
+    steps = METHODS["ukf"].steps(Linear(np.eye(2), np.eye(2), np.eye(2)).stage())
+    work = steps.memory((one_set(2, 0.0),) * 2)
+    one = np.ones(2)
+    noise, belief = Noise(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])
+    assert not steps.predict(0, belief, one, 1.0, noise, 0, work)
+    update = steps.updates[0]
+    told = update(0, belief, np.ones(4), noise, np.full(3, np.inf), 0, work, empty_note(2))
+    assert told == NOT_POSITIVE_DEFINITE

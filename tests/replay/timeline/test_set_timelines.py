@@ -1,0 +1,114 @@
+"""The timelines of sets and networks: what their files hold against what was recorded and estimated."""
+
+import numpy as np
+import pytest
+
+from recorders.log import schemas
+from recorders.recording import record_run
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import memory_source
+from replay.judging.evaluation import errors_of, gaussian_estimates
+from replay.judging.set_evaluation import areas_of, frames_of
+from replay.timeline.networks import ARRIVED, LOST
+from replay.timeline.show import show
+from tests.replay.timeline.test_timeline import read
+
+
+def drawn(scenario, parameters, estimators, folder):
+    source = memory_source(*record_run(scenario, parameters, 1))
+    outputs = collect(replay([source], [b for name in estimators for b in bind(name, [source], {})]))
+    errors = [errors_of(each, [source]) for each in gaussian_estimates(outputs)]
+    path = folder / "run.rrd"
+    show(source, outputs, [each for each in errors if each is not None], save=path)
+    return source, outputs, read(path)
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    rules = ["network:ci-trace", "network:alone"]
+    parameters = {"steps": 30}
+    return drawn("ispace", parameters, rules, tmp_path_factory.mktemp("net"))
+
+
+def test_every_message_is_a_line_and_lost_ones_are_red_and_end_half_way(network):
+    source, _, found = network
+    links = source.streams["/links"]
+    messages = found["/map/graph/messages"]
+    strips = np.array([strip for row in messages["LineStrips2D:strips"] for strip in row])
+    colours = np.array([colour for row in messages["LineStrips2D:colors"] for colour in row])
+    lost = links["lost"] > 0
+    ends = [links[side].astype(int) for side in ("sender_id", "receiver_id")]
+    assert len(strips) == len(lost)
+    red, green = (int.from_bytes(bytes(colour), "big") for colour in (LOST, ARRIVED))
+    assert np.array_equal(colours, np.where(lost, red, green))
+    length = np.linalg.norm(strips[:, 1] - strips[:, 0], axis=1)
+    sides = np.where(np.abs(np.subtract(*ends)) == 2, 2.0, np.sqrt(2.0))
+    np.testing.assert_allclose(length, np.where(lost, 0.45, 0.9) * sides, rtol=1e-5)
+
+
+def test_the_events_name_the_lost_messages_of_every_time(network):
+    source, _, found = network
+    links = source.streams["/links"]
+    texts = [row[0] for row in found["/events/links"]["TextLog:text"]]
+    assert len(texts) == 30
+    for time_ns, text in zip(np.unique(links.publish_time_ns), texts, strict=True):
+        rows = (links.publish_time_ns == time_ns) & (links["lost"] > 0)
+        pairs = zip(links["sender_id"][rows], links["receiver_id"][rows], strict=True)
+        named = [f"{sender}>{receiver}" for sender, receiver in pairs]
+        assert text.startswith("10 messages sent")
+        assert all(name in text for name in named[:8])
+        assert ("lost" in text) == bool(named)
+
+
+def test_every_node_has_its_nees_and_an_ellipse_around_its_error(network):
+    _, outputs, found = network
+    for node in range(1, 5):
+        case = f"node{node}"
+        assert len(found[f"/plots/{case}/nees_4/bounds"]["Measurements:values"]) == 2
+        for rule in ("ci-trace", "alone"):
+            estimates = outputs[f"/estimates/network:{rule}/{case}/state"]
+            entity = found[f"/map/errors/network\\:{rule}/{case}/ellipse"]
+            ellipses = np.array([row[0] for row in entity["LineStrips2D:strips"] if row])
+            assert len(ellipses) == len(estimates)
+            place = found[f"/map/errors/network\\:{rule}/{case}/place"]["Points2D:positions"]
+            middles = ellipses[:, :-1].mean(axis=1)
+            np.testing.assert_allclose(middles, np.array(place)[:, 0], atol=1e-5)
+
+
+def test_a_log_without_estimates_and_a_network_without_links_are_drawn(tmp_path):
+    _, _, found = drawn("ispace", {"steps": 5, "links": []}, [], tmp_path)
+    assert "/map/truth/path" in found
+    assert "/map/graph/messages" not in found
+
+
+def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
+    parameters = {"scene": "random", "looks": 12, "landmarks": 5, "misidentified_probability": 0.1}
+    shapes = ("exact", "box")
+    names = [f"set-membership:{shape}" for shape in shapes]
+    _, outputs, found = drawn("relative-bearings", parameters, names, tmp_path)
+    for name in names:
+        sizes, sets = (outputs[f"/estimates/{name}/robot1/{leaf}"].stream for leaf in ("size", "set"))
+        frames = frames_of(sizes, sets)
+        assert any(not rings for rings in frames)
+        strips = [
+            strip
+            for row in found[f"/map/robot1/{name.replace(':', chr(92) + ':')}"]["LineStrips2D:strips"]
+            for strip in row
+        ]
+        rings = [ring for each in frames for ring in each]
+        assert len(strips) == len(rings)
+        for strip, ring in zip(strips, rings, strict=True):
+            np.testing.assert_allclose(np.array(strip)[:-1], ring, rtol=1e-5, atol=1e-5)
+            assert strip[0] == strip[-1]
+        plot = found[f"/plots/robot1/area/{name.replace(':', chr(92) + ':')}"]["Scalars:scalars"]
+        np.testing.assert_allclose(np.ravel(plot), areas_of(frames))
+        faults = outputs[f"/estimates/{name}/robot1/fault"].stream
+        assert faults.schema.full_name == schemas.RELATIVE_BEARING.full_name
+        texts = [
+            row[0] for row in found[f"/events/robot1/{name.replace(':', chr(92) + ':')}"]["TextLog:text"]
+        ]
+        assert texts == [
+            f"{name}: empty set: the pair {first}, {second} is to blame"
+            for first, second in zip(faults["first_id"], faults["second_id"], strict=True)
+        ]

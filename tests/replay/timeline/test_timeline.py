@@ -1,0 +1,517 @@
+"""The timeline: what a .rrd holds, live streams, pictures, and what is refused."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib.image
+import numpy as np
+import pyarrow as pa
+import pytest
+import rerun as rr
+import rerun.chunk as rc
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from scipy.stats import chi2
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, open_log, schemas
+from recorders.recording import record_run
+from replay.engine.blocks import Ragged, gather
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect
+from replay.engine.replaying import replay as replayed
+from replay.engine.sources import LogSource, MemorySource, memory_source
+from replay.judging.evaluation import Errors, chi_square_interval, errors_of, gaussian_estimates
+from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
+from replay.timeline.landmarks import GATED
+from replay.timeline.plane import ellipses
+from replay.timeline.show import recorded_outputs, show
+from replay.timeline.sinks import open_recording
+from replay.timeline.viewer import Listener, listen, screenshot, view
+
+SENSOR = {"rate_hz": 5.0, "outlier_probability": 0.05, "outages_per_minute": 9.0, "outage_s": 2.0}
+RUN = 1
+Columns = dict[str, list]
+
+
+class Replayed(NamedTuple):
+    """An ensemble, what the estimators made of it, and how well."""
+
+    sources: list[MemorySource]
+    outputs: dict[str, Ragged]
+    errors: list[Errors]
+
+
+def replay_landmarks(runs: int, duration_s: float) -> Replayed:
+    scenario = {"duration_s": duration_s, "range_bearing": SENSOR}
+    sources = [memory_source(*record_run("landmarks", scenario, 3, run)) for run in range(runs)]
+    bound = [each for name in ("dead-reckoning", "ekf") for each in bind(name, sources, {})]
+    outputs = collect(replayed(sources, bound))
+    found = [errors_of(each, sources) for each in gaussian_estimates(outputs)]
+    return Replayed(sources, outputs, [each for each in found if each is not None])
+
+
+@pytest.fixture(scope="module")
+def ensemble() -> Replayed:
+    return replay_landmarks(2, 20.0)
+
+
+@pytest.fixture(scope="module")
+def rrd(ensemble: Replayed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("timeline") / "run.rrd"
+    show(ensemble.sources[RUN], ensemble.outputs, ensemble.errors, run=RUN, save=path)
+    return path
+
+
+def read(path: Path, *, static: bool = False) -> dict[str, Columns]:
+    """Entity -> column -> a list per row, as any reader of the file gets them."""
+    found: dict[str, Columns] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a live stream's file has no footer
+        chunks = list(rc.RrdReader(str(path)).stream())
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names[1:]:  # the first is Rerun's own row id, which is random
+            column = batch.column(name)
+            if pa.types.is_temporal(column.type):
+                column = column.cast("int64")
+            if chunk.is_static == static:
+                found.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(column.to_pylist())
+    return found
+
+
+def of_run(errors: list[Errors], estimator: str) -> tuple[Errors, np.ndarray]:
+    (found,) = [each for each in errors if each.estimator == estimator]
+    return found, found.run == RUN
+
+
+def test_a_file_says_what_it_is_and_has_a_layout(rrd: Path) -> None:
+    reader = rc.RrdReader(str(rrd))
+    (recording,) = reader.recordings()
+    assert recording.application_id == "fuselog-landmarks"
+    assert len(reader.blueprints()) == 1
+    indexes = reader.stream().collect().schema().index_columns()
+    assert {each.name for each in indexes} == {"step", "sim_time", "utc"}
+
+
+def test_plots_hold_the_errors_of_the_run_with_their_bands_and_bounds(
+    rrd: Path, ensemble: Replayed
+) -> None:
+    found = read(rrd)
+    for estimator in ("dead-reckoning", "ekf"):
+        errors, rows = of_run(ensemble.errors, estimator)
+        for column, (component, scale) in enumerate(
+            [("x_m", 1.0), ("y_m", 1.0), ("heading_rad", 180 / np.pi)]
+        ):
+            plot = found[f"/plots/robot1/error_{component}/{estimator}"]
+            values = np.array(plot["Measurements:values"])
+            np.testing.assert_allclose(values[:, 0], scale * errors.error[rows, column], rtol=1e-12)
+            assert not values[:, 1].any()
+            sigma = scale * np.sqrt(errors.covariance[rows, column, column])
+            variances = np.array(plot["Measurements:variances"])
+            np.testing.assert_allclose(np.sqrt(variances[:, 1]), 2 * sigma, rtol=1e-12)
+        nees = found[f"/plots/robot1/nees_3/{estimator}"]
+        assert np.array_equal(np.ravel(nees["Scalars:scalars"]), errors.nees[rows])
+        assert np.array_equal(nees["utc"], errors.time_ns[rows])
+        assert np.array_equal(nees["step"], errors.step[rows])
+        np.testing.assert_allclose(nees["sim_time"], errors.elapsed_s[rows] * 1e9, atol=1)
+    band = found["/plots/robot1/nees_3/bounds"]
+    middle = np.array(band["Measurements:values"])[:, 0]
+    half = np.sqrt(np.array(band["Measurements:variances"])[:, 0])
+    np.testing.assert_allclose(
+        [middle - half, middle + half], np.tile(chi_square_interval(3, 1), (2, 1)).T
+    )
+    innovations = ensemble.outputs["/estimates/ekf/robot1/innovation"].of_run(RUN)
+    nis = np.ravel(found["/plots/robot1/nis_2/ekf"]["Scalars:scalars"])
+    assert np.array_equal(nis, innovations["normalised_innovation_squared"])
+
+
+def test_the_map_holds_poses_paths_and_ellipses_in_true_coordinates(
+    rrd: Path, ensemble: Replayed
+) -> None:
+    found = read(rrd)
+    stream = ensemble.outputs["/estimates/ekf/robot1/pose"].of_run(RUN)
+    truth = ensemble.sources[RUN].streams["/robot1/truth"]
+    for name, states in (("ekf", stream["mean"]), ("truth", truth["state"])):
+        pose = found[f"/map/robot1/{name}/pose"]
+        np.testing.assert_allclose(np.array(pose["Arrows2D:origins"])[:, 0], states[:, :2], rtol=1e-6)
+        arrow = np.array(pose["Arrows2D:vectors"])[:, 0]
+        heading = np.arctan2(arrow[:, 1], arrow[:, 0])
+        np.testing.assert_allclose(np.cos(heading - states[:, 2]), 1.0, atol=1e-6)
+        path = np.array(found[f"/map/robot1/{name}/path"]["LineStrips2D:strips"])[:, 0]
+        np.testing.assert_allclose(path[:, 0], states[:-1, :2], rtol=1e-6)
+        np.testing.assert_allclose(path[:, 1], states[1:, :2], rtol=1e-6)
+    outlines = np.array(found["/map/robot1/ekf/ellipse"]["LineStrips2D:strips"])[:, 0]
+    away = outlines - stream["mean"][:, None, :2]
+    precision = np.linalg.inv(stream["covariance"].reshape(-1, 3, 3)[:, :2, :2])
+    squared = np.einsum("nvi,nij,nvj->nv", away, precision, away)
+    np.testing.assert_allclose(squared, chi2.ppf(0.95, 2), rtol=1e-3)
+    landmarks = ensemble.sources[RUN].streams["/landmarks"]
+    points = read(rrd, static=True)["/map/landmarks"]
+    np.testing.assert_allclose(points["Points2D:positions"][0], landmarks["position_m"], rtol=1e-6)
+    assert points["Points2D:labels"][0] == [str(number) for number in landmarks["landmark_id"]]
+
+
+def test_sight_lines_go_to_what_is_seen_and_vanish_with_it(rrd: Path, ensemble: Replayed) -> None:
+    seen = ensemble.sources[RUN].streams["/robot1/range_bearing"]
+    innovations = ensemble.outputs["/estimates/ekf/robot1/innovation"].of_run(RUN)
+    looks, counts = np.unique(seen.publish_time_ns, return_counts=True)
+    lines = read(rrd)["/map/robot1/sights"]
+    times = np.array(lines["utc"])
+    sizes = np.array([len(each) for each in lines["LineStrips2D:strips"]])
+    assert np.array_equal(times[sizes > 0], looks)
+    assert np.array_equal(sizes[sizes > 0], counts)
+    assert (sizes == 0).sum() >= 2  # the outages
+    assert np.diff(times)[sizes[:-1] > 0].max() <= 1.5 * 0.2e9
+    red = int.from_bytes(bytes(GATED), "big")
+    drawn_red = sum(colours.count(red) for colours in lines["LineStrips2D:colors"])
+    assert drawn_red == (innovations["accepted"] == 0).sum() > 0
+    places = ensemble.sources[RUN].streams["/landmarks"]
+    place_of = dict(zip(places["landmark_id"].tolist(), places["position_m"], strict=True))
+    ends = np.concatenate([np.array(each)[:, 1] for each in lines["LineStrips2D:strips"] if each])
+    order = np.lexsort((seen["target_id"], seen.publish_time_ns))
+    expected = [place_of[target] for target in seen["target_id"][order].tolist()]
+    np.testing.assert_allclose(ends, expected, rtol=1e-6)
+
+
+def test_events_tell_gated_measurements_dropouts_and_failures(
+    rrd: Path, ensemble: Replayed, tmp_path: Path
+) -> None:
+    found = read(rrd)
+    innovations = ensemble.outputs["/estimates/ekf/robot1/innovation"].of_run(RUN)
+    gated = innovations.take(innovations["accepted"] == 0)
+    texts = [text for (text,) in found["/events/robot1/ekf"]["TextLog:text"]]
+    assert len(texts) == len(gated)
+    assert texts[0].startswith(f"ekf: gated target {gated['target_id'][0]}: NIS ")
+    outages = ensemble.sources[RUN].streams["/robot1/range_bearing/outages"]
+    dropouts = found["/events/robot1/range_bearing"]
+    assert dropouts["utc"] == outages.publish_time_ns.tolist()
+    assert {text for (text,) in dropouts["TextLog:text"]} == {"range_bearing: dead for 2.0 s"}
+
+    source = ensemble.sources[0]
+    without = {topic: each for topic, each in source.streams.items() if not topic.endswith("outages")}
+    failure = make_stream(
+        "/estimates/ekf:2/robot1/failure",
+        schemas.FAILURE,
+        [source.streams["/robot1/truth"].publish_time_ns[9]],
+        metadata={"reasons": '["one; two", "another"]'},
+        reason=[1],
+    )
+    show(
+        replace(source, streams=without), {failure.topic: gather([failure])}, [], save=tmp_path / "a.rrd"
+    )
+    found = read(tmp_path / "a.rrd")
+    assert found["/events/robot1/ekf\\:2"]["TextLog:text"] == [["ekf:2: failed: another"]]
+    silent = [text for (text,) in found["/events/robot1/range_bearing"]["TextLog:text"]]
+    pauses_s = np.diff(np.unique(source.streams["/robot1/range_bearing"].publish_time_ns)) * 1e-9
+    assert silent == [f"range_bearing: silent for {pause:.1f} s" for pause in pauses_s if pause > 1]
+    assert silent
+
+
+def test_the_same_replay_is_the_same_recording_and_another_is_not(
+    rrd: Path, ensemble: Replayed, tmp_path: Path
+) -> None:
+    again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
+    show(ensemble.sources[RUN], ensemble.outputs, ensemble.errors, run=RUN, save=again)
+    ekf = {topic: each for topic, each in ensemble.outputs.items() if "/ekf/" in topic}
+    show(ensemble.sources[RUN], ekf, ensemble.errors, run=RUN, save=other)
+    names = [rc.RrdReader(str(path)).recordings()[0].recording_id for path in (rrd, again, other)]
+    assert names[0] == names[1] != names[2]
+    assert read(rrd) == read(again)
+    assert read(rrd, static=True) == read(again, static=True)
+
+
+def test_a_long_run_is_thinned_and_says_so(tmp_path: Path) -> None:
+    long = replay_landmarks(1, 300.0)
+    show(long.sources[0], long.outputs, long.errors, save=tmp_path / "long.rrd")
+    found = read(tmp_path / "long.rrd")
+    assert len(long.outputs["/estimates/ekf/robot1/pose"]) > DRAWN_ROWS
+    rows = {entity: len(columns["utc"]) for entity, columns in found.items()}
+    assert rows["/plots/robot1/error_x_m/ekf"] == DRAWN_ROWS
+    assert max(rows.values()) <= DRAWN_ROWS
+    assert found["/events/robot1/ekf"]["TextLog:text"][0] == ["ekf: drawn at 16.7 Hz of 20 Hz"]
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1), st.integers(1, 50))
+def test_thinning_keeps_the_last_of_every_span(times: list[int], rows: int) -> None:
+    time_ns = np.sort(np.array(times))
+    kept = thin(time_ns, rows)
+    assert len(kept) <= max(rows, 1)
+    assert kept[-1] == len(time_ns) - 1
+    assert np.all(np.diff(kept) > 0)
+    if len(time_ns) > rows:
+        span_ns = max((time_ns[-1] - time_ns[0]) / rows, 1.0)
+        nearest_ns = np.abs(time_ns[:, None] - time_ns[kept]).min(axis=1)
+        assert nearest_ns.max() <= span_ns
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_ellipses_lie_on_the_chosen_level_and_are_nan_without_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    means, roots = rng.normal(size=(2, 2)), rng.normal(size=(2, 2, 2))
+    covariances = roots @ roots.transpose(0, 2, 1) + 1e-3 * np.eye(2)
+    covariances[1] -= 2 * np.trace(covariances[1]) * np.eye(2)
+    outlines = ellipses(means, covariances, 0.9)
+    away = outlines[0] - means[0]
+    squared = np.sum(away * np.linalg.solve(covariances[0], away.T).T, axis=1)
+    np.testing.assert_allclose(squared, chi2.ppf(0.9, 2), rtol=1e-6)
+    np.testing.assert_allclose(outlines[0, 0], outlines[0, -1], rtol=1e-9, atol=1e-9)
+    assert np.isnan(outlines[1]).any()
+
+
+def test_a_scenario_without_a_timeline_gets_every_component(ensemble: Replayed, tmp_path: Path) -> None:
+    source = ensemble.sources[0]
+    assert source.run is not None
+    unknown = replace(source, run=replace(source.run, scenario="unheard-of"))
+    show(unknown, ensemble.outputs, ensemble.errors, save=tmp_path / "generic.rrd")
+    found = read(tmp_path / "generic.rrd")
+    assert {"/map/robot1/truth/path", "/map/robot1/ekf/pose"} <= found.keys()
+    truth = source.streams["/robot1/truth"]["state"]
+    drawn = np.ravel(found["/plots/robot1/heading_rad/truth"]["Scalars:scalars"])
+    np.testing.assert_allclose(drawn, np.degrees(truth[:, 2]), rtol=1e-12)
+    assert {f"/plots/robot1/{plot}/ekf" for plot in ("x_m", "error_x_m", "nees_3", "nis_2")} <= set(
+        found
+    )
+
+
+def test_a_log_that_no_family_draws_is_drawn_by_schema(tmp_path: Path) -> None:
+    """Fixes and landmarks on the plane, numbers as plots, and what is no numbers among the events."""
+    time_ns = np.arange(5 * 10**9, 6 * 10**9, 10**8)
+    places, pressure = np.stack([np.arange(10.0), np.arange(10.0) ** 2], axis=1), np.ones((10, 2))
+    streams = [
+        make_stream("/landmarks", schemas.LANDMARK, [2 * 10**9], landmark_id=[7], position_m=[[1, 2]]),
+        make_stream(
+            "/gps/fix",
+            schemas.POSITION_FIX,
+            time_ns,
+            position_m=places,
+            covariance_m2=np.full((10, 4), np.nan),
+        ),
+        make_stream(
+            "/beacon", schemas.BEARING, time_ns, target_id=np.ones(10), bearing_rad=np.full(10, np.pi)
+        ),
+        make_stream("/air", schemas.VECTOR_MEASUREMENT, time_ns, value=pressure),
+    ]
+    path = tmp_path / "bare.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        said = writer.register_schema("Said", "jsonschema", b"{}")
+        channel = writer.register_channel("/said", "json", said)
+        writer.add_message(channel, 5 * 10**9, b"{}", 5 * 10**9)
+        for stream in streams:
+            schema = stream.schema
+            number = writer.register_schema(schema.full_name, "protobuf", schema.descriptor_set)
+            channel = writer.register_channel(stream.topic, "protobuf", number)
+            for row, stamp_ns in enumerate(stream.publish_time_ns.tolist()):
+                values = {name: column[row].tolist() for name, column in stream.columns.items()}
+                data = schema.message_class(**values).SerializeToString()
+                writer.add_message(channel, stamp_ns, data, stamp_ns)
+        writer.finish()
+    show(LogSource(open_log(path)), {}, [], save=tmp_path / "bare.rrd")
+    found = read(tmp_path / "bare.rrd")
+    assert found["/map/gps/fix"]["Points2D:positions"] == [[row] for row in places.tolist()]
+    assert found["/plots/beacon/bearing_rad/bearing_rad"]["Scalars:scalars"] == [[180.0]] * 10
+    assert {"/plots/air/value/0", "/plots/air/value/1", "/plots/gps/fix/position_m/1"} <= found.keys()
+    assert found["/plots/air/value/0"]["sim_time"][0] == 3 * 10**9  # since the first stamp, the map's
+    (event,) = found["/events/log"]["TextLog:text"]
+    assert "/said is not drawn" in event[0]
+    assert "/map/landmarks" in read(tmp_path / "bare.rrd", static=True)
+
+
+def test_a_log_with_nothing_to_draw_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "said.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(
+            "/said", "json", writer.register_schema("Said", "jsonschema", b"{}")
+        )
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(BadInput, match=r"nothing to draw: .* it holds /said \(json\)"):
+        show(LogSource(open_log(path)), {}, [], save=tmp_path / "said.rrd")
+    assert not (tmp_path / "said.rrd").exists()
+
+
+def test_a_log_without_estimates_and_one_of_estimates_alone_are_shown(
+    ensemble: Replayed, tmp_path: Path
+) -> None:
+    source = ensemble.sources[0]
+    show(source, {}, [], save=tmp_path / "log.rrd")
+    found = read(tmp_path / "log.rrd")
+    assert len(found["/map/robot1/truth/pose"]["utc"]) == len(source.streams["/robot1/truth"])
+    assert "/map/robot1/sights" in found
+    streams = {topic: ragged.of_run(0) for topic, ragged in ensemble.outputs.items()}
+    estimates = MemorySource(streams, source.run, "estimates")
+    show(estimates, recorded_outputs(estimates), [], save=tmp_path / "estimates.rrd")
+    found = read(tmp_path / "estimates.rrd")
+    pose = streams["/estimates/ekf/robot1/pose"]
+    assert len(found["/map/robot1/ekf/pose"]["utc"]) == len(pose)
+
+
+def test_one_pass_goes_to_a_file_and_to_a_running_receiver(
+    rrd: Path, ensemble: Replayed, tmp_path: Path
+) -> None:
+    both, live = tmp_path / "both.rrd", tmp_path / "live.rrd"
+    with listen(tmp_path, "--save", str(live)) as receiver:
+        source = ensemble.sources[RUN]
+        show(source, ensemble.outputs, ensemble.errors, run=RUN, save=both, connect=receiver.url)
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            with suppress(RuntimeError):  # the receiver is still writing
+                if read(live) == read(rrd):
+                    break
+            time.sleep(0.1)
+    assert read(both) == read(rrd)
+    assert read(live) == read(rrd)
+    assert read(live, static=True) == read(rrd, static=True)
+    port = int(receiver.url.rpartition(":")[2].partition("/")[0])
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=1)
+
+
+def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp_path: Path) -> None:
+    def refused(url: str) -> None:
+        begin = time.monotonic()
+        with pytest.raises(
+            BadInput, match=r"--connect .*(no Rerun receiver answers|expected rerun\+http)"
+        ):
+            show(ensemble.sources[0], {}, [], save=tmp_path / "a.rrd", connect=url)
+        assert time.monotonic() - begin < 4
+        assert not list(tmp_path.iterdir())
+
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        port = silent.getsockname()[1]
+        refused(f"rerun+http://127.0.0.1:{port}/proxy")
+        silent.listen()  # somebody is there, but says nothing
+        refused(f"rerun+http://127.0.0.1:{port}/proxy")
+    for url in ("127.0.0.1:9876", "http://127.0.0.1:9876/proxy", "rerun+http://127.0.0.1:port/proxy"):
+        refused(url)
+
+
+def test_a_receiver_that_goes_away_is_told_and_nothing_half_written(tmp_path: Path) -> None:
+    path = tmp_path / "kept.rrd"
+    path.write_text("what was there before")
+
+    def lose(receiver: Listener) -> None:
+        with open_recording("app", "id", save=path, connect=receiver.url) as recording:
+            os.killpg(receiver.process.pid, signal.SIGKILL)
+            receiver.process.wait()
+            steps = [rr.TimeColumn("step", sequence=[1])]
+            recording.send_columns("a", steps, rr.Scalars.columns(scalars=[1.0]))
+
+    with (
+        listen(tmp_path, "--save", str(tmp_path / "live.rrd")) as receiver,
+        pytest.raises(BadInput, match="the receiver went away"),
+    ):
+        lose(receiver)
+    assert path.read_text() == "what was there before"
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_full_disk_is_told_and_nothing_half_written(ensemble: Replayed, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        with pytest.raises(BadInput, match="the timeline could not be written"):
+            show(ensemble.sources[0], ensemble.outputs, ensemble.errors, save=tmp_path / "a.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_shown_is_refused(ensemble: Replayed, tmp_path: Path) -> None:
+    source, outputs, errors = ensemble.sources[0], ensemble.outputs, ensemble.errors
+    with pytest.raises(BadInput, match=r"give --save FILE.rrd, --connect URL, or both"):
+        show(source, outputs, errors)
+    with pytest.raises(BadInput, match="no run 2 to show; the runs are 0 to 1"):
+        show(source, outputs, errors, run=2, save=tmp_path / "a.rrd")
+    with pytest.raises(BadInput, match="nothing called 'robot9' to show; did you mean 'robot1'"):
+        show(source, outputs, errors, focus="robot9", save=tmp_path / "a.rrd")
+    with pytest.raises(BadInput, match="cannot be written"):
+        show(source, outputs, errors, save=tmp_path / "nowhere" / "a.rrd")
+    (tmp_path / "a.txt").write_text("no timeline")
+    with pytest.raises(BadInput, match="not a timeline"):
+        screenshot(tmp_path / "a.txt", tmp_path / "a.png")
+    with pytest.raises(BadInput, match="cannot be read"):
+        screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a screen")
+def test_without_a_screen_the_picture_is_offered(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(BadInput, match=r"no screen .*--screenshot"):
+        view(rrd)
+    monkeypatch.setenv("DISPLAY", ":54321")
+    with pytest.raises(BadInput, match=r"the viewer ended with an error: .*X server"):
+        view(rrd)
+
+
+def test_without_a_vulkan_driver_the_picture_says_what_to_install(
+    rrd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nowhere")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nowhere")
+    with pytest.raises(BadInput, match="apt-get install mesa-vulkan-drivers"):
+        screenshot(rrd, tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_picture_shows_the_estimators_and_no_view_complains(rrd: Path, tmp_path: Path) -> None:
+    png = tmp_path / "picture.png"
+    try:
+        reports = screenshot(rrd, png, at_s=15.0, size=(1200, 800))
+    except BadInput as error:
+        if "Vulkan driver" in str(error):
+            pytest.skip(str(error))
+        raise
+    assert reports == []
+    picture = np.rint(255 * matplotlib.image.imread(png)[..., :3]).astype(int)
+    assert picture.shape == (800, 1200, 3)
+    scene, plots = picture[60:500, :590], picture[60:, 610:]
+    for colour in PALETTE[:2]:
+        assert (np.abs(scene - colour).max(axis=-1) < 12).sum() > 100
+        assert (np.abs(plots - colour).max(axis=-1) < 12).sum() > 100
+
+
+def test_the_cursor_stays_inside_the_run(rrd: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput) as refused:
+        screenshot(rrd, tmp_path / "a.png", at_s=99.0)
+    if "Vulkan driver" in str(refused.value):
+        pytest.skip(str(refused.value))
+    refused.match("--at 99: the run goes from 0 to 20 s")
+
+
+def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:
+    """Nobody is left to end it: it notices that the pipe from its parent has closed."""
+    program = (
+        "import sys, time; from pathlib import Path; from replay.timeline.viewer import listen\n"
+        "with listen(Path(sys.argv[1]), '--headless') as listener:\n"
+        "    print(listener.url, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        port = int(parent.stdout.readline().rpartition(":")[2].partition("/")[0])
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)):
+                return
+        time.sleep(0.05)
+    raise AssertionError("the viewer still answers")
