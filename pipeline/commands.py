@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.ensemble import Replayed, judge, replay_to_logs
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import plain, result_folder, write_outcome
+from pipeline.results import in_order, plain, result_folder, write_outcome
 from pipeline.starting import Origin, from_estimates, from_truth
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
@@ -21,10 +21,11 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
+from recorders.parsing import parse_json
 from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import configure, find_estimator
 from replay.engine.sources import LogSource
-from replay.judging.metrics import Output, find_metrics, measure
+from replay.judging.metrics import Output, consistency_bounds, find_metrics, measure
 
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
 TOLD = ("failure", "skipped", "coverage")
@@ -72,7 +73,7 @@ def replay_logs(
     )
     _state_losses(source.log for source in sources)
     replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
-    _print_outcome(replayed, (), as_json=as_json, written=paths, seconds=seconds)
+    _print_outcome(replayed, (), names, as_json=as_json, written=paths, seconds=seconds)
     if save is not None or connect is not None:
         _show(replayed, save, connect)
 
@@ -221,11 +222,13 @@ def evaluate_logs(
     if not measure(telling, find_metrics(metrics)):
         raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
     _state_losses([*opened, *(source.log for source in sources)])
+    estimators = _stated_estimators(opened[0])
     if out is not None:
         settings = {
             "title": f"estimates of {sources[0].name}",
             "estimates": [str(path) for path in estimates],
             "logs": [source.name for source in sources],
+            "estimators": estimators,
             "gap_limit_s": gap_limit_s,
             "metrics": list(metrics),
         }
@@ -233,7 +236,8 @@ def evaluate_logs(
         outcome.input_sha256 = _hash_files([*estimates, *places])
         with result_folder(out) as folder:
             write_outcome(folder, "evaluate", settings, outcome)
-    _print_outcome(replayed, metrics, as_json=as_json, written=[out] if out else [])
+    written = [out] if out else []
+    _print_outcome(replayed, metrics, estimators, as_json=as_json, written=written)
 
 
 def _source_path(estimates: Log) -> Path:
@@ -245,6 +249,16 @@ def _source_path(estimates: Log) -> Path:
     if not path.exists():
         raise BadInput(f"{estimates.path}: its log {path} is not there; give it with --log")
     return path
+
+
+def _stated_estimators(estimates: Log) -> dict[str, Any]:
+    """Parameters by label, in the order of the replay; none where the log does not say."""
+    notes = estimates.run.notes if estimates.run else {}
+    try:
+        stated = parse_json(notes.get("estimators", "{}"))
+    except ValueError:
+        return {}
+    return stated if isinstance(stated, dict) else {}
 
 
 def _check_same_run(estimates: Log, log: Log) -> None:
@@ -280,12 +294,15 @@ def _hash_files(paths: Sequence[Path]) -> str:
 def _print_outcome(
     replayed: Replayed,
     metrics: Sequence[str],
+    estimators: Iterable[str],
     *,
     as_json: bool,
     written: Sequence[Path],
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    values = plain(measure(replayed.judged, find_metrics(metrics)))
+    values = in_order(plain(measure(replayed.judged, find_metrics(metrics))), estimators)
+    stated = consistency_bounds(replayed.judged)
+    bounds = {key: interval for key, interval in stated.items() if key in values}
     failures = replayed.failures
     _state_unjudged(replayed)
     for sentence in failures[:5]:
@@ -295,13 +312,14 @@ def _print_outcome(
     if as_json:
         outcome = {
             "metrics": values,
+            "bounds": bounds,
             "failures": failures,
             "losses": replayed.losses,
             "written": [str(path) for path in written],
         }
         print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
         return
-    print_metrics(values)
+    print_metrics(values, bounds)
     for sentence in replayed.losses:
         say(sentence)
     if seconds:
@@ -389,6 +407,6 @@ def run_named(
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
-    print_metrics(result.metrics)
+    print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")

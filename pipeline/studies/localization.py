@@ -5,11 +5,12 @@ call `localize` and add their own tables, figures and claims.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from pipeline.charts import Axis, Chart, Panel, band, curve, thinned
 from pipeline.ensemble import (
     Replayed,
     estimates_metadata,
@@ -19,16 +20,13 @@ from pipeline.ensemble import (
 )
 from pipeline.experiment import Experiment, Setting, Study, load_scenario
 from pipeline.results import MetricValue, Outcome, split_metric
-from recorders.errors import BadInput, printable
+from recorders.errors import BadInput
 from recorders.log import LogWriter
 from recorders.parameters import merge
 from recorders.recording import import_run
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.evaluation import Errors, chi_square_interval, error_table, step_table
-from replay.judging.metrics import find_metrics, measure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from replay.judging.evaluation import Errors, error_table, rmse_interval, step_table
+from replay.judging.metrics import consistency_bounds, find_metrics, measure
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -87,6 +85,7 @@ def summarise(replayed: Replayed, metrics: Sequence[str] = ()) -> Outcome:
     """Metrics (all, where none is named), tables and figures of a judged replay."""
     outcome = Outcome()
     outcome.metrics.update(measure(replayed.judged, find_metrics(metrics)))
+    outcome.bounds.update(consistency_bounds(replayed.judged))
     outcome.tables["summary"] = summary_table(outcome.metrics)
     judged = [errors for errors in replayed.errors if len(errors.nees)]
     if judged:
@@ -94,7 +93,7 @@ def summarise(replayed: Replayed, metrics: Sequence[str] = ()) -> Outcome:
         outcome.tables["steps"] = pd.concat([step_table(errors) for errors in judged])
         for case in dict.fromkeys(errors.case for errors in judged):
             name = f"errors-{case}" if case else "errors"
-            outcome.figures[name] = error_figure([each for each in judged if each.case == case], case)
+            outcome.figures[name] = error_chart([each for each in judged if each.case == case], case)
     return outcome
 
 
@@ -104,38 +103,47 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
-def error_figure(judged: list[Errors], case: str) -> "Figure":
-    """RMSE, and NEES with its 95 % interval, over time; all runs together."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    quantity, label = _main_quantity(judged[0])
+def error_chart(judged: list[Errors], case: str) -> Chart:
+    """RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent."""
+    main = _main_quantity(judged[0])
+    rmse = Panel(x=Axis(label="time (s)"), y=Axis(label=main.label, log=True))
+    nees = Panel(x=Axis(label="time (s)"), y=Axis(label="mean NEES", log=True))
     for errors in judged:
-        table = _thinned(step_table(errors))
-        above.plot(table["elapsed_s"], table[quantity], label=errors.estimator, lw=1)
-        below.plot(table["elapsed_s"], table["nees"], label=errors.estimator, lw=1)
+        table = step_table(errors)
+        rows = thinned(len(table))
+        steps, label = table.iloc[rows], errors.estimator
+        time_s, quantity = steps["elapsed_s"], _main_quantity(errors)
+        low, high = (quantity.scale * bound[rows] for bound in rmse_interval(errors, quantity.columns))
+        rmse.bands.append(band(label, time_s, low, high))
+        rmse.series.append(curve(label, time_s, steps[quantity.name]))
+        nees.series.append(curve(label, time_s, steps["nees"]))
+        consistent = f"95 % if consistent ({len(errors.components)} components)"
+        if consistent not in {each.label for each in nees.bands}:
+            interval = steps["nees_low"], steps["nees_high"]
+            nees.bands.append(band(consistent, time_s, *interval, reference=True))
     runs = len(np.unique(judged[0].run))
-    low, high = chi_square_interval(len(judged[0].components), runs)
-    below.axhspan(low, high, color="0.85", zorder=0, label="95 % if consistent")
-    title = printable(case or "errors").replace("$", r"\$")  # which starts a formula
-    above.set(ylabel=label, title=f"{title}, {runs} {'run' if runs == 1 else 'runs'}")
-    below.set(ylabel="mean NEES", xlabel="time (s)", yscale="log")
-    above.legend(loc="upper left")
-    below.legend(loc="upper left")
-    return figure
+    what = f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}"
+    return Chart(title=f"{what}; bands: the RMSE's 95 % if consistent", panels=[rmse, nees])
 
 
-def _main_quantity(errors: Errors) -> tuple[str, str]:
-    """The column of the step table to draw, and what to call it: position, else the first component."""
+class Quantity(NamedTuple):
+    """What of the errors is drawn: its name in the step table, its label, its columns, their scale."""
+
+    name: str
+    label: str
+    columns: list[int]
+    scale: float = 1.0
+
+
+def _main_quantity(errors: Errors) -> Quantity:
+    """Position, else orientation, else the first component."""
     if errors.position:
-        return "position_rmse_m", "position RMSE (m)"
-    return f"rmse_{errors.components[0]}", f"RMSE {errors.components[0]}"
-
-
-def _thinned(table: pd.DataFrame, points: int = 2000) -> pd.DataFrame:
-    """Every k-th row, so that a figure has no more points than a person sees."""
-    return table.iloc[:: max(1, len(table) // points)]
+        return Quantity("position_rmse_m", "position RMSE (m)", errors.position)
+    if errors.rotation:
+        label = "orientation RMSE (deg)"
+        return Quantity("orientation_rmse_deg", label, errors.rotation, float(np.degrees(1)))
+    name = errors.components[0]
+    return Quantity(f"rmse_{name}", f"RMSE {name}", [0])
 
 
 LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)

@@ -281,6 +281,27 @@ def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
     return table
 
 
+def rmse_interval(
+    errors: Errors, columns: Sequence[int], probability: float = 0.95
+) -> tuple[Floats, Floats]:
+    """Where the RMSE of some components lies at each step (steps,) if the covariances are right.
+
+    A sum of squared errors of covariance P has mean tr P and variance 2 tr P^2, and the distribution of
+    a scaled chi-square variable with these, nearly (Box 1954, theorem 3.1); exactly where all are equal.
+    """
+    block = errors.covariance[:, columns][:, :, columns]
+    _, index, runs = np.unique(errors.step, return_inverse=True, return_counts=True)
+    mean = np.bincount(index, np.trace(block, axis1=1, axis2=2))
+    half_variance = np.bincount(index, np.sum(block**2, axis=(1, 2)))
+    tail = 0.5 * (1 - probability)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = mean**2 / half_variance
+        low, high = (
+            np.sqrt(mean / runs * chi2.ppf(quantile, degrees) / degrees) for quantile in (tail, 1 - tail)
+        )
+    return low, high
+
+
 def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:
     """The Gaussian estimate streams among a replay's outputs."""
     return [

@@ -15,7 +15,13 @@ from recorders.registry import available, foreign_code, load
 from replay.engine.blocks import Ragged
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, Floats, Innovations, step_table
+from replay.judging.evaluation import (
+    Errors,
+    Floats,
+    Innovations,
+    chi_square_interval,
+    step_table,
+)
 
 
 class Output(NamedTuple):
@@ -65,6 +71,28 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any]]) -> dict[s
                     for quantity, value in numbers.items():
                         values[f"{each.estimator}.{quantity}{case}"] = float(value)
     return values
+
+
+def consistency_bounds(judged: Iterable[Any]) -> dict[str, tuple[float, float]]:
+    """Where NEES and NIS lie with 95 % if an estimator is consistent, by the metric's key.
+
+    Errors of a run's steps hang together, so that NEES has the interval of one step's mean over the
+    runs; innovations do not, and NIS has that of them all.
+    """
+    bounds: dict[str, tuple[float, float]] = {}
+    for each in judged:
+        case = f".{each.case}" if each.case else ""
+        if isinstance(each, Errors) and len(each.error):
+            runs = len(np.unique(each.run))
+            bounds[f"{each.estimator}.nees{case}"] = chi_square_interval(len(each.components), runs)
+            if each.position:
+                bounds[f"{each.estimator}.position_nees{case}"] = chi_square_interval(
+                    len(each.position), runs
+                )
+        elif isinstance(each, Innovations) and (degrees := int(each.degrees.sum())):
+            low, high = chi_square_interval(degrees, 1)
+            bounds[f"{each.estimator}.nis_per_component{case}"] = (low / degrees, high / degrees)
+    return bounds
 
 
 def accuracy(errors: Errors) -> dict[str, float]:

@@ -1,16 +1,20 @@
 """Metrics: the registered ones on errors whose numbers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from replay.engine.blocks import Ragged
-from replay.judging.evaluation import Errors, Innovations
+from replay.judging.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
 from replay.judging.metrics import (
     Metric,
     Output,
     accuracy,
+    consistency_bounds,
     failures,
     find_metrics,
     innovation,
@@ -36,6 +40,40 @@ def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:
         nees=np.sum(error**2, axis=1),
         without_truth=2,
     )
+
+
+def test_nees_and_nis_have_the_bounds_of_what_is_independent() -> None:
+    """NEES those of the mean over the runs, NIS those of all innovations; values of a table."""
+    errors = make_errors(np.ones((4, 3)), ("x_m", "y_m", "heading_rad"))
+    two_runs = replace(errors, run=np.array([0, 0, 1, 1]), step=np.array([0, 1, 0, 1]))
+    numbers = np.arange(5)
+    degrees = np.full(5, 2)
+    innovations = Innovations("e", "", numbers, numbers, numbers == 0, numbers * 1.0, degrees)
+    bounds = consistency_bounds([two_runs, innovations])
+    assert bounds == {
+        "e.nees.a": pytest.approx((1.237344 / 2, 14.449375 / 2), rel=1e-6),  # of 6 degrees
+        "e.position_nees.a": pytest.approx((0.484419 / 2, 11.143287 / 2), rel=1e-5),  # of 4
+        "e.nis_per_component": pytest.approx((3.246973 / 10, 20.483177 / 10), rel=1e-6),  # of 10
+    }
+
+
+def test_rmse_lies_in_its_interval_as_often_as_it_says() -> None:
+    """Exactly so where the variances are equal; nearly where one is nine times the other."""
+    runs = 4000
+    errors = make_errors(np.zeros((2 * runs, 2)), ("x_m", "y_m"))
+    errors = replace(errors, run=np.arange(2 * runs) % runs, step=np.arange(2 * runs) // runs)
+    low, high = rmse_interval(errors, [0, 1])
+    assert_allclose(low**2, chi_square_interval(2, runs)[0])
+    assert_allclose(high**2, chi_square_interval(2, runs)[1])
+    covariance = np.array([[5.0, 4.0], [4.0, 5.0]])
+    samples = np.random.default_rng(1).multivariate_normal([0, 0], covariance, (2000, 5))
+    five = make_errors(np.zeros((5, 2)), ("x_m", "y_m"))
+    five = replace(
+        five, run=np.arange(5), step=np.zeros(5, int), covariance=np.tile(covariance, (5, 1, 1))
+    )
+    [low], [high] = rmse_interval(five, [0, 1])
+    rmse = np.sqrt(np.mean(np.sum(samples**2, axis=2), axis=1))
+    assert np.mean((low < rmse) & (rmse < high)) == pytest.approx(0.95, abs=0.01)
 
 
 def test_registered_metrics_by_name() -> None:
