@@ -9,11 +9,11 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 from urllib.parse import quote
 
 from recorders.atomic import whole_folder
@@ -25,7 +25,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from replay.judging.evaluation import Errors
+
 RESULT_FILE = "result.json"
+# Longer tables are no reading matter: they are Parquet alone.
+CSV_ROWS = 20_000
 Verdict = Literal["confirmed", "refuted", "not reproducible"]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -168,10 +172,46 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+class ErrorTables:
+    """Every error of every estimate, on request: a Parquet file per estimator and case.
+
+    They are written block by block, as they come; use it as a context.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "tables" / "errors"
+        self._stack = ExitStack()
+        self._writers: dict[tuple[str, str], Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.close()
+
+    def add(self, errors: "Errors") -> None:
+        """Write a block; see `error_table`."""
+        import pyarrow
+        import pyarrow.parquet
+
+        from replay.judging.judge import error_table
+
+        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
+        what = errors.estimator, errors.case
+        if what not in self._writers:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
+            file = self._stack.enter_context(path.open("wb"))
+            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
+            self._writers[what] = self._stack.enter_context(writer)
+        if len(table):
+            self._writers[what].write_table(table)
+
+
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
-    """Write tables (Parquet and CSV), figures (SVG) and result.json; returns what result.json says."""
+    """Write tables (Parquet, short ones CSV too), figures (SVG), result.json; returns what that says."""
     # here, since lists and --help need none of it
     import matplotlib as mpl
     import pyarrow
@@ -183,8 +223,9 @@ def write_outcome(
         columns = pyarrow.Table.from_pandas(table, preserve_index=False)
         with (folder / "tables" / f"{name}.parquet").open("wb") as file:
             pyarrow.parquet.write_table(columns, file)
-        with (folder / "tables" / f"{name}.csv").open("wb") as file:
-            pyarrow.csv.write_csv(columns, file)
+        if len(table) <= CSV_ROWS:
+            with (folder / "tables" / f"{name}.csv").open("wb") as file:
+                pyarrow.csv.write_csv(columns, file)
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes

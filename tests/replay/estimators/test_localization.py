@@ -18,6 +18,7 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.judging.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.judging.truths import Truths
 from replay.sampling.samplers import unscented
 
 Floats = NDArray[np.float64]
@@ -313,7 +314,7 @@ class Honesty(NamedTuple):
 
 def honesty(name: str, runs: list[MemorySource], **noise: float) -> Honesty:
     outputs = replayed(name, runs, gate_probability=1.0, **noise)
-    errors = errors_of(outputs["pose"], runs)
+    errors = errors_of(outputs["pose"], [*map(Truths, runs)])
     assert isinstance(errors, Errors)
     nees = errors.nees.reshape(100, -1)
     innovations = innovations_of(outputs["innovation"])

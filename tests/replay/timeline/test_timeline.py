@@ -32,6 +32,7 @@ from replay.engine.replaying import collect
 from replay.engine.replaying import replay as replayed
 from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.judging.evaluation import Errors, chi_square_interval, errors_of, gaussian_estimates
+from replay.judging.truths import Truths
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
@@ -57,7 +58,7 @@ def replay_landmarks(runs: int, duration_s: float) -> Replayed:
     sources = [memory_source(*record_run("landmarks", scenario, 3, run)) for run in range(runs)]
     bound = [each for name in ("dead-reckoning", "ekf") for each in bind(name, sources, {})]
     outputs = collect(replayed(sources, bound))
-    found = [errors_of(each, sources) for each in gaussian_estimates(outputs)]
+    found = [errors_of(each, [*map(Truths, sources)]) for each in gaussian_estimates(outputs)]
     return Replayed(sources, outputs, [each for each in found if each is not None])
 
 
