@@ -29,7 +29,7 @@ from replay.engine.estimator import Bound, bind
 from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, ensemble_blocks, replay
 from replay.engine.sources import MemorySource, Source, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
-from replay.judging.judge import Judge
+from replay.judging.judge import TIME_BINS, Judge
 from replay.judging.metrics import Metric, Output, find_metrics, measure
 from replay.judging.set_errors import SetErrors
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Every run of an ensemble has up to three files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
+# Of a run that was judged, so much is kept at least: its sums over time.
+KEPT_BYTES = 8 * TIME_BINS
 
 Settings = Mapping[str, Mapping[str, Any]]
 Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
@@ -278,17 +280,21 @@ def record_ensemble(
     progress: Progress = no_progress,
     executor: Executor | None = None,
     first_run: int = 0,
+    all_runs: int = 0,
 ) -> list[MemorySource]:
     """Record so many runs of a scenario, each from its own random stream of `seed`.
 
-    Raises BadInput where the first one shows that memory cannot hold them all.
+    Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
+    where there are more.
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
     first = record(first_run)
     took_s = time.perf_counter() - begin_s
     # replay lays the runs end to end, which holds every column twice; estimates come on top
-    require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
+    need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
+    all_runs = max(runs, all_runs)
+    require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
     numbers = range(first_run + 1, first_run + runs)
     others = executor.map(record, numbers) if executor else map(record, numbers)
     return list(progress(chain([first], others), f"recording {scenario}", runs))

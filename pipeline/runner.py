@@ -71,6 +71,7 @@ class Runner:
             experiment.runs if runs is None else runs,
             setting.progress,
             first_run=first_run,
+            all_runs=experiment.runs,
         )
 
     def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:

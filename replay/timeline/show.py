@@ -20,7 +20,7 @@ from replay.judging.evaluation import Errors, errors_at
 from replay.timeline.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from replay.timeline.generic import TIMELINE as GENERIC
 from replay.timeline.sinks import open_recording
-from replay.timeline.thinning import Held, Sensed, Thin, thinned_stream
+from replay.timeline.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 
 # A receiver is sent so many messages of outputs at once.
 LIVE_MESSAGES = 20_000
@@ -66,7 +66,8 @@ class Drawing:
             hashlib.sha256(f"{source.run or source.name}{identity}".encode()).hexdigest()[:16],
         )
         self._sensed = Sensed(source)
-        self._kept, self._fresh = Thin(), _fresh()
+        self._kept = Thin(KEPT_ROWS, KEPT_ERRORS)
+        self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
         self._sent = 0
         self._stack = ExitStack()
         self._live = None
@@ -98,9 +99,8 @@ class Drawing:
     def _send(self, live: rr.RecordingStream, until_ns: int) -> None:
         """Send what has come since the last time, and what was sensed up to a stamp."""
         sensed = self._sensed.read_to(until_ns)
-        held = Held(sensed.of, {topic: _few(each) for topic, each in sensed.streams.items()})
-        self._draw(live, Scene(held, self._fresh.outputs, self._fresh.errors, self._focus))
-        self._fresh = _fresh()
+        self._draw(live, Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus))
+        self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
         self._sent += 1
 
     def _finish(self) -> None:
@@ -127,17 +127,6 @@ class Drawing:
                 collapse_panels=True,
             )
         )
-
-
-def _fresh() -> Thin:
-    """For what is sent next: no more than is drawn of a whole run."""
-    return Thin(DRAWN_ROWS, DRAWN_ROWS)
-
-
-def _few(stream: Stream) -> Stream:
-    kept = thinned_stream(stream.schema.full_name, DRAWN_ROWS)
-    kept.add(stream)
-    return kept.rows
 
 
 def show(

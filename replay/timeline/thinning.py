@@ -12,6 +12,7 @@ from recorders.log import Clock, RunMetadata, Stream, Topic, schemas
 from replay.engine.failures import join_streams
 from replay.engine.sources import Source
 from replay.judging.evaluation import PER_ROW, Errors, errors_at
+from replay.timeline.canvas import DRAWN_ROWS
 
 Times = NDArray[np.int64]
 # So many messages of a topic are kept; what is drawn of them is less, see `canvas.DRAWN_ROWS`.
@@ -123,7 +124,7 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 class Thin:
     """The outputs of a run and the errors of its estimates, thinned."""
 
-    def __init__(self, rows: int = KEPT_ROWS, errors: int = KEPT_ERRORS) -> None:
+    def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
         self._outputs: dict[str, Thinned[Stream]] = {}
         self._errors: dict[tuple[str, str], Thinned[Errors]] = {}
@@ -218,14 +219,17 @@ class Sensed:
 
     def __init__(self, source: Source) -> None:
         self.source = source.whole()
-        topics = [topic for topic in source.topics if self._is_sensed(topic)]
-        self._kept = {
-            topic: thinned_stream(source.topics[topic].schema_name, KEPT_ROWS) for topic in topics
-        }
-        for topic, kept in self._kept.items():
-            kept.add(source.empty(topic))
-        self._blocks = self.source.blocks(topics, "publish_time", BLOCK_MESSAGES)
+        self._topics = [topic for topic in source.topics if self._is_sensed(topic)]
+        self._kept, self._fresh = self._empty(KEPT_ROWS), self._empty(DRAWN_ROWS)
+        self._blocks = self.source.blocks(self._topics, "publish_time", BLOCK_MESSAGES)
         self._read_to_ns = -1
+
+    def _empty(self, rows: int) -> dict[str, Thinned[Stream]]:
+        streams = [self.source.empty(topic) for topic in self._topics]
+        kept = {each.topic: thinned_stream(each.schema.full_name, rows) for each in streams}
+        for each in streams:
+            kept[each.topic].add(each)
+        return kept
 
     def _is_sensed(self, topic: str) -> bool:
         if topic.startswith("/estimates/"):
@@ -237,19 +241,21 @@ class Sensed:
         return True
 
     def read_to(self, time_ns: int) -> Held:
-        """What comes up to a stamp, and has not come yet; maps whole."""
-        new: dict[str, list[Stream]] = {}
+        """What comes up to a stamp, and has not come yet, thinned to what is drawn; maps whole."""
         while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
             for topic, stream in block.items():
                 self._kept[topic].add(stream)
-                new.setdefault(topic, []).append(stream)
+                self._fresh[topic].add(stream)
                 self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
-        streams = {topic: self.source.empty(topic) for topic in self._kept}
-        streams |= {topic: join_streams(parts) for topic, parts in new.items()}
-        for topic, kept in self._kept.items():
-            if self.source.topics[topic].schema_name == schemas.LANDMARK.full_name:
-                streams[topic] = kept.rows
+        streams = {
+            topic: (self._kept if self._is_map(topic) else self._fresh)[topic].rows
+            for topic in self._topics
+        }
+        self._fresh = self._empty(DRAWN_ROWS)
         return Held(self.source, streams)
+
+    def _is_map(self, topic: str) -> bool:
+        return self.source.topics[topic].schema_name == schemas.LANDMARK.full_name
 
     def all(self) -> Held:
         """The whole run, thinned."""
