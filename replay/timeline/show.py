@@ -65,7 +65,7 @@ class Drawing:
             f"fuselog-{scenario}" if scenario else "fuselog",
             hashlib.sha256(f"{source.run or source.name}{identity}".encode()).hexdigest()[:16],
         )
-        self._sensed = Sensed(source)
+        self._sensed = Sensed(source, is_live=connect is not None)
         self._kept = Thin(KEPT_ROWS, KEPT_ERRORS)
         self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
         self._sent = 0

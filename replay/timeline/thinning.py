@@ -35,6 +35,8 @@ WHOLE = frozenset(
     )
 )
 BLOCK_MESSAGES = 1 << 17
+# A cell of 2^62 ns is all time.
+LAST_SHIFT = 62
 Rows = TypeVar("Rows", Stream, Errors)
 
 
@@ -62,6 +64,8 @@ class Thinned(Generic[Rows]):
 
     def add(self, rows: Rows) -> None:
         """Take in the next rows, sorted by time."""
+        if self._shift:
+            rows = self._take(rows, last_of_cells(self._time_ns(rows), self._shift))
         count = len(self._time_ns(rows))
         if count == 0 and self._parts:
             return
@@ -69,25 +73,22 @@ class Thinned(Generic[Rows]):
             self._parts = []
         self._parts.append(rows)
         self._count += count
-        if self._limit is not None and self._count > 2 * self._limit:
-            self._thin(self._limit)
+        while self._limit is not None and self._count > 2 * self._limit and self._shift < LAST_SHIFT:
+            self._shift += 1
+            self._thin()
 
     @property
     def rows(self) -> Rows:
         """What is kept."""
-        if len(self._parts) > 1:
-            self._parts = [self._join(self._parts)]
+        self._thin()
         return self._parts[0]
 
-    def _thin(self, limit: int) -> None:
-        rows = self.rows
-        time_ns = self._time_ns(rows)
-        is_kept = last_of_cells(time_ns, self._shift)
-        while is_kept.sum() > limit and self._shift < 62:
-            self._shift += 1
-            is_kept = last_of_cells(time_ns, self._shift)
-        self._parts = [self._take(rows, is_kept)]
-        self._count = int(is_kept.sum())
+    def _thin(self) -> None:
+        """Join the parts: of a cell that two of them share, the later one tells."""
+        rows = self._parts[0] if len(self._parts) == 1 else self._join(self._parts)
+        if self._shift:
+            rows = self._take(rows, last_of_cells(self._time_ns(rows), self._shift))
+        self._parts, self._count = [rows], len(self._time_ns(rows))
 
 
 def last_of_cells(time_ns: Times, shift: int) -> NDArray[np.bool_]:
@@ -96,7 +97,7 @@ def last_of_cells(time_ns: Times, shift: int) -> NDArray[np.bool_]:
         return np.empty(0, bool)
     cell = time_ns >> shift
     last = np.flatnonzero(np.append(cell[1:] != cell[:-1], True))
-    return time_ns == time_ns[last[np.searchsorted(last, np.arange(len(time_ns)))]]
+    return time_ns == np.repeat(time_ns[last], np.diff(last, prepend=-1))
 
 
 def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
@@ -217,8 +218,9 @@ class Held:
 class Sensed:
     """The sensor streams and truths of a run, read along with a replay of it."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, *, is_live: bool) -> None:
         self.source = source.whole()
+        self._is_live = is_live
         self._topics = [topic for topic in source.topics if self._is_sensed(topic)]
         self._kept, self._fresh = self._empty(KEPT_ROWS), self._empty(DRAWN_ROWS)
         self._blocks = self.source.blocks(self._topics, "publish_time", BLOCK_MESSAGES)
@@ -245,7 +247,8 @@ class Sensed:
         while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
             for topic, stream in block.items():
                 self._kept[topic].add(stream)
-                self._fresh[topic].add(stream)
+                if self._is_live:
+                    self._fresh[topic].add(stream)
                 self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
         streams = {
             topic: (self._kept if self._is_map(topic) else self._fresh)[topic].rows
