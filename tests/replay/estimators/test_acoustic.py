@@ -1,4 +1,4 @@
-"""Shooter localization against the numbers of /spec/acoustic (Osborne et al. 2014)."""
+"""Shooter localization against an independent implementation of Osborne et al., JAIF 2014."""
 
 import tomllib
 from functools import cache

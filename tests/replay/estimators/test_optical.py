@@ -1,4 +1,4 @@
-"""Bias estimation from lines of sight against the numbers of /spec/los-bias (Belfadel et al. 2014)."""
+"""Bias estimation from lines of sight against an independent one of Belfadel et al., JAIF 2014."""
 
 import tomllib
 from pathlib import Path
