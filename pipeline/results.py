@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 from recorders.atomic import whole_folder
-from recorders.errors import BadInput
+from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESULT_FILE = "result.json"
+# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+FORMAT = 1
 Verdict = Literal["confirmed", "refuted", "not reproducible"]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -67,6 +69,7 @@ class Result(Parameters):
     without it. A timeline has none: Rerun numbers its rows by the clock.
     """
 
+    format: int = FORMAT
     experiment: str
     fuselog: str
     settings: dict[str, Any]
@@ -235,7 +238,7 @@ def _decided(claim: Claim) -> Claim:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
+    """What result.json of a result folder says; raises BadInput where it is missing, damaged or of another format."""
     path = folder / RESULT_FILE
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
@@ -245,6 +248,7 @@ def read_result(folder: Path) -> Result:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
         raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+    check_format(path, values.get("format", 1), FORMAT)
     return build(Result, values, str(path))
 
 

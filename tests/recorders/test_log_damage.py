@@ -22,6 +22,7 @@ from tests.recorders.log_samples import assert_same, some_streams
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
 STREAMS = some_streams(6, count=6)[:2]
 TOPICS = [stream.topic for stream in STREAMS]
+RECORD = RUN.to_record()
 
 
 def written(folder, compression: str):
@@ -432,3 +433,21 @@ def test_run_metadata_of_wrong_types_are_told(changes, sentence):
     del record["notes"]
     with pytest.raises(BadInput, match="'notes' is missing"):
         RunMetadata.from_record(record, "run.mcap")
+
+
+def test_a_log_of_another_format_is_refused_and_one_of_before_formats_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+    for stated, sentence in {
+        "2": "a newer fuselog wrote it (format 2, this one reads 1); update fuselog",
+        "0": "an older fuselog wrote it (format 0, this one reads 1); write it again",
+        '"x"': 'format is "x", expected a whole number',
+    }.items():
+        monkeypatch.setattr(RunMetadata, "to_record", lambda _, f=stated: {**RECORD, "format": f})
+        write_log(path, STREAMS, RUN)
+        with pytest.raises(BadInput, match=re.escape(sentence)) as refusal:
+            _ = open_log(path).run
+        assert str(refusal.value).startswith(f"{path}: ")
+    before = {name: text for name, text in RECORD.items() if name != "format"}
+    monkeypatch.setattr(RunMetadata, "to_record", lambda _: before)
+    write_log(path, STREAMS, RUN)
+    assert open_log(path).run == RUN
