@@ -238,7 +238,10 @@ def _decided(claim: Claim) -> Claim:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says; raises BadInput where it is missing, damaged or of another format."""
+    """What result.json of a result folder says.
+
+    Raises BadInput where it is missing, damaged or of another format.
+    """
     path = folder / RESULT_FILE
     try:
         values = parse_json(path.read_text(encoding="utf-8"))

@@ -43,9 +43,10 @@ class RunMetadata:
 
     @classmethod
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
-        """Read the MCAP metadata record back; raises BadInput where it is damaged, or of another format."""
+        """Read the MCAP metadata record back; raises BadInput where damaged or of another format."""
         try:
-            check_format(path, _stated({"format": "1", **record}, "format", int), FORMAT)
+            written_in = _stated({"format": "1", **record}, "format", int)
+            check_format(path, written_in, FORMAT)
             epoch_ns = _stated(record, "epoch_ns", int)
             notes = _stated(record, "notes", dict)
             if epoch_ns >= 2**63:
