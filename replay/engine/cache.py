@@ -64,7 +64,7 @@ def say_once(sentence: str) -> None:
 
 
 def kept_files() -> Iterator[Path]:
-    """The files in the folders of this user's cache that fuselog wrote, and that are as it wrote them."""
+    """The files in this user's cache that fuselog wrote, and that are as it wrote them."""
     for path in sorted(cache_folder().glob("*/*.bin")):
         ours = not path.is_symlink() and is_private(path.parent)
         if ours and read_checked(path) is not None:

@@ -1,4 +1,4 @@
-"""`fuselog cache`: how much it holds; clearing removes what fuselog wrote, as it wrote it, and no more."""
+"""`fuselog cache`: how much it holds; clearing removes what fuselog wrote and nothing else."""
 
 import os
 from collections.abc import Callable
