@@ -1,9 +1,11 @@
 # make demo, make test: each does all of its own set-up in .venv; only Python 3.11 or newer is needed.
+# make docs makes the pages' tables from the stored results; make docs-claims FUSELOG_DATA=FOLDER runs the
+# experiments first, all or those that NAMES="..." lists.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test mutants bench faults format clean
+.PHONY: demo test mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -30,6 +32,13 @@ bench: .venv/with-bench
 
 faults: .venv/with-test
 	$(BIN)/python -m tests.faults
+
+docs: .venv/with-test
+	$(BIN)/python -m tests.claims render
+
+docs-claims: .venv/with-test
+	$(BIN)/python -m tests.claims run $(NAMES)
+	$(BIN)/python -m tests.claims render
 
 format: .venv/with-test
 	$(BIN)/ruff format .
