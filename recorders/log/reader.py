@@ -48,8 +48,8 @@ def read_streams(
     """Read topics whole, each in time order; see `read_blocks`. A topic without messages is empty.
 
     >>> from recorders.log import make_stream, open_log, schemas, write_log
-    >>> ranges = make_stream("/range", schemas.RANGE, [20, 0, 10], target_id=[1, 1, 1], range_m=[5, 3, 4])
-    >>> write_log("run.mcap", [ranges])
+    >>> seen = make_stream("/range", schemas.RANGE, [20, 0, 10], target_id=[1, 1, 1], range_m=[5, 3, 4])
+    >>> write_log("run.mcap", [seen])
     >>> read_streams(open_log("run.mcap"), ["/range"], start_ns=10)["/range"]["range_m"].tolist()
     [4.0, 5.0]
     """

@@ -293,8 +293,8 @@ def recursive(
     >>> from recorders.recording import Recording
     >>> from replay.engine.replaying import collect, replay
     >>> from replay.engine.sources import memory_source
-    >>> ranges = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
-    >>> source = memory_source(Recording([ranges]), RunMetadata("example"))
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
     >>> bound = nearest.bind("nearest", source.topics, Parameters())
     >>> estimates = collect(replay([source], bound))
     >>> estimates["/estimates/nearest/state"]["mean"].ravel().tolist()
@@ -418,8 +418,8 @@ def batch(
     >>> from recorders.recording import Recording
     >>> from replay.engine.replaying import collect, replay
     >>> from replay.engine.sources import memory_source
-    >>> ranges = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
-    >>> source = memory_source(Recording([ranges]), RunMetadata("example"))
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
     >>> estimates = collect(replay([source], average.bind("average", source.topics, Parameters())))
     >>> estimates["/estimates/average/state"]["mean"].tolist()
     [[4.0]]
