@@ -1,6 +1,5 @@
 """`fuselog cache`: how much it holds; clearing removes what fuselog wrote and nothing else."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ def test_what_fuselog_did_not_write_stays(place: Path, fuselog: Callable[..., An
     assert left == {place / name: content for name, content in others.items()}
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="links and modes as Unix has them")
+@pytest.mark.unix
 def test_links_and_folders_that_others_may_write_to_stay(
     place: Path, fuselog: Callable[..., Any]
 ) -> None:

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import shutil
 import signal
 import subprocess
@@ -314,6 +313,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(
     arguments: list[str], here: Path, start_fuselog: Callable[..., Any]
 ) -> None:
     """The limit on the size of files stands in for the disk's."""
+    resource = pytest.importorskip("resource")
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
@@ -346,6 +346,7 @@ def parent_that_ignores_interrupts() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.unix
 @pytest.mark.usefixtures("parent_that_ignores_interrupts")
 def test_a_stopped_run_leaves_nothing_and_a_killed_one_a_part(
     here: Path, start_fuselog: Callable[..., Any], fuselog: Fuselog

@@ -48,7 +48,7 @@ def test_nothing_is_said_of_progress_where_nobody_watches(
     assert json.loads(out)["experiment"] == "landmarks"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+@pytest.mark.unix
 def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable[..., Any]) -> None:
     import pty
 

@@ -218,6 +218,7 @@ def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch
     ]
 
 
+@pytest.mark.unix
 def test_only_a_folder_of_this_user_alone_is_used(
     kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog
 ):

@@ -401,6 +401,7 @@ def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp
         refused(url)
 
 
+@pytest.mark.unix
 def test_a_receiver_that_goes_away_is_told_and_nothing_half_written(tmp_path: Path) -> None:
     path = tmp_path / "kept.rrd"
     path.write_text("what was there before")
