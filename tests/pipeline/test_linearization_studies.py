@@ -7,6 +7,8 @@ from pipeline.experiment import load_experiment, run_experiment
 from pipeline.results import Result
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.paper
+
 # Fig. 7 of Steinbring and Hanebeck, JAIF 2014, by an independent implementation (the sheet):
 # RMSE of mean and covariance, one data seed of 1000 runs
 REACTOR = {

@@ -37,6 +37,7 @@ def test_the_readmes_line_completes_commands_and_options() -> None:
         assert expected <= set(done.stdout.split()), done
 
 
+@pytest.mark.paper
 def test_nothing_is_said_of_progress_where_nobody_watches(
     tmp_path: Path, start_fuselog: Callable[..., Any]
 ) -> None:
@@ -48,6 +49,7 @@ def test_nothing_is_said_of_progress_where_nobody_watches(
     assert json.loads(out)["experiment"] == "landmarks"
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable[..., Any]) -> None:
     import pty

@@ -114,6 +114,7 @@ KILLED = """
 """
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 @pytest.mark.parametrize(("name", "inside"), [("f.txt", "f.txt"), ("r", "r/a")])
 def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, name, inside):

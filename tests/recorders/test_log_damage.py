@@ -101,6 +101,7 @@ def messages_by_chunk(raw: bytes) -> list[tuple[int, Counter]]:
     return ends
 
 
+@pytest.mark.paper
 def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole):
     """No cut gives a wrong, half or doubled message; the three compressions take turns at the bytes."""
     raw, honest, path = whole
@@ -120,6 +121,7 @@ def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole
                 assert_same(stream, honest[topic], slice(kept[topic]))
 
 
+@pytest.mark.paper
 def test_a_flipped_bit_is_told_or_changes_nothing(whole):
     """Either a sentence, or exactly the log as it was written; with recover no message is another."""
     raw, honest, path = whole

@@ -20,6 +20,8 @@ from replay.inference.least_squares import Solution, Status, fisher_information
 from replay.judging.consistency import ellipse_area
 from replay.judging.evaluation import chi_square_interval
 
+pytestmark = pytest.mark.paper
+
 SCENARIOS = Path(__file__).parents[3] / "data" / "scenarios"
 MEDIUM = Medium()
 MODES = [Mode.BEARINGS_ONLY, Mode.LOCAL_ESTIMATES, Mode.NATIVE_MEASUREMENTS]

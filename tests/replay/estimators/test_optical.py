@@ -15,6 +15,8 @@ from replay.estimators.optical import Scene
 from replay.inference.least_squares import Status, cramer_rao_bound, solve
 from replay.judging.evaluation import chi_square_interval
 
+pytestmark = pytest.mark.paper
+
 SCENARIOS = Path(__file__).parents[3] / "data" / "scenarios"
 # (bias in deg, noise in rad): as the paper states them, and as they reproduce its table III.
 STATED = (1.0, 0.34e-3)

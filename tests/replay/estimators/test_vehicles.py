@@ -28,6 +28,8 @@ from replay.judging.evaluation import errors_of
 from replay.judging.label_errors import assigned_squared_error, fixed_squared_error, total_error
 from replay.judging.set_distances import gospa
 
+pytestmark = pytest.mark.paper
+
 Floats = NDArray[np.float64]
 TOLERANCE = 1e-4
 WHOLE = Scanning(0.5, 1.0, 0.0)

@@ -221,6 +221,7 @@ def plain_jet(expression: str, x: float, y: float) -> list[float]:
     return [value_of(y_x), slope_of(y_x, 0), slope_of(y_x, 1)]
 
 
+@pytest.mark.paper
 def test_every_function_has_the_slopes_of_central_differences_compiled_and_plain():
     rng = np.random.default_rng(1)
     step = 1e-6
@@ -237,6 +238,7 @@ def test_every_function_has_the_slopes_of_central_differences_compiled_and_plain
             assert_allclose(slopes, np.divide(differences, 2 * step), 1e-6, 1e-8, err_msg=expression)
 
 
+@pytest.mark.paper
 def test_values_are_those_without_jets_in_every_bit():
     """An estimator with jets has exactly the values of one with derivatives by hand."""
     lines = [f"out[{k}] = {expression}" for k, expression in enumerate(SMOOTH)]
@@ -363,6 +365,7 @@ def by_differences(models: ModuleType, x: np.ndarray, step: float = 1e-6) -> np.
     return out
 
 
+@pytest.mark.paper
 def test_every_model_has_the_slopes_of_central_differences_compiled_and_plain(models: ModuleType):
     given = np.random.default_rng(3).normal(size=(100, 6))
     compiled, plain = by_compiler(models, given), plainly(models, given)

@@ -7,6 +7,8 @@ from recorders.errors import BadInput
 from replay.sampling import lcd_distance, lcd_samples, moment_corrected
 from replay.sampling.distance import lcd_distance_and_gradient
 
+pytestmark = pytest.mark.paper
+
 # N, L, D / pi^(N/2), smallest and largest eigenvalue of the raw covariance: sets of an independent
 # implementation of Steinbring and Hanebeck, JAIF 2014, section V
 REFERENCE = [
