@@ -28,6 +28,8 @@ from replay.engine.compile import compile_over_runs
 from replay.inference import jets
 from replay.inference.jets import jet, slope_of, value_of
 
+pytestmark = pytest.mark.paper
+
 # --- one function at a time ------------------------------------------------------------------------
 
 # Smooth at every x in (0.1, 0.9) and y in (1.1, 1.9).
@@ -221,7 +223,6 @@ def plain_jet(expression: str, x: float, y: float) -> list[float]:
     return [value_of(y_x), slope_of(y_x, 0), slope_of(y_x, 1)]
 
 
-@pytest.mark.paper
 def test_every_function_has_the_slopes_of_central_differences_compiled_and_plain():
     rng = np.random.default_rng(1)
     step = 1e-6
@@ -238,7 +239,6 @@ def test_every_function_has_the_slopes_of_central_differences_compiled_and_plain
             assert_allclose(slopes, np.divide(differences, 2 * step), 1e-6, 1e-8, err_msg=expression)
 
 
-@pytest.mark.paper
 def test_values_are_those_without_jets_in_every_bit():
     """An estimator with jets has exactly the values of one with derivatives by hand."""
     lines = [f"out[{k}] = {expression}" for k, expression in enumerate(SMOOTH)]
@@ -365,7 +365,6 @@ def by_differences(models: ModuleType, x: np.ndarray, step: float = 1e-6) -> np.
     return out
 
 
-@pytest.mark.paper
 def test_every_model_has_the_slopes_of_central_differences_compiled_and_plain(models: ModuleType):
     given = np.random.default_rng(3).normal(size=(100, 6))
     compiled, plain = by_compiler(models, given), plainly(models, given)
