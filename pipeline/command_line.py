@@ -314,6 +314,16 @@ def models(name: str | None, as_json: bool) -> None:
     show_models(name, as_json=as_json)
 
 
+@fuselog.command(short_help="Say what the cache of kernels and samples holds, or clear it.")
+@click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
+@json_option
+def cache(clear: bool, as_json: bool) -> None:
+    """Say how large the cache is: compiled kernels and samples, which fuselog can make again."""
+    from pipeline.information import show_cache
+
+    show_cache(clear=clear, as_json=as_json)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from urllib.parse import quote
 
 from recorders.atomic import whole_folder
-from recorders.errors import BadInput
+from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 RESULT_FILE = "result.json"
 # Longer tables are no reading matter: they are Parquet alone.
 CSV_ROWS = 20_000
+# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+FORMAT = 1
 Verdict = Literal["confirmed", "refuted", "not reproducible"]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -71,6 +73,7 @@ class Result(Parameters):
     without it. A timeline has none: Rerun numbers its rows by the clock.
     """
 
+    format: int = FORMAT
     experiment: str
     fuselog: str
     settings: dict[str, Any]
@@ -276,7 +279,10 @@ def _decided(claim: Claim) -> Claim:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
+    """What result.json of a result folder says.
+
+    Raises BadInput where it is missing, damaged or of another format.
+    """
     path = folder / RESULT_FILE
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
@@ -286,6 +292,7 @@ def read_result(folder: Path) -> Result:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
         raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+    check_format(path, values.get("format", 1), FORMAT)
     return build(Result, values, str(path))
 
 

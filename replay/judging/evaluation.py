@@ -103,7 +103,13 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Where the mean of `runs` chi-square values lies with this probability if all is well."""
+    """Where the mean of `runs` chi-square values lies with this probability if all is well.
+
+    A mean NEES of 3 components over 50 runs is credible within
+
+    >>> [round(bound, 3) for bound in chi_square_interval(3, 50)]
+    [2.36, 3.716]
+    """
     tail = 0.5 * (1 - probability)
     interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
     return float(interval[0]), float(interval[1])

@@ -63,7 +63,7 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     assert "Infinity" not in text
     values = json.loads(text)
     assert list(values) == [
-        *["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
+        *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
     ]
     assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"
@@ -327,6 +327,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.paper
 def test_nothing_is_refuted_by_estimates_that_are_missing(tmp_path: Path) -> None:
     """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
     label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})

@@ -149,6 +149,7 @@ def set_6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> MemorySo
     return source
 
 
+@pytest.mark.paper
 def test_set_6_has_every_message_but_the_unknown_barcodes(set_6: MemorySource):
     """Counts are the files' rows (less four lines of comments); 43, 34 and 50 are in no table."""
     counts = {topic: len(stream) for topic, stream in set_6.streams.items()}
@@ -165,6 +166,7 @@ def test_set_6_has_every_message_but_the_unknown_barcodes(set_6: MemorySource):
     }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_filters_localize_the_robots_of_set_6(name: str, set_6: MemorySource):
     """From the truth's start: RMSE at most .22 m (robot 4: .30), NEES of the position at most 3.

@@ -14,6 +14,8 @@ from replay.engine.sources import memory_source
 from replay.estimators.covariance_intersection import fuse_sighting
 from replay.judging.metrics import ACCURACY, CONSISTENCY
 
+pytestmark = pytest.mark.paper
+
 POSES = np.array([[0.0, 0.0, 0.3], [2.0, 1.0, -1.0]])
 COVARIANCES = np.array(
     [

@@ -191,6 +191,7 @@ RICH = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("order", ["publish_time", "log_time"])
 @pytest.mark.parametrize(("name", "steps"), [("ekf", Ekf()), ("ukf", Ukf(0.0)), ("ukf", Ukf(0.7))])
 def test_filters_equal_the_textbook(name: str, steps: Ekf | Ukf, order: Clock):

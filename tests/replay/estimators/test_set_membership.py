@@ -18,6 +18,8 @@ from replay.estimators.set_membership import Known, frames
 from replay.judging.set_evaluation import judge_sets
 from replay.judging.truths import truth_at
 
+pytestmark = pytest.mark.paper
+
 SHAPES = ("exact", "box", "l4", "l8")
 
 

@@ -29,6 +29,8 @@ from replay.judging.label_errors import assigned_squared_error, fixed_squared_er
 from replay.judging.set_distances import gospa
 from replay.judging.truths import Truths
 
+pytestmark = pytest.mark.paper
+
 Floats = NDArray[np.float64]
 TOLERANCE = 1e-4
 WHOLE = Scanning(0.5, 1.0, 0.0)

@@ -232,6 +232,7 @@ def test_the_same_replay_is_the_same_recording_and_another_is_not(
     assert read(rrd, static=True) == read(again, static=True)
 
 
+@pytest.mark.paper
 def test_a_long_run_is_thinned_and_says_so(tmp_path: Path) -> None:
     long = replay_landmarks(1, 300.0)
     show(long.sources[0], long.outputs, long.errors, save=tmp_path / "long.rrd")
@@ -382,6 +383,7 @@ def test_one_pass_goes_to_a_file_and_to_a_running_receiver(
         socket.create_connection(("127.0.0.1", port), timeout=1)
 
 
+@pytest.mark.paper
 def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp_path: Path) -> None:
     def refused(url: str) -> None:
         begin = time.monotonic()
@@ -402,6 +404,7 @@ def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp
         refused(url)
 
 
+@pytest.mark.unix
 def test_a_receiver_that_goes_away_is_told_and_nothing_half_written(tmp_path: Path) -> None:
     path = tmp_path / "kept.rrd"
     path.write_text("what was there before")
