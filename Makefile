@@ -5,7 +5,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v pyth
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-fast lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast test-paper lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -17,11 +17,15 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
+# the fast tests and the long reproductions of papers, side by side
 test: lint
-	$(BIN)/pytest
+	$(MAKE) -j2 test-fast test-paper
 
-test-fast: lint
+test-fast: .venv/with-test
 	$(BIN)/pytest -m "not paper"
+
+test-paper: .venv/with-test
+	$(BIN)/pytest -m paper
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .

@@ -326,14 +326,14 @@ FAULTS = [
     ),
     Fault(
         "replay/judging/metrics.py",
-        "sums["squared"] / sums["degrees"]",
-        "sums["squared"] / sums["messages"]",
+        'sums["squared"] / sums["degrees"]',
+        'sums["squared"] / sums["messages"]',
         f"{EVALUATION} tests/replay/judging/test_metrics.py",
     ),
     Fault(
         "replay/judging/metrics.py",
-        "1 - sums["accepted"] / sums["messages"]",
-        "sums["accepted"] / sums["messages"]",
+        '1 - sums["accepted"] / sums["messages"]',
+        'sums["accepted"] / sums["messages"]',
         f"{EVALUATION} tests/replay/judging/test_metrics.py",
     ),
     # tracks, sets, verification
