@@ -9,16 +9,16 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
 from pipeline.charts import Chart, draw
 from recorders.atomic import whole_folder
-from recorders.errors import BadInput
+from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -26,7 +26,13 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from replay.judging.evaluation import Errors
+
 RESULT_FILE = "result.json"
+# Longer tables are no reading matter: they are Parquet alone.
+CSV_ROWS = 20_000
+# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+FORMAT = 1
 Verdict = Literal["confirmed", "refuted", "not reproducible"]
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
@@ -72,6 +78,7 @@ class Result(Parameters):
     lies with 95 % if all is well.
     """
 
+    format: int = FORMAT
     experiment: str
     fuselog: str
     settings: dict[str, Any]
@@ -179,10 +186,46 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+class ErrorTables:
+    """Every error of every estimate, on request: a Parquet file per estimator and case.
+
+    They are written block by block, as they come; use it as a context.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "tables" / "errors"
+        self._stack = ExitStack()
+        self._writers: dict[tuple[str, str], Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.close()
+
+    def add(self, errors: "Errors") -> None:
+        """Write a block; see `error_table`."""
+        import pyarrow
+        import pyarrow.parquet
+
+        from replay.judging.judge import error_table
+
+        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
+        what = errors.estimator, errors.case
+        if what not in self._writers:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
+            file = self._stack.enter_context(path.open("wb"))
+            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
+            self._writers[what] = self._stack.enter_context(writer)
+        if len(table):
+            self._writers[what].write_table(table)
+
+
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
-    """Write tables (Parquet and CSV), figures (SVG; charts as JSON too) and result.json.
+    """Write tables (Parquet, short ones CSV too), figures (SVG; charts as JSON too) and result.json.
 
     Returns what result.json says.
     """
@@ -197,8 +240,9 @@ def write_outcome(
         columns = pyarrow.Table.from_pandas(table, preserve_index=False)
         with (folder / "tables" / f"{name}.parquet").open("wb") as file:
             pyarrow.parquet.write_table(columns, file)
-        with (folder / "tables" / f"{name}.csv").open("wb") as file:
-            pyarrow.csv.write_csv(columns, file)
+        if len(table) <= CSV_ROWS:
+            with (folder / "tables" / f"{name}.csv").open("wb") as file:
+                pyarrow.csv.write_csv(columns, file)
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes
@@ -253,7 +297,10 @@ def _decided(claim: Claim) -> Claim:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
+    """What result.json of a result folder says.
+
+    Raises BadInput where it is missing, damaged or of another format.
+    """
     path = folder / RESULT_FILE
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
@@ -263,14 +310,8 @@ def read_result(folder: Path) -> Result:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
         raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
-    try:
-        return build(Result, values, str(path))
-    except BadInput as error:
-        writer = f"fuselog {values['fuselog']}" if "fuselog" in values else "something else"
-        own = version("fuselog")
-        raise BadInput(
-            f"{error}; {writer} wrote it, this is fuselog {own}: run the experiment again"
-        ) from None
+    check_format(path, values.get("format", 1), FORMAT)
+    return build(Result, values, str(path))
 
 
 def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:

@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from typing import Any
 
 from recorders.errors import BadInput
@@ -75,10 +75,10 @@ def replay(
         raise next(iter(refused.values()))
     for bound, watch, given in zip(estimators, watches, states, strict=True):
         if isinstance(bound, Batch):
-            for block in _ensemble_blocks(sources, bound.streams, order, sys.maxsize):
+            for block in _required(sources, bound.streams, order, sys.maxsize):
                 yield watch.receive(watch.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
-    for block in _ensemble_blocks(sources, sorted(streamed), order, block_messages):
+    for block in _required(sources, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
         for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
             if isinstance(bound, Recursive):
@@ -178,7 +178,18 @@ def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, R
     return {topic: gather([run[topic] for run in runs]) for topic in topics}
 
 
-def _ensemble_blocks(
+def _required(
+    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
+) -> Iterator[dict[str, Ragged]]:
+    """As `ensemble_blocks`; raises BadInput where no run has a message of the topics."""
+    blocks = ensemble_blocks(sources, topics, order, block_messages)
+    first = next(blocks, None)
+    if first is None and topics:
+        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
+    yield from chain([first] if first is not None else [], blocks)
+
+
+def ensemble_blocks(
     sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
     """The next block of every run, until all runs are at their end.
@@ -189,13 +200,9 @@ def _ensemble_blocks(
         return
     empty = {topic: sources[0].empty(topic) for topic in topics}
     ended: dict[str, Stream] = {}
-    is_empty = True
     runs = [source.blocks(topics, order, block_messages) for source in sources]
     for blocks in zip_longest(*runs, fillvalue=ended):
         yield {topic: gather([block.get(topic, empty[topic]) for block in blocks]) for topic in topics}
-        is_empty = False
-    if is_empty:
-        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:

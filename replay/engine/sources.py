@@ -56,6 +56,9 @@ class Source(Protocol):
     ) -> Iterator[dict[str, Stream]]:
         """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
+    def whole(self) -> "Source":
+        """The run without a span."""
+
 
 @dataclass(frozen=True)
 class LogSource:
@@ -114,6 +117,10 @@ class LogSource:
             block_messages=block_messages,
         )
 
+    def whole(self) -> "LogSource":
+        """The whole log."""
+        return LogSource(self.log)
+
 
 @dataclass(frozen=True)
 class MemorySource:
@@ -163,6 +170,10 @@ class MemorySource:
         block = {topic: self._in_order(topic, order) for topic in topics if len(self.streams[topic])}
         if block:
             yield block
+
+    def whole(self) -> "MemorySource":
+        """The recording itself."""
+        return self
 
     def _in_order(self, topic: str, order: Clock) -> Stream:
         if (topic, order) not in self._ordered:

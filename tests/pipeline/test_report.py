@@ -269,8 +269,7 @@ def _garble(folder: Path) -> None:
 
 def _make_older(folder: Path) -> None:
     values = json.loads((folder / "result.json").read_text())
-    values["scores"] = values.pop("metrics")
-    values["fuselog"] = "0.0.1"
+    values["format"] = 0
     (folder / "result.json").write_text(json.dumps(values))
 
 
@@ -279,7 +278,7 @@ def _make_older(folder: Path) -> None:
     [
         (_lose, ("figures/errors-robot", "is missing; run it again")),
         (_garble, ("figures/errors-robot", "panels.0.title")),
-        (_make_older, ("result.json", "fuselog 0.0.1 wrote it", "run the experiment again")),
+        (_make_older, ("result.json", "an older fuselog wrote it (format 0")),
     ],
 )
 def test_a_damaged_or_older_result_is_one_sentence(
