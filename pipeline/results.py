@@ -109,6 +109,14 @@ class Measured(NamedTuple):
     value: MetricValue = None
     bounds: Bounds | None = None
 
+    @property
+    def place(self) -> Literal["below", "within", "above", ""]:
+        """Where the value lies; nowhere where there is none, or no bounds."""
+        if self.bounds is None or not isinstance(self.value, int | float):
+            return ""
+        low, high = self.bounds
+        return "below" if self.value < low else "above" if self.value > high else "within"
+
 
 @dataclass(frozen=True)
 class MetricTable:
