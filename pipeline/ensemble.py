@@ -77,9 +77,16 @@ def parts_of(runs: int) -> Iterator[slice]:
 
 @dataclass
 class Pass:
-    """What a streamed pass leaves: the judge of all runs, and the seconds that each estimator took."""
+    """What a streamed pass leaves.
+
+    Attributes:
+        judge: of all runs.
+        parameters: of every estimator, defaults included, by label.
+        seconds: that each estimator took, by label.
+    """
 
     judge: Judge
+    parameters: dict[str, dict[str, Any]]
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
@@ -158,7 +165,7 @@ def replay_parts(
         if passes:
             passes[0].judge.merge(judge)
         else:
-            passes.append(Pass(judge))
+            passes.append(Pass(judge, parameters_of(bound)))
         for label, time_s in report.seconds.items():
             passes[0].seconds[label] += time_s
 
@@ -176,6 +183,15 @@ def bind_from(
     """Bind estimators to runs, each begun from its origin where there are any."""
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
     return [start_from(each, sources, origins, order) for each in bound] if origins else bound
+
+
+def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
+    """The parameters of estimators by label, as JSON has them; those that are None are not used."""
+    return {
+        each.name.partition("/")[0]: each.parameters.model_dump(mode="json", exclude_none=True)
+        for each in bound
+        if each.parameters is not None
+    }
 
 
 def replay_blocks(
@@ -382,3 +398,12 @@ def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
     for stream in source.streams.values():
         for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
             digest.update(np.ascontiguousarray(array).data)
+
+
+def hash_files(paths: Sequence[Path]) -> str:
+    """SHA-256 over the bytes of files."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()

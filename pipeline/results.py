@@ -56,7 +56,8 @@ def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Cla
 class Outcome:
     """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
 
-    `input_sha256` is a hash of the data that went in.
+    `input_sha256` is a hash of the data that went in, `parameters` are those of all estimators, defaults
+    included.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -64,6 +65,7 @@ class Outcome:
     tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
     figures: dict[str, "Figure"] = field(default_factory=dict)
     input_sha256: str = ""
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 class Result(Parameters):

@@ -8,7 +8,7 @@ the runs replayed one by one, bit for bit.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic
 
 from recorders.errors import BadInput
@@ -37,6 +37,7 @@ class Recursive:
         given: whole topics that are not read from the runs, see `pipeline.starting`.
         finish: the state after the last block -> the outputs that waited for messages which did not
             come any more.
+        parameters: those that it was bound with, defaults included.
     """
 
     name: str
@@ -47,14 +48,14 @@ class Recursive:
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
     finish: Callable[[Any], list[Ragged]] | None = None
+    parameters: Parameters | None = None
 
 
 @dataclass(frozen=True)
 class Batch:
     """An estimator that needs everything at once: `solve` turns its topics into output streams.
 
-    `streams` are the measurements, within the span that is replayed; `whole` and `priors` as for
-    `Recursive`.
+    `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Batch:
     solve: Callable[[dict[str, Ragged]], list[Ragged]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
+    parameters: Parameters | None = None
 
 
 Bound = Recursive | Batch
@@ -139,7 +141,9 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
                     f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
                     "ensemble hold the same topics, replay this one on its own"
                 )
-    return bound
+    return [
+        each if each.parameters is not None else replace(each, parameters=parameters) for each in bound
+    ]
 
 
 def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:

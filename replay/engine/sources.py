@@ -60,6 +60,17 @@ class Source(Protocol):
         """The run without a span."""
 
 
+def is_sensed(source: Source, topic: str) -> bool:
+    """Whether a topic is the run's own, and columns: no estimates, no images."""
+    if topic.startswith("/estimates/"):
+        return False
+    try:
+        source.empty(topic)
+    except BadInput:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class LogSource:
     """A log file, read lazily."""

@@ -173,7 +173,8 @@ def bind_model(
         whole = (found.prior.name, *maps)
         priors = {found.prior.name: model.state}
         start, run, finish = filtering.start, filtering.run, filtering.finish
-        bound.append(Recursive(name, streams, whole, start, run, priors, finish=finish))
+        made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
+        bound.append(made)
     return bound
 
 
