@@ -413,16 +413,6 @@ def each_run(
     return solve_all
 
 
-def _joined(parts: Sequence[Estimates]) -> Estimates:
-    solutions = [part.solution for part in parts if part.solution]
-    return Estimates(
-        np.concatenate([part.time_ns for part in parts]),
-        np.concatenate([part.mean for part in parts]),
-        np.concatenate([part.covariance for part in parts]),
-        Solution(*map(np.concatenate, zip(*solutions, strict=True))) if solutions else None,
-    )
-
-
 def bindings(
     topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, Topic]]]:

@@ -219,7 +219,7 @@ def _kalman_run(
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:
     """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
 
-    See `replay.engine.tangent.vector_part_covariance`.
+    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
     """
     t = len(covariance)
     for i in range(t):

@@ -550,7 +550,12 @@ class Stake(NamedTuple):
 
 
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """The weight w of `fuse_sighting`; NaN where a covariance is singular.
+    """The weight w of the update by a measurement of part of a state that rests on another estimate.
+
+    Its noise has a part `shared` that is correlated with the state in an unknown way, and one that is
+    not, `own`, the sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace,
+    which depends on the state's units, or the least determinant, which does not. It is above 0: at 0
+    whatever the measurement does not see would be lost. NaN where a covariance is singular.
 
     With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
     tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
@@ -573,33 +578,3 @@ def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -
         else:
             value = np.log(determinant(noise) / determinant(total)) - stake.states * np.log(weight)
     return weight if np.isfinite(value) else np.nan
-
-
-def fuse_sighting(
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    rows: ArrayLike,
-    innovation: ArrayLike,
-    shared: ArrayLike,
-    own: ArrayLike,
-    criterion: Criterion = "trace",
-) -> tuple[Floats, Floats, float]:
-    """The update by a measurement of part of a state that rests on another node's estimate.
-
-    The innovation (m,), with rows (m, n), has a part with covariance `shared` that is correlated with
-    the state in an unknown way, and one that is not, `own`, the sensor's: P / w against
-    shared / (1 - w) + own, at the w of the least trace, which depends on the state's units, or the least
-    determinant, which does not. It is above 0: at 0 whatever the measurement does not see would be lost.
-
-    Returns mean (n,), covariance (n, n) and w. Raises BadInput where a covariance is singular.
-    """
-    x, p, h, v, r, q = (
-        np.asarray(part, float) for part in (mean, covariance, rows, innovation, shared, own)
-    )
-    spread = h @ p @ h.T
-    stake = Stake(len(x), float(np.trace(p)), spread, h @ p @ p @ h.T)
-    weight = sighting_weight(criterion == "trace", stake, r, q) if determinant(p) > 0 else np.nan
-    if not np.isfinite(weight):
-        raise BadInput("a covariance of the sighting is singular; it needs the sensor's own noise")
-    gain = np.linalg.solve(spread / weight + r / (1 - weight) + q, h @ p / weight).T
-    return x + gain @ v, p / weight - gain @ h @ p / weight, weight

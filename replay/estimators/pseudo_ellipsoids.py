@@ -65,13 +65,6 @@ def monomials(points: Floats, order: Order) -> Floats:
     return np.stack(columns, axis=-1)
 
 
-def parabola_ellipse(low: float, high: float) -> tuple[Floats, Floats]:
-    """Midpoint (2,) and V (2, 2) of the ellipse around (z, z^2), low <= z <= high; Example 1."""
-    z, h = 0.5 * (low + high), 0.5 * (high - low)
-    shape = np.array([[h, 0.0], [2 * z * h, h * h]])
-    return np.array([z, z * z + 2 * h * h / 3]), shape @ np.diag([4 / 3, 4 / 9]) @ shape.T
-
-
 def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
     """Rings u = a |x|^2 + b'x + c with |u| <= 1 on each pair's exact set: (2 n, 4), two a pair.
 

@@ -219,12 +219,6 @@ def _judge(
     return Solution(parameters, covariance, rank, iterations, cost, status)
 
 
-def fisher_information(at: Linearization) -> Array:
-    """Fisher information (runs, n, n), trace term of a parameter-dependent covariance included."""
-    root = information_root(at)
-    return np.swapaxes(root, 1, 2) @ root
-
-
 def information_root(at: Linearization) -> Array:
     """Rows (runs, k, n) whose outer products sum to the Fisher information.
 

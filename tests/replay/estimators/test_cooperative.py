@@ -6,13 +6,14 @@ import pytest
 from pipeline.ensemble import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.planar import range_bearing, range_bearing_jacobian
+from recorders.models.planar import range_bearing
 from recorders.recording import Recording, import_run
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
-from replay.estimators.covariance_intersection import fuse_sighting
 from replay.judging.metrics import accuracy, consistency
+from tests.bench.reference.landmarks import range_bearing_jacobian
+from tests.replay.estimators.test_covariance_intersection import fuse_sighting
 
 POSES = np.array([[0.0, 0.0, 0.3], [2.0, 1.0, -1.0]])
 COVARIANCES = np.array(
