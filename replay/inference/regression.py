@@ -5,12 +5,12 @@ Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF
 vectors, and means are intrinsic: the weighted differences from them sum to zero.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from replay.engine.arrays import Floats, Function
 from replay.inference.gaussian import cholesky, wrap
 from replay.inference.generate import (
     differencing,
@@ -37,8 +37,6 @@ from replay.inference.steps import (
 )
 from replay.sampling.sets import SampleSets
 
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
 MEANS = 30  # at most so many steps to an intrinsic mean
 
 
@@ -214,13 +212,13 @@ def _moved(motion: Motion) -> Function:
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
         return move(state, arguments[0], arguments[1], arguments[2])
 
     return without
 
 
-def _no_variances(state: Any, duration_s: float, parameters: Any) -> tuple[float, ...]:  # noqa: ARG001
+def _no_variances(state: Any, duration_s: float, parameters: Any) -> tuple[float, ...]:
     return ()
 
 
@@ -270,13 +268,13 @@ def _measured(sensor: Sensor) -> Function:
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
         return measure(state, arguments[0], arguments[1])
 
     return without
 
 
-def _no_sensor_variances(parameters: Any) -> tuple[float, ...]:  # noqa: ARG001
+def _no_sensor_variances(parameters: Any) -> tuple[float, ...]:
     return ()
 
 

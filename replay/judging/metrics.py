@@ -117,10 +117,10 @@ def innovation(innovations: Innovations) -> dict[str, float]:
     """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
     if len(innovations.squared) == 0:
         return {}
-    return {
-        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
-        "gated_share": float(1 - innovations.accepted.mean()),
-    }
+    gated = {"gated_share": float(1 - innovations.accepted.mean())}
+    if not innovations.degrees.any():  # all said nothing of their states
+        return gated
+    return {"nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()), **gated}
 
 
 def likelihood(innovations: Innovations) -> dict[str, float]:
