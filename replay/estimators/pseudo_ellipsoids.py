@@ -12,13 +12,12 @@ from typing import Literal, NamedTuple
 
 import contourpy
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Floats
 from replay.estimators.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
 
-Floats = NDArray[np.float64]
 Order = Literal[4, 8]
 Weighting = Literal["area", "batch", "determinant", "equal"]
 Size = Callable[[Floats], float]
