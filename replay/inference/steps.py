@@ -260,12 +260,13 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     elif motion.noise is not None:
         pieces.append(_additive_noise(motion.noise, model.tangent))
     if not pieces:
-        return _no_noise
+        return nothing
     return pieces[0] if len(pieces) == 1 else _both(*pieces)
 
 
-def _no_noise(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
-    pass
+def nothing(*_: Any) -> None:
+    """Do nothing, in place of what a model does not need."""
+    return
 
 
 def _both(first: Function, second: Function) -> Function:
