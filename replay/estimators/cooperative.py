@@ -247,10 +247,10 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
         """Use a sighting; False where a covariance is not positive definite."""
         own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
         first, both = 3 * robots, robots[1] >= 0
+        for row in range(2):
+            own[row, row] = variance[row]
         for side in range(1 + both):
-            own[side, side] = variance[side]
             traces[side] = see_through(covariance, first[side], side, work)
-        own[1, 1] = variance[1]
         for side in range(1 + (both and not joint)):
             weight, share = 1.0, 0.0
             if both and not joint:
@@ -292,8 +292,11 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
                 if seen >= 0:
                     place = (mean[3 * seen], mean[3 * seen + 1])
                 look(mean, robot, place, events.value[event], difference, work)
-                variance, gate = settings.variance[robot], settings.gate[2]
-                if not meet(mean, covariance, robots, difference, variance, gate, work):
+                measured, variance = 0, settings.variance[robot]
+                for k in range(2):
+                    measured += not np.isnan(difference[k])
+                gate = settings.gate[measured]
+                if measured > 0 and not meet(mean, covariance, robots, difference, variance, gate, work):
                     carried.failure[run] = NOT_POSITIVE_DEFINITE
                     continue
             else:

@@ -115,6 +115,15 @@ def test_an_impossible_sighting_changes_nothing(mode):
         np.testing.assert_allclose(covariance, COVARIANCES[side], atol=1e-7)
 
 
+@pytest.mark.parametrize("mode", ["ci", "naive", "joint"])
+def test_a_sighting_on_the_very_spot_changes_nothing(mode, monkeypatch):
+    """Where both robots are thought to be in one place it has no bearing, and no derivative."""
+    monkeypatch.setattr(f"{__name__}.POSES", np.array([POSES[0], POSES[0]]))
+    for side, (mean, covariance) in enumerate(estimates(two_robots(), mode)):
+        np.testing.assert_array_equal(mean, POSES[side])
+        np.testing.assert_array_equal(covariance, COVARIANCES[side])
+
+
 def test_an_anchor_that_is_not_there_is_refused():
     with pytest.raises(BadInput, match="anchor 3 is none of the robots 1, 2"):
         bind("cooperative:ci", [two_robots()], {})
