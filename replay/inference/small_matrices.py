@@ -126,7 +126,7 @@ def update(
         for j in range(i + 1):
             entry = noise[i, j]
             for k in range(len(mean)):
-                entry += rows[j, k] * innovation.cross_covariance[k, i]
+                entry += rows[i, k] * innovation.cross_covariance[k, j]
             innovation.covariance[i, j] = innovation.covariance[j, i] = entry
     size = keep_measured(innovation)
     squared = whiten(innovation, size)[0]
