@@ -530,8 +530,9 @@ def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixtu
 
 def settings_of(parameters: PhdParameters, scan: Topic) -> Settings:
     """What the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
-    numbers = (given_or_stated(parameters, [scan], name) for name in Settings._fields[:-1])
-    return Settings(*numbers, gate=float(chi2.ppf(parameters.gate_probability, 2)))
+    names = Settings._fields[:-1]
+    numbers = [given_or_stated(parameters, [scan], name) for name in names]
+    return Settings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> list[Bound]:

@@ -365,13 +365,13 @@ def forget(run: int, now_ns: int, tracks: Tracks, settings: Settings) -> None:
             continue
         last = tracks.used[run] - 1
         tracks.used[run] = last
-        for column in (tracks.number, tracks.time_ns):
-            column[run, place] = column[run, last]
-        for column in (tracks.interval_s, tracks.course_rad, tracks.speed_mps):
-            column[run, place] = column[run, last]
-        for column in (tracks.mean, tracks.spread, tracks.weight, tracks.held):
-            for entry in range(column.shape[2]):
-                column[run, place, entry] = column[run, last, entry]
+        for whole in (tracks.number, tracks.time_ns):
+            whole[run, place] = whole[run, last]
+        for real in (tracks.interval_s, tracks.course_rad, tracks.speed_mps):
+            real[run, place] = real[run, last]
+        for vector in (tracks.mean, tracks.spread, tracks.weight, tracks.held):
+            for entry in range(vector.shape[2]):
+                vector[run, place, entry] = vector[run, last, entry]
 
 
 def track(
