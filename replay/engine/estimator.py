@@ -7,7 +7,8 @@ the runs replayed one by one, bit for bit.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic
 
@@ -16,6 +17,7 @@ from recorders.log import Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import DoesNotCompile
 from replay.engine.components import Components
 from replay.engine.sources import Source
 
@@ -115,6 +117,16 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
 
 
+@contextmanager
+def code_of(name: str) -> Iterator[None]:
+    """Around calls of an estimator's code: what it raises, and what does not compile, names it."""
+    try:
+        with foreign_code(f"estimator {name}"):
+            yield
+    except DoesNotCompile as error:
+        raise BadInput(f"estimator {name}: {error}") from error
+
+
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
@@ -124,7 +136,7 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     estimator, parameters = configure(label, settings)
     first = sources[0]
     try:
-        with foreign_code(f"estimator {label}"):
+        with code_of(label):
             bound = estimator.bind(label, first.topics, parameters)
     except BadInput as error:
         raise BadInput(f"{first.name}: {error}") from error

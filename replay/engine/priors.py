@@ -36,20 +36,12 @@ class Priors(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def read_priors(prior: Ragged, components: Components) -> Priors:
+def priors_of(prior: Ragged, components: Components) -> Priors:
     """The priors of all runs; see `Priors`.
 
-    Raises BadInput where the channel does not state the components (see `match_components`), the
-    vectors have other widths than it states, or no run has a prior that can be used.
+    Raises BadInput where the channel does not state the components (see `match_components`), or the
+    vectors have other widths than it states.
     """
-    priors = _priors_of(prior, components)
-    if all(priors.reasons):
-        raise BadInput(f"{priors.reasons[0]}; the filter cannot start")
-    return priors
-
-
-def _priors_of(prior: Ragged, components: Components) -> Priors:
-    """As `read_priors`, where no run may have one that can be used."""
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
     columns = match_components(stream.metadata, components, where)
@@ -104,11 +96,11 @@ def start_of_runs(
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
     order, NaN where the run cannot start; and the reasons by run, which may be all of them.
-    Raises BadInput where a topic is no such prior, see `read_priors`.
+    Raises BadInput where a topic is no such prior, see `priors_of`.
     """
     found, failed = dict(whole), dict[int, str]()
     for topic, components in priors.items():
-        read = _priors_of(whole[topic], components)
+        read = priors_of(whole[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)

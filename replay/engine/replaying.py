@@ -10,9 +10,8 @@ from typing import Any
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream
-from recorders.registry import foreign_code
 from replay.engine.blocks import Block, Ragged, gather, join, merge_events
-from replay.engine.estimator import Batch, Bound, Recursive
+from replay.engine.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.priors import start_of_runs
 from replay.engine.sources import Source
 from replay.engine.supervision import Watch
@@ -115,7 +114,7 @@ def _start(
         try:
             given, unable = start_of_runs(whole, bound.priors)
             watch.exclude(unable)
-            with foreign_code(f"estimator {bound.name}"):
+            with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
             starts = len(unable) < watch.runs
             told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
@@ -132,7 +131,7 @@ def _start(
 def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
     if given is _REFUSED:
         return []
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return bound.solve(given | streams)
 
 
@@ -142,7 +141,7 @@ def _advance(
     if state is _REFUSED:
         return state, []
     events = merge_events(streams, order)
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return bound.run(state, Block(streams, events))
 
 
@@ -152,7 +151,7 @@ def _finish(
     state: Any,
     _: dict[str, Ragged],
 ) -> list[Ragged]:
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return finish(state)
 
 

@@ -53,6 +53,21 @@ def state_stream(
     return replace(blank, columns={**blank.columns, **columns})
 
 
+def states_in(
+    rows: Integers,
+    topic: str,
+    time_ns: Integers,
+    offsets: Integers,
+    components: Components,
+    truth: str | None,
+    mean: Floats,
+    covariance: Floats,
+) -> Ragged:
+    """The states in some rows, in order, of columns in which run r owns offsets[r]:offsets[r + 1]."""
+    stream = state_stream(topic, time_ns[rows], components, truth, mean[rows], covariance[rows])
+    return Ragged(stream, np.searchsorted(rows, offsets))
+
+
 def innovation_stream(
     topic: str,
     time_ns: Integers,
