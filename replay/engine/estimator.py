@@ -131,10 +131,13 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
+    read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
+    stated = [(topic, _stated(first.topics[topic])) for topic in read]
     for source in sources[1:]:
-        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
-            here, there = first.topics[topic], source.topics.get(topic)
-            if there is None or _stated(there) != _stated(here):
+        topics = source.topics
+        for topic, here in stated:
+            there = topics.get(topic)
+            if there is None or _stated(there) != here:
                 raise BadInput(
                     f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
                     "ensemble hold the same topics, replay this one on its own"

@@ -56,6 +56,7 @@ Integers = NDArray[np.int64]
 Function = Callable[..., Any]
 
 
+@lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
     """The parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
@@ -347,10 +348,8 @@ class Filter:
     def gates(self) -> Floats:
         """Bounds of the NIS (sensors, largest measurement + 1), by the number of components."""
         largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
-        gates = np.full((max(len(self.stage.sensors), 1), largest + 1), np.inf)
-        probability = self.parameters.gate_probability
-        gates[:, 1:] = chi2.ppf(probability, np.arange(1, largest + 1))
-        return gates
+        bounds = _nis_bounds(self.parameters.gate_probability, largest)
+        return np.tile(bounds, (max(len(self.stage.sensors), 1), 1))
 
     def outputs(
         self,
@@ -391,6 +390,12 @@ class Filter:
             log_likelihood=numbers[:, 1],
         )
         return [*made, Ragged(innovation, offsets)]
+
+
+@lru_cache(maxsize=64)
+def _nis_bounds(probability: float, components: int) -> Floats:
+    """The quantiles (components + 1,) of the NIS of so many components; nothing is always let in."""
+    return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))
 
 
 def _room(
