@@ -1,7 +1,6 @@
 """The prior rule: components by name, and a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from math import isqrt
 from typing import NamedTuple
 
@@ -59,7 +58,7 @@ def _priors_of(prior: Ragged, components: Components) -> Priors:
     present = np.flatnonzero(np.diff(prior.offsets))
     first = prior.offsets[present]
     time_ns, mean, covariance, _ = no_priors(runs, components, MISSING)
-    reasons = np.full(runs, MISSING, object)
+    reasons = [""] * runs
     if len(present):
         widths = stream["mean"].shape[1], stream["covariance"].shape[1]
         if widths != (len(stated), size**2):
@@ -71,15 +70,15 @@ def _priors_of(prior: Ragged, components: Components) -> Priors:
         mean[present] = stream["mean"][first][:, columns]
         whole = stream["covariance"][first].reshape(-1, size, size)
         covariance[present] = whole[:, rows][:, :, rows]
-        finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
-        definite = is_positive_definite(covariance)
-        reasons[present] = np.where(definite, "", NOT_POSITIVE_DEFINITE)[present]
-        reasons[present[~finite[present]]] = NOT_FINITE
-    unusable = reasons != ""
-    mean[unusable], covariance[unusable] = np.nan, np.nan
-    wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
-    told = tuple(f"{wanted}: {reason}" if reason else "" for reason in reasons.tolist())
-    return Priors(time_ns, mean, covariance, told)
+    finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
+    usable = finite & is_positive_definite(covariance)
+    if not usable.all():
+        mean[~usable], covariance[~usable] = np.nan, np.nan
+        wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
+        for run in np.flatnonzero(~usable).tolist():
+            reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
+            reasons[run] = f"{wanted}: {reason if run in present else MISSING}"
+    return Priors(time_ns, mean, covariance, tuple(reasons))
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
@@ -130,13 +129,12 @@ def gaussians(
 
 def _one_each(topic: str, priors: Priors) -> Ragged:
     runs = len(priors.mean)
-    blank = make_stream(
+    stream = make_stream(
         topic,
         schemas.GAUSSIAN_ESTIMATE,
         priors.time_ns,
-        mean=np.zeros_like(priors.mean),
-        covariance=np.zeros((runs, priors.covariance.shape[1] ** 2)),
+        allow_nan=True,
+        mean=priors.mean,
+        covariance=priors.covariance.reshape(runs, priors.covariance.shape[1] ** 2),
     )
-    covariance = priors.covariance.reshape(blank["covariance"].shape)
-    columns = {**blank.columns, "mean": priors.mean, "covariance": covariance}
-    return Ragged(replace(blank, columns=columns), np.arange(runs + 1))
+    return Ragged(stream, np.arange(runs + 1))
