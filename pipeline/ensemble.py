@@ -28,7 +28,7 @@ from replay.engine.blocks import Ragged
 from replay.engine.estimator import bind
 from replay.engine.failures import sentences_of
 from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
-from replay.engine.sources import MemorySource, Source, memory_source
+from replay.engine.sources import Ensemble, MemorySource, Source, memory_source
 from replay.judging.evaluation import (
     Errors,
     Innovations,
@@ -134,7 +134,7 @@ def record_ensemble(
     runs: int,
     progress: Progress = no_progress,
     executor: Executor | None = None,
-) -> list[MemorySource]:
+) -> Ensemble[MemorySource]:
     """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`.
 
     Raises BadInput where the first run shows that memory cannot hold them all.
@@ -146,7 +146,7 @@ def record_ensemble(
     # replay lays the runs end to end, which holds every column twice; estimates come on top
     require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
     others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
-    return list(progress(chain([first], others), f"recording {scenario}", runs))
+    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:

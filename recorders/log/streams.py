@@ -65,19 +65,32 @@ def make_stream(
     log_time_ns: ArrayLike | None = None,
     sensor_time_ns: ArrayLike | None = None,
     metadata: Mapping[str, str] | None = None,
-    allow_nan: bool = False,
     **columns: ArrayLike,
 ) -> Stream:
     """Build a stream; clocks that are not given equal `publish_time_ns`.
 
     Raises BadInput where a column is missing or unknown, has another length, has the wrong number of
-    axes, holds NaN that neither its field nor `allow_nan` allows or a number that its type cannot keep
-    (a fraction of a nanosecond, say), or a time is negative.
+    axes, holds NaN that its field does not allow or a number that its type cannot keep (a fraction of a
+    nanosecond, say), or a time is negative.
     """
+    clock = publish_time_ns if sensor_time_ns is None else sensor_time_ns
+    given = {"sensor_time_ns": clock, **columns}
+    return stream_of(topic, schema, publish_time_ns, given, log_time_ns=log_time_ns, metadata=metadata)
+
+
+def stream_of(
+    topic: str,
+    schema: Schema,
+    publish_time_ns: ArrayLike,
+    given: Mapping[str, ArrayLike],
+    *,
+    log_time_ns: ArrayLike | None = None,
+    metadata: Mapping[str, str] | None = None,
+    allow_nan: bool = False,
+) -> Stream:
+    """As `make_stream`, of all columns by name; with `allow_nan`, NaN may stand in any of them."""
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
-    clock = published if sensor_time_ns is None else sensor_time_ns
-    given: dict[str, ArrayLike] = {"sensor_time_ns": clock, **columns}
     names = [entry.name for entry in schema]
     if given.keys() != set(names):
         raise BadInput(

@@ -17,7 +17,7 @@ from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
 from replay.engine.components import Components
-from replay.engine.sources import Source
+from replay.engine.sources import Source, ensemble_of
 
 
 @dataclass(frozen=True)
@@ -132,19 +132,5 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
     read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
-    stated = [(topic, _stated(first.topics[topic])) for topic in read]
-    for source in sources[1:]:
-        topics = source.topics
-        for topic, here in stated:
-            there = topics.get(topic)
-            if there is None or _stated(there) != here:
-                raise BadInput(
-                    f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
-                    "ensemble hold the same topics, replay this one on its own"
-                )
+    ensemble_of(sources).require_alike(read)
     return bound
-
-
-def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
-    """What an estimator is told of a topic when it is bound."""
-    return topic.schema_name, topic.metadata

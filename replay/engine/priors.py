@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import is_positive_definite
+from replay.engine.results import gaussian_stream
 from replay.engine.tangent import tangent_components
 
 MISSING = "there is no prior message"
@@ -74,10 +74,10 @@ def _priors_of(prior: Ragged, components: Components) -> Priors:
     usable = finite & is_positive_definite(covariance)
     if not usable.all():
         mean[~usable], covariance[~usable] = np.nan, np.nan
-        wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
+        wanted = f"no prior of {len(components)} components ({', '.join(components)}) can be used"
         for run in np.flatnonzero(~usable).tolist():
             reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
-            reasons[run] = f"{wanted}: {reason if run in present else MISSING}"
+            reasons[run] = f"{where}: {wanted}: {reason if run in present else MISSING}"
     return Priors(time_ns, mean, covariance, tuple(reasons))
 
 
@@ -111,7 +111,8 @@ def start_of_runs(
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)
-        found[topic] = _one_each(topic, read)
+        stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
+        found[topic] = Ragged(stream, np.arange(len(read.reasons) + 1))
     return found, failed
 
 
@@ -125,16 +126,3 @@ def gaussians(
     size = isqrt(prior["covariance"].shape[1])
     covariance = prior["covariance"].reshape(-1, size, size)
     return prior.stream.publish_time_ns.copy(), prior["mean"].copy(), covariance.copy()
-
-
-def _one_each(topic: str, priors: Priors) -> Ragged:
-    runs = len(priors.mean)
-    stream = make_stream(
-        topic,
-        schemas.GAUSSIAN_ESTIMATE,
-        priors.time_ns,
-        allow_nan=True,
-        mean=priors.mean,
-        covariance=priors.covariance.reshape(runs, priors.covariance.shape[1] ** 2),
-    )
-    return Ragged(stream, np.arange(runs + 1))

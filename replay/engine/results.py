@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, make_stream, schemas
+from recorders.log.streams import stream_of
 from recorders.models.planar import wrap_angle
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components
@@ -40,15 +41,17 @@ def state_stream(
         mean = mean.copy()
         angles = mean[:, angular]  # those in range stay as they are, to the last bit
         mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
-    return make_stream(
-        topic,
-        schemas.GAUSSIAN_ESTIMATE,
-        time_ns,
-        metadata=named(components) if truth is None else {**named(components), "truth": truth},
-        allow_nan=True,  # is for the replay to find: it ends its run alone
-        mean=mean,
-        covariance=_flat(covariance),
-    )
+    metadata = named(components) if truth is None else {**named(components), "truth": truth}
+    return gaussian_stream(topic, time_ns, mean, covariance, metadata)
+
+
+def gaussian_stream(
+    topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
+) -> Stream:
+    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `supervision`."""
+    columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
+    schema = schemas.GAUSSIAN_ESTIMATE
+    return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
 
 
 def innovation_stream(
