@@ -69,6 +69,13 @@ class Block(NamedTuple):
         return np.concatenate(parts)[self.events.source]
 
 
+def copied(carried: CarriedType) -> CarriedType:
+    """A NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
+    columns: Any = carried
+    made: Any = type(carried)
+    return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
+
+
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
     """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
 
@@ -83,6 +90,8 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
     """The offsets that the chosen rows of ragged columns have, laid end to end."""
+    if chosen.all():
+        return offsets
     return np.concatenate([[0], np.cumsum(chosen)])[offsets]
 
 

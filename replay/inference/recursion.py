@@ -6,11 +6,12 @@ belief is no Gaussian any more.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.engine.blocks import filled_rows
 from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
 from replay.inference.steps import (
@@ -71,7 +72,7 @@ class Estimates(NamedTuple):
     """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
-    event: Integers
+    time_ns: Integers
     mean: Floats
     covariance: Floats
 
@@ -80,10 +81,43 @@ class Innovations(NamedTuple):
     """The innovations as the recursion fills them in, see `Estimates` and `steps.Note`."""
 
     end: Integers
-    event: Integers
+    time_ns: Integers
+    target_id: NDArray[np.uint32]
     difference: Floats
     covariance: Floats
     numbers: Floats
+
+
+ResultsType = TypeVar("ResultsType", Estimates, Innovations)
+
+
+def no_estimates(offsets: Integers, size: int, tangent: int) -> Estimates:
+    """Estimates to be filled in: those of run r from row offsets[r] on, before offsets[r + 1]."""
+    rows = int(offsets[-1])
+    mean, covariance = np.empty((rows, size)), np.empty((rows, tangent, tangent))
+    return Estimates(offsets[:-1].copy(), np.empty(rows, np.int64), mean, covariance)
+
+
+def no_innovations(offsets: Integers, slots: int) -> Innovations:
+    """Innovations to be filled in, see `no_estimates`."""
+    rows = int(offsets[-1])
+    return Innovations(
+        offsets[:-1].copy(),
+        np.empty(rows, np.int64),
+        np.empty(rows, np.uint32),
+        np.empty((rows, slots)),
+        np.empty((rows, slots, slots)),
+        np.empty((rows, 3)),
+    )
+
+
+def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
+    """What was filled in of results that began at these offsets, laid end to end, and its offsets."""
+    rows, kept = filled_rows(offsets, results.end)
+    if isinstance(rows, slice):
+        return results, kept
+    columns: Any = (column[rows] for column in results[1:])
+    return type(results)(kept[1:], *columns), kept
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
@@ -151,7 +185,8 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             if told >= 0:
                 return told
             if told == ALL_WELL:
-                innovations.event[row] = event
+                innovations.time_ns[row] = happenings.time_ns[event]
+                innovations.target_id[row] = happenings.target_id[event]
                 innovations.end[run] = row + 1
         return ALL_WELL
 
@@ -181,7 +216,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 estimate(run, carried.belief, mean, covariance)
                 failure = fault_of(mean, covariance)
                 if failure == ALL_WELL:
-                    estimates.event[row] = event
+                    estimates.time_ns[row] = happenings.time_ns[event]
                     estimates.end[run] = row + 1
             carried.failure[run] = failure
 
