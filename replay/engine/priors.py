@@ -1,6 +1,7 @@
 """The prior rule: components by name, and a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 from math import isqrt
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import is_positive_definite
 from replay.engine.results import gaussian_stream
-from replay.engine.tangent import tangent_components
+from replay.engine.tangent import Kind, tangent_components
 
 MISSING = "there is no prior message"
 NOT_FINITE = "the prior is not finite"
@@ -51,25 +52,24 @@ def _priors_of(prior: Ragged, components: Components) -> Priors:
     """As `read_priors`, where no run may have one that can be used."""
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
-    columns = match_components(stream.metadata, components, where)
-    rows = match_tangent(stream.metadata, components, where)
-    stated = stated_components(stream.metadata, components, where)
-    size = len(match_tangent(stream.metadata, stated, where))
+    names, kinds = (stream.metadata.get(name, "") for name in ("components", "kinds"))
+    layout = _layout(names, kinds, tuple(components.items()), where)
+    size = layout.tangent
     present = np.flatnonzero(np.diff(prior.offsets))
     first = prior.offsets[present]
     time_ns, mean, covariance, _ = no_priors(runs, components, MISSING)
     reasons = [""] * runs
     if len(present):
         widths = stream["mean"].shape[1], stream["covariance"].shape[1]
-        if widths != (len(stated), size**2):
+        if widths != (layout.stated, size**2):
             raise BadInput(
-                f"{where}: {len(stated)} components are stated, mean and covariance have {widths[0]} "
-                f"and {widths[1]} numbers; {len(stated)} and {size**2} are needed"
+                f"{where}: {layout.stated} components are stated, mean and covariance have {widths[0]} "
+                f"and {widths[1]} numbers; {layout.stated} and {size**2} are needed"
             )
         time_ns[present] = stream.publish_time_ns[first]
-        mean[present] = stream["mean"][first][:, columns]
+        mean[present] = stream["mean"][first][:, layout.columns]
         whole = stream["covariance"][first].reshape(-1, size, size)
-        covariance[present] = whole[:, rows][:, :, rows]
+        covariance[present] = whole[:, layout.rows][:, :, layout.rows]
     finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
     usable = finite & is_positive_definite(covariance)
     if not usable.all():
@@ -79,6 +79,28 @@ def _priors_of(prior: Ragged, components: Components) -> Priors:
             reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
             reasons[run] = f"{where}: {wanted}: {reason if run in present else MISSING}"
     return Priors(time_ns, mean, covariance, tuple(reasons))
+
+
+class _Layout(NamedTuple):
+    """How many components a channel states, of the tangent space too, and where the wanted stand."""
+
+    stated: int
+    tangent: int
+    columns: list[int]
+    rows: list[int]
+
+
+@lru_cache(maxsize=256)
+def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
+    """The layout of a channel that states these names and kinds; raises BadInput as `read_priors`."""
+    metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
+    stated = stated_components(metadata, components, where)
+    return _Layout(
+        len(stated),
+        len(match_tangent(metadata, stated, where)),
+        match_components(metadata, components, where),
+        match_tangent(metadata, components, where),
+    )
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:

@@ -9,7 +9,7 @@ time that the estimator took.
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import cache, partial, reduce
 from math import isqrt
 from typing import TypeVar
 
@@ -276,10 +276,15 @@ class Watch:
         rhythms = [self._rhythms[case] for case in self._states]
         if not rhythms:
             return
-        mute = ~np.any([rhythm.said for rhythm in rhythms], axis=0)
-        silent = np.all([rhythm.misses(self._last_ns) for rhythm in rhythms], axis=0)
-        last_ns = np.max([rhythm.last_ns for rhythm in rhythms], axis=0)
-        found = (self._last_ns >= 0) & (mute | (silent & (not self._is_batch)))
+        mute = ~reduce(np.logical_or, (rhythm.said for rhythm in rhythms))
+        found = mute
+        if not self._is_batch:
+            silent = (rhythm.misses(self._last_ns) for rhythm in rhythms)
+            found = mute | reduce(np.logical_and, silent)
+        found = found & (self._last_ns >= 0)
+        if not found.any():
+            return
+        last_ns = reduce(np.maximum, (rhythm.last_ns for rhythm in rhythms))
         for run in set(np.flatnonzero(found).tolist()) - failed:
             if mute[run]:
                 self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")

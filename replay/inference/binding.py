@@ -216,6 +216,17 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     return f"topic {topic}: {sensor.covariance} is missing{mend}"
 
 
+@lru_cache(maxsize=256)
+def _number(parameters: type[ParametersType], topic: str, name: str, text: str) -> float:
+    """A parameter's number that a channel states; BadInput where it is none, or not taken."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise BadInput(f"topic {topic} states {name} = {text}, which is no number") from None
+    build(parameters, {name: value}, f"topic {topic}")
+    return value
+
+
 def stated(
     parameters: type[ParametersType], topics: Sequence[Topic], name: str, *, needed: bool = True
 ) -> float:
@@ -225,15 +236,7 @@ def stated(
     """
     for topic in topics:
         if name in topic.metadata:
-            text = topic.metadata[name]
-            try:
-                value = float(text)
-            except ValueError:
-                raise BadInput(
-                    f"topic {topic.name} states {name} = {text}, which is no number"
-                ) from None
-            build(parameters, {name: value}, f"topic {topic.name}")
-            return value
+            return _number(parameters, topic.name, name, topic.metadata[name])
     if needed:
         raise BadInput(f"topic {topics[0].name} does not state {name}; give it with --set {name}=...")
     return np.nan
