@@ -129,7 +129,7 @@ class Watch:
         )
         self._find_silence(failed)
         own_topic = f"/estimates/{self.name}/failure"
-        topic = next((topic for topic in told if topic == own_topic), next(iter(told), own_topic))
+        topic = own_topic if own_topic in told else next(iter(told), own_topic)
         if self._failed or not told:
             runs = sorted(self._failed)
             own = failure_stream(topic, [self._failed[run] for run in runs])

@@ -348,8 +348,9 @@ class Filter:
                 scratch=partial(steps.memory, sets),
             )
         made = self.outputs(filled(estimates, due), filled(innovations, noted))
-        topic = f"/estimates/{self.name}"
-        made.append(failures_of(topic, before.failure, carried.failure, carried.time_ns, FAILURES))
+        if (carried.failure != before.failure).any():
+            failures = before.failure, carried.failure, carried.time_ns, FAILURES
+            made.append(failures_of(f"/estimates/{self.name}", *failures))
         return state._replace(carried=carried, generators=generators), made
 
     @cached_property
