@@ -51,8 +51,7 @@ from replay.inference.recursion import (
     Happenings,
     Innovations,
     filled,
-    no_estimates,
-    no_innovations,
+    no_results,
     recursion,
 )
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
@@ -328,8 +327,7 @@ class Filter:
         due = ragged_rows(happenings.is_due, happenings.offsets)
         noted = ragged_rows(happenings.source >= 0, happenings.offsets)
         slots = len(slots_of(sensors))
-        estimates = no_estimates(due, model.size, model.tangent)
-        innovations = no_innovations(noted, slots)
+        estimates, innovations = no_results(due, noted, model, slots)
         if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
         settings = np.repeat(self.settings[None], runs, axis=0)

@@ -5,6 +5,7 @@ what drives the next prediction. Messages before the state's own time say nothin
 belief is no Gaussian any more.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from replay.engine.blocks import filled_rows
 from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
+from replay.inference.model import Model
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
@@ -91,24 +93,28 @@ class Innovations(NamedTuple):
 ResultsType = TypeVar("ResultsType", Estimates, Innovations)
 
 
-def no_estimates(offsets: Integers, size: int, tangent: int) -> Estimates:
-    """Estimates to be filled in: those of run r from row offsets[r] on, before offsets[r + 1]."""
-    rows = int(offsets[-1])
-    mean, covariance = np.empty((rows, size)), np.empty((rows, tangent, tangent))
-    return Estimates(offsets[:-1].copy(), np.empty(rows, np.int64), mean, covariance)
+def no_results(
+    due: Integers, noted: Integers, model: Model, slots: int
+) -> tuple[Estimates, Innovations]:
+    """Results to be filled in: run r has the rows due[r]:due[r + 1] and noted[r]:noted[r + 1].
 
-
-def no_innovations(offsets: Integers, slots: int) -> Innovations:
-    """Innovations to be filled in, see `no_estimates`."""
-    rows = int(offsets[-1])
-    return Innovations(
-        offsets[:-1].copy(),
-        np.empty(rows, np.int64),
-        np.empty(rows, np.uint32),
-        np.empty((rows, slots)),
-        np.empty((rows, slots, slots)),
-        np.empty((rows, 3)),
+    All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
+    every page by itself, and that takes as long as half of a small filter.
+    """
+    n, t = model.size, model.tangent
+    shapes = [
+        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
+        *((int(noted[-1]), *shape) for shape in ((), (), (slots,), (slots, slots), (3,))),
+    ]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
+        part.reshape(shape)
+        for part, shape in zip(np.split(np.empty(ends[-1]), ends[:-1]), shapes, strict=True)
     )
+    estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
+    about = target_id.view(np.uint32)[: len(target_id)]
+    told = Innovations(noted[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers)
+    return estimates, told
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
