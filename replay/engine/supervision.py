@@ -78,7 +78,8 @@ class Watch:
     def exclude(self, reasons: Mapping[int, str]) -> None:
         """These runs cannot start, for a reason each."""
         self._unable |= reasons
-        self._end_ns[list(reasons)] = 0
+        for run in reasons:
+            self._end_ns[run] = 0
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
         """What `work` makes of the next streams of the runs that have not failed.
@@ -175,7 +176,7 @@ class Watch:
 
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
         """The messages of every run before its end (runs,)."""
-        if np.all(end_ns == FOREVER):
+        if (end_ns == FOREVER).all():
             return dict(streams)
         return {
             topic: _kept(ragged, ragged.stream.times(self._order) < end_ns[_run_of(ragged)])

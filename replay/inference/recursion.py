@@ -7,6 +7,7 @@ belief is no Gaussian any more.
 
 import math
 from collections.abc import Callable
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -106,10 +107,11 @@ def no_results(
         *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
         *((int(noted[-1]), *shape) for shape in ((), (), (slots,), (slots, slots), (3,))),
     ]
-    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    ends = list(accumulate(map(math.prod, shapes), initial=0))
+    memory = np.empty(ends[-1])
     time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
-        part.reshape(shape)
-        for part, shape in zip(np.split(np.empty(ends[-1]), ends[:-1]), shapes, strict=True)
+        memory[begin:end].reshape(shape)
+        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
     about = target_id.view(np.uint32)[: len(target_id)]
