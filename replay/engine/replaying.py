@@ -13,7 +13,7 @@ from recorders.registry import foreign_code
 from replay.engine.blocks import Block, Ragged, join, merge_events
 from replay.engine.estimator import Batch, Bound, Recursive
 from replay.engine.priors import start_of_runs
-from replay.engine.sources import Source, ensemble_of
+from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
@@ -65,7 +65,7 @@ def replay(
     read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
     wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
     for bound, whole in zip(estimators, wholes, strict=True):
-        _refuse_old_priors(bound, sources, whole, order)
+        _refuse_old_priors(bound, ensemble, whole, order)
     watches = [
         Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
@@ -157,16 +157,15 @@ def _finish(
 
 
 def _refuse_old_priors(
-    bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
+    bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
-    starts_ns = {run: each.start_ns for run, each in enumerate(sources) if each.start_ns is not None}
     for topic in bound.priors.keys() - bound.given.keys():
-        for run, start_ns in starts_ns.items():
+        for run, start_ns in ensemble.starts_ns.items():
             times_ns = whole[topic].of_run(run).times(order)[:1]
             if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(
-                    f"{sources[run].name}: the replay would start {bound.name} from {topic}, which is "
+                    f"{ensemble[run].name}: the replay would start {bound.name} from {topic}, which is "
                     f"{(start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
                     "to start from with --start-from truth or --start-from ESTIMATES"
                 )

@@ -203,6 +203,12 @@ class Ensemble(list[SourceType]):
         self._kept: dict[tuple[str, Clock], Ragged] = {}
         self._alike: set[str] = set()
 
+    @cached_property
+    def starts_ns(self) -> dict[int, int]:
+        """Where the replayed spans begin, by run; of those that do not begin with their run."""
+        starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
+        return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
+
     def require_alike(self, topics: Iterable[str]) -> None:
         """Raise BadInput where a run does not hold these topics as the first one does."""
         first = self[0]
