@@ -16,7 +16,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, lru_cache, partial, wraps
 from hashlib import sha256
 from importlib.metadata import version
@@ -193,10 +193,13 @@ def _over_runs(
             if own is None or last:
                 loop(0, 0, *arguments, *last)
         helpers = [_helpers(os.getpid()).submit(work, waiting) for _ in range(cores - 1)]
-        work(waiting)
-        for helper in helpers:
-            if not helper.cancel():
-                helper.result()
+        try:
+            work(waiting)
+        finally:  # none works on when this returns
+            begun = [helper for helper in helpers if not helper.cancel()]
+            wait(begun)
+        for helper in begun:
+            helper.result()
     except NumbaError as error:
         loop._cache.ended()  # type: ignore[attr-defined]
         said = str(error)
