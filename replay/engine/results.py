@@ -68,7 +68,8 @@ def innovation_stream(
     log_likelihood: Floats | None = None,
 ) -> Stream:
     """Innovations (n, m) with their covariances (n, m, m), NIS (n,) and, where known, log-likelihood."""
-    unknown = np.full(len(time_ns), np.nan)
+    if log_likelihood is None:
+        log_likelihood = np.full(len(time_ns), np.nan)
     return make_stream(
         topic,
         schemas.INNOVATION,
@@ -79,7 +80,7 @@ def innovation_stream(
         innovation=innovation,
         covariance=_flat(covariance),
         normalised_innovation_squared=squared,
-        log_likelihood=unknown if log_likelihood is None else log_likelihood,
+        log_likelihood=log_likelihood,
     )
 
 

@@ -309,8 +309,9 @@ class _Rhythm:
         self.topic = topic
         self.last_ns = starts_ns.copy()
         self.said = np.zeros(len(starts_ns), bool)
-        self._counts = np.zeros((len(starts_ns), self.BINS), np.int64)
-        self._sums_ns = np.zeros((len(starts_ns), self.BINS))
+        # a bin's runs side by side: most runs use one or two bins, and the rest is never touched
+        self._counts = np.zeros((self.BINS, len(starts_ns)), np.int64)
+        self._sums_ns = np.zeros((self.BINS, len(starts_ns)))
 
     def note(self, estimates: Ragged) -> None:
         """Take in the stamps of a block."""
@@ -320,8 +321,8 @@ class _Rhythm:
 
     def estimated_s(self) -> Floats:
         """For how long (runs,) there were estimates, gaps left out."""
-        is_gap = np.arange(self.BINS) > self._longest()[:, None]
-        return np.where(is_gap, 0, self._sums_ns).sum(axis=1) * 1e-9
+        is_gap = np.arange(self.BINS)[:, None] > self._longest()
+        return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
 
     def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
         """Whether the time (runs,) since each run's last estimate is a gap."""
@@ -331,8 +332,8 @@ class _Rhythm:
 
     def _longest(self) -> Integers:
         """The bin (runs,) of the longest intervals that are no gaps."""
-        reached = np.cumsum(self._counts, axis=1)
-        median = np.argmax(2 * reached >= reached[:, -1:], axis=1)
+        reached = np.cumsum(self._counts, axis=0)
+        median = np.argmax(2 * reached >= reached[-1], axis=0)
         return np.maximum(median + self.GAP, self.SECOND)
 
 
@@ -370,15 +371,15 @@ def note_intervals(
         time_ns: (n,) the stamps.
         said: (runs,) whether there were any.
         last_ns: (runs,) the last one; negative where there is none.
-        counts: (runs, BINS) of the intervals of every bin, how many there are.
-        sums_ns: (runs, BINS) and their sum, exact up to 2^53 ns, a hundred days.
+        counts: (BINS, runs) of the intervals of every bin, how many there are.
+        sums_ns: (BINS, runs) and their sum, exact up to 2^53 ns, a hundred days.
     """
     for row in range(offsets[run], offsets[run + 1]):
         interval = time_ns[row] - last_ns[run]
         if last_ns[run] >= 0 and interval > 0:
             _, exponent = math.frexp(float(interval))
-            counts[run, exponent - 1] += 1
-            sums_ns[run, exponent - 1] += interval
+            counts[exponent - 1, run] += 1
+            sums_ns[exponent - 1, run] += interval
         said[run], last_ns[run] = True, time_ns[row]
 
 

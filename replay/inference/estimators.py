@@ -356,7 +356,7 @@ class Filter:
         """Bounds of the NIS (sensors, largest measurement + 1), by the number of components."""
         largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
         bounds = _nis_bounds(self.parameters.gate_probability, largest)
-        return np.tile(bounds, (max(len(self.stage.sensors), 1), 1))
+        return np.repeat(bounds[None], max(len(self.stage.sensors), 1), axis=0)
 
     def outputs(
         self, estimated: tuple[Estimates, Integers], noted: tuple[Innovations, Integers]
