@@ -1,9 +1,11 @@
 # make demo, make test: each does all of its own set-up in .venv; only Python 3.11 or newer is needed.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
-BIN := .venv/bin
+# make docs makes the pages' tables from the stored results; make docs-claims FUSELOG_DATA=FOLDER runs the
+# experiments first, all or those that NAMES="..." lists.
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
+BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test mutants bench faults format clean
+.PHONY: demo test test-fast test-paper lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -15,12 +17,24 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-test: .venv/with-test
+# the fast tests and the long reproductions of papers, side by side
+test: lint
+	$(MAKE) -j2 test-fast test-paper
+
+test-fast: .venv/with-test
+	$(BIN)/pytest -m "not paper"
+
+test-paper: .venv/with-test
+	$(BIN)/pytest -m paper
+
+lint: .venv/with-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest
+
+wheel: .venv/with-test
+	$(BIN)/python -m build --outdir dist
 
 mutants: .venv/with-test
 	$(BIN)/python -m tests.mutants
@@ -31,12 +45,19 @@ bench: .venv/with-bench
 faults: .venv/with-test
 	$(BIN)/python -m tests.faults
 
+docs: .venv/with-test
+	$(BIN)/python -m tests.claims render
+
+docs-claims: .venv/with-test
+	$(BIN)/python -m tests.claims run $(NAMES)
+	$(BIN)/python -m tests.claims render
+
 format: .venv/with-test
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf .venv demo out build *.egg-info
+	rm -rf .venv demo out build dist *.egg-info
 
 .venv/with-fuselog: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -149,7 +149,7 @@ def _listed(components: Mapping[str, str]) -> str:
     )
 
 
-def _metric(name: str, metric: Metric[Any]) -> Entry:
+def _metric(name: str, metric: Metric[Any, Any]) -> Entry:
     return Entry(name, metric.summary, {"judges": metric.judges.__name__})
 
 

@@ -58,6 +58,9 @@ COUNT = click.IntRange(min=0)
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
 )
+errors_option = click.option(
+    "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 recover_option = click.option(
     "--recover", is_flag=True, help="Read what is whole of a log that was cut off or damaged."
@@ -210,6 +213,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
 @click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
 @click.option("--out", type=FOLDER, help="Write a result folder, as fuselog run does.")
+@errors_option
 @recover_option
 @gap_option
 @json_option
@@ -243,6 +247,7 @@ def view(path: Path, **options: Any) -> None:
 @click.option(
     "--logs", type=COUNT, default=20, show_default=True, help="Write the logs of the first K runs."
 )
+@errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
 @json_option
@@ -307,6 +312,16 @@ def models(name: str | None, as_json: bool) -> None:
     from pipeline.catalog import show_models
 
     show_models(name, as_json=as_json)
+
+
+@fuselog.command(short_help="Say what the cache of kernels and samples holds, or clear it.")
+@click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
+@json_option
+def cache(clear: bool, as_json: bool) -> None:
+    """Say how large the cache is: compiled kernels and samples, which fuselog can make again."""
+    from pipeline.information import show_cache
+
+    show_cache(clear=clear, as_json=as_json)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

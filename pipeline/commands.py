@@ -6,14 +6,15 @@ Rerun and matplotlib take long to import: only what draws imports them.
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.ensemble import Replayed, judge, replay_to_logs
+from pipeline.ensemble import Part, judge_logs, parts_of, replay_parts
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import plain, result_folder, write_outcome
+from pipeline.results import ErrorTables, plain, result_folder, write_outcome
 from pipeline.starting import Origin, from_estimates, from_truth
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
@@ -21,13 +22,11 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
-from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import configure, find_estimator
 from replay.engine.sources import LogSource
-from replay.judging.metrics import Output, find_metrics, measure
+from replay.judging.judge import Judge
+from replay.judging.metrics import find_metrics
 
-# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
-TOLD = ("failure", "skipped", "coverage")
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
 
@@ -62,19 +61,23 @@ def replay_logs(
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [_span(source, start_s, end_s, order) for source in opened]
-    seconds = replay_to_logs(
-        sources,
+    starts = _origins(sources, origins, sigmas, order, gap_limit_s)
+    estimates = list(zip(paths, logs, strict=True))
+    parts = [
+        Part(sources[now], now.start, len(sources[now]) == len(sources), estimates[now], starts[now])
+        for now in parts_of(len(sources))
+    ]
+    done = replay_parts(
+        parts,
         estimators,
-        paths,
+        gap_limit_s=gap_limit_s,
         order=order,
-        origins=_origins(sources, origins, sigmas, order, gap_limit_s),
+        save=save,
+        connect=connect,
         progress=progress,
     )
     _state_losses(source.log for source in sources)
-    replayed = judge(sources, _read_outputs([open_log(path) for path in paths]), gap_limit_s)
-    _print_outcome(replayed, (), as_json=as_json, written=paths, seconds=seconds)
-    if save is not None or connect is not None:
-        _show(replayed, save, connect)
+    _print_outcome(done.judge, as_json=as_json, written=paths, seconds=done.seconds)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -199,11 +202,14 @@ def evaluate_logs(
     *,
     out: Path | None,
     metrics: Sequence[str],
+    errors: bool,
     recover: bool,
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
     """Judge estimates logs; the truth is in the logs given, else in those they were replayed from."""
+    if errors and out is None:
+        raise BadInput("--errors: goes into a result folder; give it with --out")
     if logs and len(logs) != len(estimates):
         raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
     opened = [open_log(path, recover=recover) for path in estimates]
@@ -216,24 +222,31 @@ def evaluate_logs(
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
-    replayed = judge(sources, _read_outputs(opened), gap_limit_s)
-    telling = [each for each in replayed.judged if not isinstance(each, Output) or each.leaf not in TOLD]
-    if not measure(telling, find_metrics(metrics)):
-        raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
-    _state_losses([*opened, *(source.log for source in sources)])
-    if out is not None:
-        settings = {
-            "title": f"estimates of {sources[0].name}",
-            "estimates": [str(path) for path in estimates],
-            "logs": [source.name for source in sources],
-            "gap_limit_s": gap_limit_s,
-            "metrics": list(metrics),
-        }
-        outcome = summarise(replayed, metrics)
-        outcome.input_sha256 = _hash_files([*estimates, *places])
-        with result_folder(out) as folder:
+    wanted = find_metrics(metrics)
+    with result_folder(out) if out is not None else nullcontext() as folder:
+        with ErrorTables(folder) if folder and errors else nullcontext() as kept:
+            judge = judge_logs(
+                [LogSource(each) for each in opened],
+                sources,
+                wanted,
+                gap_limit_s=gap_limit_s,
+                on_errors=kept.add if kept else None,
+            )
+        if not judge.tells:
+            raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
+        if folder is not None:
+            settings = {
+                "title": f"estimates of {sources[0].name}",
+                "estimates": [str(path) for path in estimates],
+                "logs": [source.name for source in sources],
+                "gap_limit_s": gap_limit_s,
+                "metrics": list(metrics),
+            }
+            outcome = summarise(judge)
+            outcome.input_sha256 = _hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
-    _print_outcome(replayed, metrics, as_json=as_json, written=[out] if out else [])
+    _state_losses([*opened, *(source.log for source in sources)])
+    _print_outcome(judge, as_json=as_json, written=[out] if out else [])
 
 
 def _source_path(estimates: Log) -> Path:
@@ -257,18 +270,6 @@ def _check_same_run(estimates: Log, log: Log) -> None:
         )
 
 
-def _read_outputs(logs: Sequence[Log]) -> dict[str, Ragged]:
-    """The streams of an ensemble's estimates logs."""
-    topics, *others = (
-        [topic for topic in log.topics if topic.startswith("/estimates/")] for log in logs
-    )
-    for log, theirs in zip(logs[1:], others, strict=True):
-        if theirs != topics:
-            raise BadInput(f"{log.path}: other estimates than in {logs[0].path}; judge it on its own")
-    read = [LogSource(log).read(topics) for log in logs]
-    return {topic: gather([streams[topic] for streams in read]) for topic in topics}
-
-
 def _hash_files(paths: Sequence[Path]) -> str:
     digest = hashlib.sha256()
     for path in paths:
@@ -278,17 +279,15 @@ def _hash_files(paths: Sequence[Path]) -> str:
 
 
 def _print_outcome(
-    replayed: Replayed,
-    metrics: Sequence[str],
+    judge: Judge,
     *,
     as_json: bool,
     written: Sequence[Path],
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    values = plain(measure(replayed.judged, find_metrics(metrics)))
-    failures = replayed.failures
-    _state_unjudged(replayed)
-    for sentence in failures[:5]:
+    values = plain(judge.metrics)
+    failures = judge.failures
+    for sentence in [*judge.unjudged, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
@@ -296,31 +295,18 @@ def _print_outcome(
         outcome = {
             "metrics": values,
             "failures": failures,
-            "losses": replayed.losses,
+            "losses": judge.losses,
             "written": [str(path) for path in written],
         }
         print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
         return
     print_metrics(values)
-    for sentence in replayed.losses:
+    for sentence in judge.losses:
         say(sentence)
     if seconds:
         print_table(("estimator", "time (s)"), list(seconds.items()))
     for path in written:
         say(str(path))
-
-
-def _state_unjudged(replayed: Replayed) -> None:
-    """What of the estimates has no truth, in one sentence for each."""
-    for sentence in replayed.unjudged:
-        warn(sentence)
-
-
-def _show(replayed: Replayed, save: Path | None, connect: str | None) -> None:
-    """Draw the first run."""
-    from replay.timeline.show import show
-
-    show(replayed.sources[0], replayed.outputs, replayed.errors, save=save, connect=connect)
 
 
 def view_path(
@@ -357,16 +343,19 @@ def _draw_log(
     path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
 ) -> None:
     """Draw a log, or an estimates log together with the log that it is of."""
-    from replay.timeline.show import recorded_outputs, show
+    from replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
-    source = LogSource(log)
-    outputs = recorded_outputs(source)
-    if outputs and log.run is not None and "log" in log.run.notes:
+    estimates = source = LogSource(log)
+    is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
+    if is_estimates and log.run is not None and "log" in log.run.notes:
         source = LogSource(open_log(_source_path(log), recover=recover))
-    replayed = judge([source], outputs, gap_limit_s)
-    show(source, outputs, replayed.errors, focus=focus, save=rrd, connect=connect)
-    _state_unjudged(replayed)
+    with Drawing(source, identity=str(path), focus=focus, save=rrd, connect=connect) as drawing:
+        judge = judge_logs(
+            [estimates] if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
+        )
+    for sentence in judge.unjudged:
+        warn(sentence)
     _state_losses([log, source.log])
 
 
@@ -375,6 +364,7 @@ def run_named(
     over: Mapping[str, Any],
     *,
     logs: int,
+    errors: bool,
     data: Path | None,
     out: Path | None,
     as_json: bool,
@@ -385,7 +375,9 @@ def run_named(
     folder = out or Path("out") / label
     inputs = [Path(name)] if name.endswith(".toml") else []
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
-    result = run_experiment(label, experiment, folder, data=data, logs=logs, progress=progress)
+    result = run_experiment(
+        label, experiment, folder, data=data, logs=logs, errors=errors, progress=progress
+    )
     if as_json:
         print_json(result.model_dump(mode="json"))
         return

@@ -1,4 +1,4 @@
-"""Monte Carlo execution: record an ensemble, replay estimators over it, judge them.
+"""Ensembles: recorded, replayed and judged, in one streamed pass or whole in memory.
 
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
@@ -15,36 +15,31 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import psutil
 
 from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
-from recorders.log import Clock, LogWriter, RunMetadata, schemas
+from recorders.log import Clock, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
-from replay.engine.failures import sentences_of
+from replay.engine.estimator import Bound, bind
 from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
-from replay.engine.sources import Ensemble, MemorySource, Source, memory_source
-from replay.judging.evaluation import (
-    Errors,
-    Innovations,
-    errors_of,
-    gaussian_estimates,
-    innovations_of,
-    split_topic,
-    unjudged,
-)
-from replay.judging.metrics import Output, estimated_share
-from replay.judging.set_errors import SetErrors, set_errors
+from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
+from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
+from replay.judging.judge import TIME_BINS, Judge
+from replay.judging.metrics import Metric, Output, find_metrics, measure
+from replay.judging.set_errors import SetErrors
 
-# Every run of an ensemble has two files open while it is replayed from logs; systems allow 1024.
+if TYPE_CHECKING:
+    from replay.timeline.show import Drawing
+
+# Every run of an ensemble has up to three files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
-# Less than this share of a span is said; a run's first measurements may well be before the prior.
-LEAST_SHARE = 0.995
+# Of a run that was judged, so much is kept at least: its sums over time.
+KEPT_BYTES = 8 * TIME_BINS
 
 Settings = Mapping[str, Mapping[str, Any]]
 Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
@@ -56,14 +51,212 @@ def no_progress(items: Iterable[Any], title: str, total: int | None) -> Iterable
 
 
 @dataclass(frozen=True)
-class Replayed:
-    """An ensemble with what the estimators made of it, and how that compares with the truth."""
+class Part:
+    """Some runs of an ensemble, replayed together.
+
+    Attributes:
+        sources: the runs.
+        first_run: the number of the first of them.
+        estimates: where the estimates of the first runs are written, and the log that each is of.
+        origins: what the runs start from where their spans begin after their priors, none or one each.
+        is_all: whether there are no other runs.
+    """
 
     sources: Sequence[Source]
+    first_run: int = 0
+    is_all: bool = True
+    estimates: Sequence[tuple[Path, Path]] = ()
+    origins: Sequence[Origin] = ()
+
+
+def parts_of(runs: int) -> Iterator[slice]:
+    """The runs of an ensemble that are replayed together: a cut that only their number decides."""
+    for first in range(0, runs, RUNS_AT_ONCE):
+        yield slice(first, min(first + RUNS_AT_ONCE, runs))
+
+
+@dataclass
+class Pass:
+    """What a streamed pass leaves: the judge of all runs, and the seconds that each estimator took."""
+
+    judge: Judge
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+
+def replay_parts(
+    parts: Iterable[Part],
+    estimators: Settings,
+    *,
+    gap_limit_s: float,
+    metrics: Sequence[str] = (),
+    order: Clock = "publish_time",
+    save: Path | None = None,
+    connect: str | None = None,
+    on_errors: Callable[[Errors], None] | None = None,
+    block_messages: int = BLOCK_MESSAGES,
+    progress: Progress = no_progress,
+) -> Pass:
+    """Replay an ensemble part by part: block by block to the estimates logs, the judge and the timeline.
+
+    Memory holds the runs of a part, if they are in memory at all, and the blocks in hand.
+
+    Args:
+        parts: the runs.
+        estimators: parameters by label.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        metrics: their names; none stands for all.
+        order: the clock to go by.
+        save: the file that the first run's timeline goes to.
+        connect: the receiver that it goes to; see `Drawing`.
+        on_errors: is handed the errors of every block.
+        block_messages: about how many messages of a run are in memory at once.
+        progress: is told of every block.
+
+    Raises BadInput as `replay` does, for what no run of any part can be replayed by.
+    """
+    reports: list[Report] = []
+    passes: list[Pass] = []
+
+    def replayed(part: Part) -> Iterator[None]:
+        reports.append(report := Report())
+        bound = bind_from(part.sources, estimators, part.origins, order)
+        found = find_metrics(metrics)
+        judge = Judge(
+            part.sources,
+            found,
+            gap_limit_s=gap_limit_s,
+            first_run=part.first_run,
+            on_errors=on_errors,
+        )
+        with ExitStack() as stack:
+            writers = [
+                stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path, log)))
+                for (path, log), source in zip(part.estimates, part.sources, strict=False)
+            ]
+            drawing = None
+            if part.first_run == 0 and (save or connect):
+                from replay.timeline.show import Drawing  # which takes long to import
+
+                asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
+                first = Drawing(part.sources[0], identity=asked, save=save, connect=connect)
+                drawing = stack.enter_context(first)
+            blocks = replay_blocks(
+                part.sources,
+                bound,
+                report,
+                order=order,
+                block_messages=block_messages,
+                is_part=not part.is_all,
+            )
+            for block in blocks:
+                for run, writer in enumerate(writers):
+                    writer.write([ragged.of_run(run) for ragged in block.values()])
+                judged = judge.add(block)
+                if drawing is not None:
+                    drawing.add(*of_run(block, judged.errors, 0))
+                yield
+        if passes:
+            passes[0].judge.merge(judge)
+        else:
+            passes.append(Pass(judge))
+        for label, time_s in report.seconds.items():
+            passes[0].seconds[label] += time_s
+
+    for _ in progress(chain.from_iterable(map(replayed, parts)), "replaying", None):
+        pass
+    for name, refusal in reports[0].refused.items():
+        if all(name in report.refused for report in reports):
+            raise refusal
+    return passes[0]
+
+
+def bind_from(
+    sources: Sequence[Source], estimators: Settings, origins: Sequence[Origin], order: Clock
+) -> list[Bound]:
+    """Bind estimators to runs, each begun from its origin where there are any."""
+    bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
+    return [start_from(each, sources, origins, order) for each in bound] if origins else bound
+
+
+def replay_blocks(
+    sources: Sequence[Source],
+    bound: Sequence[Bound],
+    report: Report,
+    *,
+    order: Clock = "publish_time",
+    block_messages: int = BLOCK_MESSAGES,
+    is_part: bool = False,
+) -> Iterator[dict[str, Ragged]]:
+    """The outputs of a replay, block by block, by topic; the last block says what was covered."""
+    for block in replay(
+        sources, bound, order=order, block_messages=block_messages, report=report, is_part=is_part
+    ):
+        yield collect([block])
+    yield collect([report.coverage])
+
+
+def of_run(
+    block: Mapping[str, Ragged], errors: Sequence[Errors], run: int
+) -> tuple[dict[str, Any], list[Errors]]:
+    """What a timeline draws: the streams of one run, and its errors."""
+    streams = {topic: rows.of_run(run) for topic, rows in block.items()}
+    return streams, [errors_at(each, each.run == run) for each in errors]
+
+
+def judge_logs(
+    estimates: Sequence[Source],
+    sources: Sequence[Source],
+    metrics: Mapping[str, Metric[Any, Any]],
+    *,
+    gap_limit_s: float,
+    drawing: "Drawing | None" = None,
+    on_errors: Callable[[Errors], None] | None = None,
+) -> Judge:
+    """Judge the estimates that logs hold, block by block.
+
+    Args:
+        estimates: what was estimated of every run.
+        sources: the runs, with their truths.
+        metrics: what to compute.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        drawing: is handed what there is of the first run.
+        on_errors: is handed the errors of every block.
+
+    Raises BadInput where one holds other estimates than the first.
+    """
+    held = [[each for each in source.topics if each.startswith("/estimates/")] for source in estimates]
+    for source, topics in zip(estimates, held, strict=True):
+        if topics != held[0]:
+            raise BadInput(
+                f"{source.name}: other estimates than in {estimates[0].name}; judge it on its own"
+            )
+    whole: Judge | None = None
+    for now in parts_of(len(sources)):
+        judge = Judge(
+            sources[now], metrics, gap_limit_s=gap_limit_s, first_run=now.start, on_errors=on_errors
+        )
+        runs = ensemble_of(estimates[now])
+        for block in runs.blocks(held[0], "publish_time", BLOCK_MESSAGES) if held else ():
+            judged = judge.add(block)
+            if drawing is not None and now.start == 0:
+                drawing.add(*of_run(block, judged.errors, 0))
+        if whole is None:
+            whole = judge
+        else:
+            whole.merge(judge)
+    assert whole is not None
+    return whole
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """An ensemble in memory, what the estimators made of it, and how that compares with the truth."""
+
+    sources: Sequence[MemorySource]
     outputs: dict[str, Ragged]
     errors: list[Errors]
     innovations: list[Innovations]
-    sets: list[SetErrors] = field(default_factory=list)
+    sets: list[SetErrors]
 
     @property
     def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
@@ -74,57 +267,9 @@ class Replayed:
         ]
         return [*self.errors, *self.innovations, *self.sets, *outputs]
 
-    @property
-    def unjudged(self) -> list[str]:
-        """A sentence for every estimate of which the truth lacks components."""
-        sentences = []
-        for estimates in gaussian_estimates(self.outputs):
-            names = unjudged(estimates, self.sources)
-            if names:
-                stream = estimates.stream
-                what = " ".join(filter(None, split_topic(stream.topic)))
-                verb = "is" if len(names) == 1 else "are"
-                sentences.append(
-                    f"{what}: {', '.join(names)} {verb} not judged: {stream.metadata['truth']} lacks "
-                    + ("it" if len(names) == 1 else "them")
-                )
-        return sentences
-
-    @property
-    def failures(self) -> list[str]:
-        """A sentence for every run that an estimator could not follow to the end, or not at all."""
-        failed: dict[tuple[str, int], str] = {}
-        silent: dict[tuple[str, int], str] = {}
-        for topic, rows in self.outputs.items():
-            what = " ".join(filter(None, split_topic(topic)))
-            for run, source in enumerate(self.sources):
-                found = rows.of_run(run)
-                if rows.stream.schema.full_name == schemas.FAILURE.full_name and len(found):
-                    elapsed_s = (int(found.publish_time_ns[0]) - source.epoch_ns) * 1e-9
-                    reason = sentences_of(found.take(slice(0, 1)))[0]
-                    failed[what, run] = f"{source.name}: {what} failed at {elapsed_s:.3f} s: {reason}"
-                elif rows.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name and not len(
-                    found
-                ):
-                    silent[what, run] = f"{source.name}: {what} gave no estimates"
-        return list({**silent, **failed}.values())
-
-    @property
-    def losses(self) -> list[str]:
-        """A sentence for every case that was not estimated throughout, and for measurements not used."""
-        said = []
-        for topic, rows in self.outputs.items():
-            what = " ".join(filter(None, split_topic(topic)))
-            schema = rows.stream.schema.full_name
-            if schema == schemas.COVERAGE.full_name and (share := estimated_share(rows)) is not None:
-                if share < LEAST_SHARE:
-                    said.append(
-                        f"{what}: {100 * share:.1f} % of the span was estimated; its figures are of that"
-                    )
-            elif schema == schemas.SKIPPED.full_name:
-                counts = Counter(sentences_of(rows.stream))
-                said += [f"{what}: {count} not used: {reason}" for reason, count in counts.items()]
-        return said
+    def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
+        """The metrics of these names, of all where none is given; see `measure`."""
+        return measure(self.judged, find_metrics(names))
 
 
 def record_ensemble(
@@ -134,18 +279,24 @@ def record_ensemble(
     runs: int,
     progress: Progress = no_progress,
     executor: Executor | None = None,
+    first_run: int = 0,
+    all_runs: int = 0,
 ) -> Ensemble[MemorySource]:
-    """Record runs 0 ... runs - 1 of a scenario, each from its own random stream of `seed`.
+    """Record so many runs of a scenario, each from its own random stream of `seed`.
 
-    Raises BadInput where the first run shows that memory cannot hold them all.
+    Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
+    where there are more.
     """
     record = partial(_record, scenario, dict(parameters), seed)
     begin_s = time.perf_counter()
-    first = record(0)
+    first = record(first_run)
     took_s = time.perf_counter() - begin_s
     # replay lays the runs end to end, which holds every column twice; estimates come on top
-    require_memory(f"{runs} runs of {scenario}", 2 * runs * _size(first), took_s * runs)
-    others = executor.map(record, range(1, runs)) if executor else map(record, range(1, runs))
+    need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
+    all_runs = max(runs, all_runs)
+    require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
+    numbers = range(first_run + 1, first_run + runs)
+    others = executor.map(record, numbers) if executor else map(record, numbers)
     return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
 
 
@@ -175,16 +326,14 @@ def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -
 
 
 def replay_ensemble(
-    sources: Sequence[Source],
+    sources: Sequence[MemorySource],
     estimators: Settings,
     *,
     gap_limit_s: float,
-    order: Clock = "publish_time",
     progress: Progress = no_progress,
 ) -> Replayed:
     """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
-    outputs = replay_in_memory(sources, estimators, order=order, progress=progress)
-    return judge(sources, outputs, gap_limit_s)
+    return judge(sources, replay_in_memory(sources, estimators, progress=progress), gap_limit_s)
 
 
 def replay_in_memory(
@@ -198,103 +347,38 @@ def replay_in_memory(
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
-        report = Report()
-        outputs |= collect(replay(sources, bound, order=order, report=report))
-        outputs |= collect([report.coverage])
+        blocks = replay_blocks(sources, bound, Report(), order=order)
+        outputs |= collect(list(block.values()) for block in blocks)
     return outputs
 
 
-def judge(sources: Sequence[Source], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
+def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
     """Errors, innovations and set errors of a replay's outputs."""
-    found = [errors_of(each, sources, gap_limit_s) for each in gaussian_estimates(outputs)]
-    innovations = [
-        innovations_of(each)
-        for each in outputs.values()
-        if each.stream.schema.full_name == schemas.INNOVATION.full_name
-    ]
-    errors = [each for each in found if each is not None]
-    sets = set_errors(outputs, sources, gap_limit_s=gap_limit_s)
-    return Replayed(sources, outputs, errors, innovations, sets)
+    judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
+    return Replayed(sources, outputs, judged.errors, judged.innovations, judged.sets)
 
 
-def replay_to_logs(
-    sources: Sequence[Source],
-    estimators: Settings,
-    paths: Sequence[Path],
-    *,
-    order: Clock = "publish_time",
-    origins: Sequence[Origin] = (),
-    block_messages: int = BLOCK_MESSAGES,
-    progress: Progress = no_progress,
-) -> dict[str, float]:
-    """Replay and write one estimates log per run, block by block: memory holds the blocks in hand.
-
-    `origins` are what the runs start from where their spans begin after their priors, one per run.
-    Returns how many seconds each estimator took, by label. Raises BadInput as `replay` does.
-    """
-    reports: list[Report] = []
-    bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
-
-    def write_some(first: int) -> Iterator[int]:
-        now = slice(first, first + RUNS_AT_ONCE)
-        begun = [
-            start_from(each, sources[now], origins[now], order) if origins else each for each in bound
-        ]
-        with ExitStack() as stack:
-            writers = [
-                stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path)))
-                for path, source in zip(paths[now], sources[now], strict=True)
-            ]
-            reports.append(part := Report())
-            blocks = replay(
-                sources[now],
-                begun,
-                order=order,
-                block_messages=block_messages,
-                report=part,
-                is_part=len(sources) > RUNS_AT_ONCE,
-            )
-            for block in chain(blocks, _coverage_of(part)):
-                for run, writer in enumerate(writers):
-                    writer.write([ragged.of_run(run) for ragged in block])
-                yield first
-
-    parts = map(write_some, range(0, len(sources), RUNS_AT_ONCE))
-    for _ in progress(chain.from_iterable(parts), "replaying", None):
-        pass
-    for name, refusal in reports[0].refused.items():
-        if all(name in report.refused for report in reports):
-            raise refusal
-    seconds: dict[str, float] = defaultdict(float)
-    for report in reports:
-        for label, time_s in report.seconds.items():
-            seconds[label] += time_s
-    return dict(seconds)
-
-
-def _coverage_of(report: Report) -> Iterator[list[Ragged]]:
-    """The last block of a replay; it is there only when the others have been taken."""
-    yield report.coverage
-
-
-def estimates_metadata(
-    source: Source, estimators: Settings, path: Path, log: Path | None = None
-) -> RunMetadata:
+def estimates_metadata(source: Source, estimators: Settings, path: Path, log: Path) -> RunMetadata:
     """What the estimates log at `path` says of itself: the run that it is of, the estimators, its log.
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    place = os.path.relpath((log or Path(source.name)).resolve(), path.resolve().parent)
+    place = os.path.relpath(log.resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()})
     return replace(run, notes={"log": place, "estimators": settings})
 
 
-def hash_streams(sources: Sequence[MemorySource]) -> str:
+def hash_streams(sources: Iterable[MemorySource]) -> str:
     """SHA-256 over every column of every run: equal where the input data are equal."""
     digest = hashlib.sha256()
     for source in sources:
-        for stream in source.streams.values():
-            for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
-                digest.update(np.ascontiguousarray(array).data)
+        add_to_hash(digest, source)
     return digest.hexdigest()
+
+
+def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
+    """Take a run's columns into a hash."""
+    for stream in source.streams.values():
+        for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
+            digest.update(np.ascontiguousarray(array).data)

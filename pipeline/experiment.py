@@ -65,11 +65,21 @@ class Experiment(Parameters):
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how an experiment runs; `options` are of the study's own type."""
+    """Where and how an experiment runs.
+
+    Attributes:
+        folder: what is written goes there.
+        data: what is imported.
+        logs: of how many runs the logs are kept.
+        errors: whether every single error is kept too.
+        options: of the study's own type.
+        progress: is told how it goes.
+    """
 
     folder: Path
     data: Path | None = None
     logs: int = 20
+    errors: bool = False
     options: Any = None
     progress: Progress = no_progress
 
@@ -170,6 +180,7 @@ def run_experiment(
     *,
     data: Path | None = None,
     logs: int = 20,
+    errors: bool = False,
     progress: Progress = no_progress,
 ) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
@@ -189,7 +200,7 @@ def run_experiment(
     ):
         # of runs that all failed there is no mean: a null in the results, not a warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
-        outcome = study.run(experiment, Setting(part, data, logs, options, progress))
+        outcome = study.run(experiment, Setting(part, data, logs, errors, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

@@ -1,4 +1,4 @@
-"""What a log holds, for a person and for machines."""
+"""What a log holds, and what the cache holds, for a person and for machines."""
 
 import json
 from collections.abc import Mapping
@@ -13,6 +13,7 @@ from recorders.log import Log, RunMetadata, open_log, read_span
 from recorders.parameters import describe
 from recorders.recording import Recorder
 from recorders.registry import load
+from replay.engine.cache import cache_folder, kept_files
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
@@ -35,6 +36,29 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
     print_table(["topic", "schema", "messages", "per second"], rows)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+def show_cache(*, clear: bool, as_json: bool) -> None:
+    """Print how much each folder of the cache holds; where it is cleared, how much that was."""
+    place = cache_folder()
+    kept = set(kept_files())
+    found: dict[str, dict[str, int]] = {}
+    for path in sorted(kept):
+        size = found.setdefault(path.parent.name, {"files": 0, "bytes": 0})
+        size["files"] += 1
+        size["bytes"] += path.stat().st_size
+        if clear:
+            path.unlink()
+    others = sum(path.is_file() for path in place.rglob("*") if path not in kept)
+    if as_json:
+        print_json({"folder": str(place), "cleared": clear, "holds": found, "others": others})
+        return
+    say(f"{place}: {'cleared' if clear else 'holds'} {len(kept)} files")
+    if found:
+        rows = [[name, size["files"], size["bytes"] / 1e6] for name, size in found.items()]
+        print_table(["", "files", "MB"], rows)
+    if others:
+        say(f"{others} other files stay: fuselog did not write them as they are")
 
 
 def _as_json(log: Log) -> dict[str, Any]:

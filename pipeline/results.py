@@ -9,15 +9,15 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 from urllib.parse import quote
 
 from recorders.atomic import whole_folder
-from recorders.errors import BadInput
+from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
@@ -25,7 +25,13 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from replay.judging.evaluation import Errors
+
 RESULT_FILE = "result.json"
+# Longer tables are no reading matter: they are Parquet alone.
+CSV_ROWS = 20_000
+# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+FORMAT = 1
 Verdict = Literal["confirmed", "refuted", "not reproducible"]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -67,6 +73,7 @@ class Result(Parameters):
     without it. A timeline has none: Rerun numbers its rows by the clock.
     """
 
+    format: int = FORMAT
     experiment: str
     fuselog: str
     settings: dict[str, Any]
@@ -168,10 +175,46 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+class ErrorTables:
+    """Every error of every estimate, on request: a Parquet file per estimator and case.
+
+    They are written block by block, as they come; use it as a context.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "tables" / "errors"
+        self._stack = ExitStack()
+        self._writers: dict[tuple[str, str], Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.close()
+
+    def add(self, errors: "Errors") -> None:
+        """Write a block; see `error_table`."""
+        import pyarrow
+        import pyarrow.parquet
+
+        from replay.judging.judge import error_table
+
+        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
+        what = errors.estimator, errors.case
+        if what not in self._writers:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
+            file = self._stack.enter_context(path.open("wb"))
+            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
+            self._writers[what] = self._stack.enter_context(writer)
+        if len(table):
+            self._writers[what].write_table(table)
+
+
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
-    """Write tables (Parquet and CSV), figures (SVG) and result.json; returns what result.json says."""
+    """Write tables (Parquet, short ones CSV too), figures (SVG), result.json; returns what that says."""
     # here, since lists and --help need none of it
     import matplotlib as mpl
     import pyarrow
@@ -183,8 +226,9 @@ def write_outcome(
         columns = pyarrow.Table.from_pandas(table, preserve_index=False)
         with (folder / "tables" / f"{name}.parquet").open("wb") as file:
             pyarrow.parquet.write_table(columns, file)
-        with (folder / "tables" / f"{name}.csv").open("wb") as file:
-            pyarrow.csv.write_csv(columns, file)
+        if len(table) <= CSV_ROWS:
+            with (folder / "tables" / f"{name}.csv").open("wb") as file:
+                pyarrow.csv.write_csv(columns, file)
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes
@@ -235,7 +279,10 @@ def _decided(claim: Claim) -> Claim:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says; raises BadInput where it is missing or damaged."""
+    """What result.json of a result folder says.
+
+    Raises BadInput where it is missing, damaged or of another format.
+    """
     path = folder / RESULT_FILE
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
@@ -245,6 +292,7 @@ def read_result(folder: Path) -> Result:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
         raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+    check_format(path, values.get("format", 1), FORMAT)
     return build(Result, values, str(path))
 
 

@@ -17,6 +17,15 @@ def choices(name: str, known: Collection[str]) -> str:
     return f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known) or 'none'}"
 
 
+def check_format(path: object, stated: object, read: int) -> None:
+    """Raise BadInput where a file states another format than the one that this fuselog reads."""
+    if isinstance(stated, int) and stated != read:
+        age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
+        raise BadInput(
+            f"{path}: {age} fuselog wrote it (format {stated}, this one reads {read}); {mend}"
+        )
+
+
 def printable(text: str) -> str:
     """A text for a terminal: line breaks stay, other control characters are shown by their numbers."""
     return "".join(

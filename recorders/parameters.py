@@ -117,6 +117,9 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
 
     A right side that is no TOML value is taken as text. Raises BadInput where there is no `=`.
+
+    >>> parse_settings(["duration_s=30", "range.rate_hz=5.0", "name=walk"])
+    {'duration_s': 30, 'range': {'rate_hz': 5.0}, 'name': 'walk'}
     """
     values: dict[str, Any] = {}
     for setting in settings:
@@ -142,7 +145,11 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values of `over`, nested tables merged."""
+    """`base` with the values of `over`, nested tables merged.
+
+    >>> merge({"seed": 1, "range": {"rate_hz": 5.0, "sigma_m": 0.1}}, {"range": {"rate_hz": 2.0}})
+    {'seed': 1, 'range': {'rate_hz': 2.0, 'sigma_m': 0.1}}
+    """
     merged = dict(base)
     for key, value in over.items():
         old = merged.get(key)

@@ -79,6 +79,12 @@ def record_run(
     """Record run number `run` of a scenario; (scenario, values, seed, run) give the same streams.
 
     Raises BadInput for an unknown scenario or parameter, or one that only imports.
+
+    >>> recording, run = record_run("landmarks", {"duration_s": 2.0, "robots": 2}, seed=7)
+    >>> sorted(stream.topic for stream in recording.streams if stream.topic.startswith("/robot2"))
+    ['/robot2/odometry', '/robot2/prior', '/robot2/range_bearing', '/robot2/truth']
+    >>> run.parameters["robots"]
+    2
     """
     simulator: Recorder[Any] = load("recorders", scenario, Recorder)
     if not isinstance(simulator, Simulator):

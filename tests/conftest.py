@@ -1,6 +1,7 @@
 """What tests of all rooms share."""
 
 import os
+import sys
 import tarfile
 from pathlib import Path
 
@@ -10,6 +11,12 @@ from hypothesis import settings
 # The same examples in every run: a red test is red for everyone, and stays so until it is mended.
 settings.register_profile("fuselog", deadline=None, derandomize=True)
 settings.load_profile("fuselog")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip on Windows what it has no such thing for."""
+    if sys.platform == "win32" and item.get_closest_marker("unix"):
+        pytest.skip("signals, limits, links and owners of files as Unix has them")
 
 
 @pytest.fixture(scope="session")

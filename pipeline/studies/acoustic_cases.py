@@ -1,15 +1,15 @@
 """What the study of shooter localization runs: one scenario at one noise, all modes, bounds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.ensemble import hash_streams, record_ensemble, replay_ensemble
-from pipeline.experiment import Experiment, Setting, load_scenario
-from pipeline.studies.localization import write_logs
+from pipeline.ensemble import hash_streams
+from pipeline.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.runner import Runner
 from pipeline.studies.repetitions import Floats, by_repetition, errors_named, root_mean_square
 from recorders.models.acoustic import local_estimate_covariances, range_from_time_difference
 from recorders.parameters import Parameters, build, merge
@@ -22,7 +22,6 @@ from replay.estimators import acoustic
 from replay.estimators.acoustic import Detections
 from replay.estimators.acoustic_streams import ShooterParameters, gather_detections
 from replay.judging.consistency import ellipse_area
-from replay.timeline.show import show
 
 BEARINGS, LOCAL, NATIVE = "bearings-only", "local-estimates", "native-measurements"
 CROSS, FIXED = "cross-covariances", "fixed-sensors"
@@ -137,21 +136,19 @@ def run_case(experiment: Experiment, setting: Setting, number: int, multiplier: 
     """Record a scenario, replay the modes that go at this noise, and bound them."""
     options: AcousticOptions = setting.options
     name = options.scenarios[number - 1]
-    recorder, values, _ = load_scenario(name)
-    values = merge(values, experiment.record.parameters if experiment.record else {})
+    stated = experiment.record.parameters if experiment.record else {}
+    values = merge(load_scenario(name)[1], stated)
     for angle in ("sigma_muzzle_blast_deg", "sigma_shockwave_deg"):
         values[angle] = multiplier * values[angle]
     parameters = build(AcousticParameters, values, f"scenario {name}")
     everything = multiplier in (1.0, options.multipliers[-1])
     labels = [each for each in experiment.estimators if everything or each in options.modes]
-    sources = record_ensemble(recorder, values, experiment.seed + number - 1, experiment.runs)
     estimators = {label: experiment.estimators[label] for label in labels}
-    replayed = replay_ensemble(sources, estimators, gap_limit_s=experiment.gap_limit_s)
+    runner = Runner(experiment.model_copy(update={"record": Record(scenario=name)}), setting)
+    sources = runner.obtain(values, seed=experiment.seed + number - 1)
+    replayed = runner.replay(sources, estimators)
     if multiplier == 1.0:
-        write_logs(experiment, replace(setting, folder=setting.folder / name), sources, replayed)
-        if number == 1:
-            rrd = setting.folder / "timeline.rrd"
-            show(sources[0], replayed.outputs, replayed.errors, save=rrd)
+        runner.keep(sources, replayed.outputs, name, drawn="" if number == 1 else None)
     modes = {}
     for label, settings in estimators.items():
         errors = errors_named(replayed, label)

@@ -12,11 +12,12 @@ from pydantic import NonNegativeInt, PositiveFloat
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
-from pipeline.studies.localization import replay_runs, summary_table
+from pipeline.runner import Runner
+from pipeline.studies.localization import summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.judging.metrics import Output, find_metrics, measure
-from replay.judging.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, track_tables
+from replay.judging.metrics import Output
+from replay.judging.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, reports_of, track_tables
 
 
 class AisOptions(Parameters):
@@ -32,15 +33,15 @@ class AisOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: AisOptions = setting.options
-    sources, replayed = replay_runs(experiment, setting)
+    replayed = Runner(experiment, setting).run()
     vessels = vessel_table(replayed)
     if options.estimator not in set(vessels["estimator"]):
         raise BadInput(f"no tracks of '{options.estimator}' with identities to judge them by")
-    outcome = Outcome(input_sha256=hash_streams(sources))
-    outcome.metrics.update(measure(replayed.judged, find_metrics(experiment.metrics)))
+    outcome = Outcome(input_sha256=hash_streams(replayed.sources))
+    outcome.metrics.update(replayed.metrics(experiment.metrics))
     outcome.tables["summary"] = summary_table(outcome.metrics)
     outcome.tables["vessels"] = vessels
-    notes = sources[0].run.notes.items()
+    notes = replayed.sources[0].run.notes.items()
     outcome.tables["notes"] = pd.DataFrame(notes, columns=["what", "count"])
     outcome.figures["tracks"] = tracks_figure(replayed, vessels, options)
     outcome.claims = _claims(vessels, options)
@@ -53,7 +54,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
         table.assign(estimator=each.estimator)
         for each in replayed.judged
         if isinstance(each, Output)
-        for table in track_tables(each)
+        for table in track_tables(reports_of(each))
     ]
     if not tables:
         raise BadInput("no tracks to judge: the log has no identities, or no estimator tells tracks")

@@ -17,8 +17,8 @@ from pydantic import PositiveInt
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study, load_scenario
 from pipeline.results import Claim, Outcome
-from pipeline.studies.cases import replay_cases, rmse_of_runs
-from pipeline.studies.repetitions import require_spread
+from pipeline.runner import Runner
+from pipeline.studies.repetitions import require_spread, rmse_of_runs
 from recorders.errors import BadInput
 from recorders.models.orientation import axis_angle_between
 from recorders.parameters import Parameters, build, merge
@@ -53,9 +53,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     stated = _stated(experiment)
     sources: list[MemorySource] = []
     errors_deg: dict[str, dict[str, Floats]] = {}
-    for case, replayed in replay_cases(experiment, setting, _cases(stated)):
+    for case, replayed in Runner(experiment, setting).cases(_cases(stated)):
         errors_deg[case] = _errors_deg(replayed, stated, options, case)
-        sources += replayed.sources  # type: ignore[arg-type]
+        sources += replayed.sources
     outcome = Outcome(input_sha256=hash_streams(sources))
     for case, found in errors_deg.items():
         for name, error in found.items():

@@ -4,7 +4,7 @@ Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are r
 seeds; those of all pairs get confidence intervals of drawing users again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from pydantic import PositiveInt
 from scipy.stats import norm
 
-from pipeline.ensemble import Replayed, hash_streams, replay_ensemble
+from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Outcome
+from pipeline.runner import Runner
 from pipeline.studies.biometrics_claims import (
     CASES,
     METHODS,
@@ -23,7 +24,7 @@ from pipeline.studies.biometrics_claims import (
     claims_of_bssr1,
     claims_of_simulation,
 )
-from pipeline.studies.localization import replay_runs, summary_table
+from pipeline.studies.localization import summary_table
 from recorders.models.scores import TOPIC, comparisons_of, matchers_of
 from recorders.parameters import Parameters
 from replay.engine.blocks import Ragged
@@ -31,7 +32,6 @@ from replay.engine.estimator import configure
 from replay.engine.sources import MemorySource
 from replay.estimators.biometrics import LearnerParameters, subsets_of
 from replay.judging.evaluation import split_topic
-from replay.judging.metrics import find_metrics, measure
 from replay.judging.verification import (
     FALSE_ACCEPT_RATES,
     Fused,
@@ -54,10 +54,11 @@ class BiometricsOptions(Parameters):
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    sources, replayed = replay_runs(experiment, setting)
-    metrics = find_metrics(experiment.metrics)
-    values = measure(replayed.judged, metrics)
-    values |= _repeated(experiment, setting, sources, values)
+    runner = Runner(experiment, setting)
+    replayed = runner.run()
+    sources = replayed.sources
+    values = replayed.metrics(experiment.metrics)
+    values |= _repeated(runner, sources, values)
     outcome = Outcome(metrics=dict(values), input_sha256=hash_streams(sources))
     outcome.tables["summary"] = summary_table(outcome.metrics)
     outcome.tables["factors"] = factor_table(values, sources[0])
@@ -74,20 +75,19 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _repeated(
-    experiment: Experiment, setting: Setting, sources: list[MemorySource], first: Mapping[str, float]
+    runner: Runner, sources: Sequence[MemorySource], first: Mapping[str, float]
 ) -> dict[str, float]:
     """Means and standard deviations over the seeds of the fusions that draw a trimmed database."""
     drawn = {}
-    for label, settings in experiment.estimators.items():
+    for label, settings in runner.experiment.estimators.items():
         _, parameters = configure(label, settings)
         if isinstance(parameters, LearnerParameters) and parameters.pairs == "trimmed":
             drawn[label] = (dict(settings), parameters.seed)
     rates = [{key: value for key, value in first.items() if f".{RATE}" in key}]
-    more = range(1, setting.options.seeds if drawn else 1)
-    for step in setting.progress(more, "repeating with other seeds", len(more)):
+    more = range(1, runner.setting.options.seeds if drawn else 1)
+    for step in runner.setting.progress(more, "repeating with other seeds", len(more)):
         estimators = {label: {**values, "seed": seed + step} for label, (values, seed) in drawn.items()}
-        again = replay_ensemble(sources, estimators, gap_limit_s=experiment.gap_limit_s)
-        rates.append(measure(again.judged, find_metrics(["verification"])))
+        rates.append(runner.replay(sources, estimators).metrics(["verification"]))
     values: dict[str, float] = {}
     for key in rates[0]:
         over_seeds = [rate[key] for rate in rates]
@@ -164,14 +164,14 @@ def _complete(replayed: Replayed) -> dict[str, Fused]:
 
 def _counts(replayed: Replayed) -> dict[str, list[float]]:
     """Identified users in every run, by fusion and case."""
-    metrics = find_metrics(["verification"])
     counts: dict[str, list[float]] = {}
     for run in range(len(replayed.sources)):
         of_run = {
             topic: Ragged(rows.of_run(run), np.array([0, len(rows.of_run(run))]))
             for topic, rows in replayed.outputs.items()
         }
-        values = measure(Replayed(replayed.sources[run : run + 1], of_run, [], []).judged, metrics)
+        alone = Replayed(replayed.sources[run : run + 1], of_run, [], [], [])
+        values = alone.metrics(["verification"])
         for key, value in values.items():
             counts.setdefault(key, []).append(value)
     return counts

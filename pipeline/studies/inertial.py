@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
-from pipeline.studies.localization import replay_runs
+from pipeline.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.sources import Source
 from replay.judging.evaluation import Errors
-from replay.judging.metrics import find_metrics, measure
 
 
 class InertialOptions(Parameters):
@@ -32,19 +31,19 @@ class InertialOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: InertialOptions = setting.options
-    sources, replayed = replay_runs(experiment, setting)
-    trials = movement_table(replayed.errors, sources)
+    replayed = Runner(experiment, setting).run()
+    trials = movement_table(replayed.errors, replayed.sources)
     means = {
         str(name): float(rows["movement_rmse_deg"].mean())
         for name, rows in trials.groupby("estimator", sort=False)
     }
     if options.estimator not in means:
         raise BadInput(f"no estimates of '{options.estimator}' over movement with truth to judge")
-    outcome = Outcome(input_sha256=hash_streams(sources))
+    outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
     for trial, estimator, rmse_deg, _ in trials.to_numpy():
         outcome.metrics[f"{estimator}.movement_rmse_deg.{trial}"] = rmse_deg
-    outcome.metrics.update(measure(replayed.judged, find_metrics(experiment.metrics)))
+    outcome.metrics.update(replayed.metrics(experiment.metrics))
     outcome.tables["trials"] = trials
     outcome.figures["trials"] = trials_figure(trials)
     outcome.claims = _claims(means, options, int((trials["estimator"] == options.estimator).sum()))

@@ -14,14 +14,13 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
-from pipeline.ensemble import Replayed, judge, replay_in_memory
+from pipeline.ensemble import replay_in_memory
 from pipeline.experiment import Experiment, Setting
-from pipeline.studies.localization import obtain, write_logs
+from pipeline.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.engine.blocks import Ragged, gather
-from replay.engine.sources import MemorySource, Source
-from replay.timeline.show import show
+from replay.engine.blocks import Ragged
+from replay.engine.sources import MemorySource
 
 Floats = NDArray[np.float64]
 REFERENCE = "analytic"
@@ -74,11 +73,11 @@ def ensembles(
         raise BadInput(f"this study compares with the estimator '{REFERENCE}'; add it to the experiment")
     for number in range(options.data_seeds):
         again = experiment.model_copy(update={"seed": experiment.seed + number})
-        sources = obtain(again, setting)
+        runner = Runner(again, setting)
+        sources = runner.obtain()
         outputs = replay_in_memory(sources, experiment.estimators, progress=setting.progress)
         if number == 0 and written:
-            write_logs(again, setting, sources, Replayed(sources, outputs, [], []))
-            _draw_first_run(again, setting, sources, outputs)
+            runner.keep(sources, outputs)
         outputs |= replay_in_memory(sources, extra or {}, progress=setting.progress)
         truth = np.stack([source.streams["/truth"]["state"][1:] for source in sources])
         labels = [*experiment.estimators, *(extra or {})]
@@ -87,14 +86,6 @@ def ensembles(
             truth,
             {label: track(outputs[f"/estimates/{label}/state"], truth.shape[1]) for label in labels},
         )
-
-
-def _draw_first_run(
-    experiment: Experiment, setting: Setting, sources: Sequence[Source], outputs: dict[str, Ragged]
-) -> None:
-    of_run = {topic: gather([ragged.of_run(0)]) for topic, ragged in outputs.items()}
-    first = judge(sources[:1], of_run, experiment.gap_limit_s)
-    show(sources[0], of_run, first.errors, save=setting.folder / "timeline.rrd")
 
 
 def track(estimates: Ragged, steps: int) -> Track:

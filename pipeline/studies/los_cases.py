@@ -7,9 +7,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
-from pipeline.experiment import Experiment, Setting, load_scenario
-from pipeline.studies.localization import write_logs
+from pipeline.ensemble import Replayed, hash_streams
+from pipeline.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.runner import Runner
 from pipeline.studies.repetitions import Floats, by_repetition, errors_named, root_mean_square
 from recorders.errors import BadInput
 from recorders.models.optical import ANGLES
@@ -17,13 +17,11 @@ from recorders.parameters import Parameters, build, merge
 from recorders.simulators.optical import OpticalParameters
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.estimator import configure
-from replay.engine.sources import MemorySource
 from replay.estimators import optical
 from replay.estimators.optical import Observability, Scene
 from replay.estimators.optical_streams import known_biases
 from replay.inference.least_squares import cramer_rao_bound
 from replay.judging.consistency import component_error_squared, dilution_of_precision
-from replay.timeline.show import show
 
 ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 
@@ -151,25 +149,19 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     values = merge(values, experiment.record.parameters if experiment.record else {})
     parameters = build(OpticalParameters, values, f"scenario {name}")
 
-    def recorded(over: Mapping[str, Any]) -> list[MemorySource]:
+    runner = Runner(experiment.model_copy(update={"record": Record(scenario=name)}), setting)
+
+    def replayed(over: Mapping[str, Any], *schemes: str) -> Replayed:
         seed = experiment.seed + number - 1  # scenarios share no noise
-        return record_ensemble(recorder, merge(values, over), seed, experiment.runs, setting.progress)
+        sources = runner.obtain(merge(values, over), seed=seed)
+        return runner.replay(sources, {scheme: experiment.estimators[scheme] for scheme in schemes})
 
-    def replayed(sources: list[MemorySource], *schemes: str) -> Replayed:
-        estimators = {scheme: experiment.estimators[scheme] for scheme in schemes}
-        return replay_ensemble(sources, estimators, gap_limit_s=experiment.gap_limit_s)
-
-    biased = recorded({})
-    free = replayed(recorded({"bias_deg": None}), ALONE)
-    with_bias = replayed(biased, BLIND, JOINT)
+    free, biased = replayed({"bias_deg": None}, ALONE), replayed({}, BLIND, JOINT)
     if condition == next(iter(options.conditions)):
-        place = replace(setting, folder=setting.folder / f"scenario-{number}")
-        write_logs(experiment, place, biased, with_bias)
-        if number == 1:
-            rrd = setting.folder / "timeline.rrd"
-            show(biased[0], with_bias.outputs, with_bias.errors, save=rrd)
-    case = _judged(experiment, number, condition, parameters, free, with_bias)
-    return replace(case, input_sha256=hash_streams(biased))
+        place = f"scenario-{number}"
+        runner.keep(biased.sources, biased.outputs, place, drawn="" if number == 1 else None)
+    case = _judged(experiment, number, condition, parameters, free, biased)
+    return replace(case, input_sha256=hash_streams(biased.sources))
 
 
 def _judged(

@@ -14,17 +14,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 from pydantic import NonNegativeFloat
 
-from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
+from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
-from pipeline.studies.localization import replay_runs, summarise
+from pipeline.runner import Runner
+from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
-from recorders.parameters import Parameters, merge
+from recorders.parameters import Parameters
 from replay.engine.blocks import gather
 from replay.engine.sources import MemorySource
 from replay.estimators.covariance_intersection import fuse
 from replay.estimators.networks import ALONE, CENTRALISED, NetworkParameters, message_bytes
 from replay.judging.evaluation import Errors
+from replay.judging.judge import Judge
 
 CI = "ci-trace"
 
@@ -40,11 +42,14 @@ class NetworkOptions(Parameters):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: NetworkOptions = setting.options
-    sources, replayed = replay_runs(experiment, setting)
+    runner = Runner(experiment, setting)
+    replayed = runner.run()
     settled = replace(replayed, errors=[_after(each, options.settle_s) for each in replayed.errors])
-    outcome = summarise(settled)
-    outcome.metrics |= _loads(experiment, sources)
-    by_loss = _by_loss(experiment, setting, options, settled)
+    judge = Judge(replayed.sources, gap_limit_s=experiment.gap_limit_s, settle_s=options.settle_s)
+    judge.add(replayed.outputs)
+    outcome = summarise(judge)
+    outcome.metrics |= _loads(experiment, replayed.sources)
+    by_loss = _by_loss(runner, options, settled)
     table = network_table(settled.errors)
     for row in table.to_dict("records"):
         for quantity in ("rmse_ratio", "nees"):
@@ -56,7 +61,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.tables |= {"network": table, "loss": by_loss}
     outcome.figures["loss"] = _loss_figure(by_loss)
     outcome.claims = _claims(table, by_loss, options.settle_s)
-    outcome.input_sha256 = hash_streams(sources)
+    outcome.input_sha256 = hash_streams(replayed.sources)
     return outcome
 
 
@@ -113,11 +118,9 @@ def _rule(label: str, values: Mapping[str, Any]) -> str:
     return variant or str(values.get("rule", NetworkParameters().rule))
 
 
-def _by_loss(
-    experiment: Experiment, setting: Setting, options: NetworkOptions, settled: Replayed
-) -> pd.DataFrame:
+def _by_loss(runner: Runner, options: NetworkOptions, settled: Replayed) -> pd.DataFrame:
     """NEES and ratio of some rules over the share of messages that are lost."""
-    assert experiment.record is not None
+    experiment = runner.experiment
     labels = [label for label in experiment.estimators if label in options.loss_rules]
     chosen = {
         label: experiment.estimators[label]
@@ -128,13 +131,7 @@ def _by_loss(
     assert own is not None
     found = {own.parameters["loss_probability"]: network_table(settled.errors)}
     for loss in options.losses:
-        parameters = merge(experiment.record.parameters, {"loss_probability": loss})
-        sources = record_ensemble(
-            experiment.record.scenario, parameters, experiment.seed, experiment.runs, setting.progress
-        )
-        errors = replay_ensemble(
-            sources, chosen, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-        ).errors
+        errors = runner.replay(runner.obtain({"loss_probability": loss}), chosen).errors
         found[loss] = network_table([_after(each, options.settle_s) for each in errors])
     parts = [found[loss].assign(loss=loss) for loss in sorted(found)]
     table = pd.concat(parts, ignore_index=True)

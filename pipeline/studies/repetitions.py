@@ -44,6 +44,14 @@ def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
     return np.sqrt(np.nanmean(values**2, axis=axis))
 
 
+def rmse_of_runs(errors: Errors, runs: int) -> Floats:
+    """The root mean square length of every run's errors (runs,); NaN for a run without any."""
+    squared = np.sum(errors.error**2, axis=1)
+    count = np.bincount(errors.run, minlength=runs)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.bincount(errors.run, squared, runs) / count)
+
+
 def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:
     """How far printed RMSEs (k,) of `runs` runs are from ours, in standard errors, and what is allowed.
 

@@ -5,18 +5,18 @@ experiment's own runs wherever these are simulated.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from pipeline.ensemble import Replayed, hash_streams, record_ensemble, replay_ensemble
-from pipeline.experiment import Experiment, Setting, Study
+from pipeline.ensemble import Replayed, hash_streams
+from pipeline.experiment import Experiment, Record, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome, judged
-from pipeline.studies.localization import obtain, write_logs
+from pipeline.runner import Runner
 from replay.judging.evaluation import split_topic
 from replay.judging.set_evaluation import JudgedSets, frames_of, judge_sets
-from replay.timeline.show import show
 
 EXACT, BOX, L4, L8 = "exact", "box", "l4", "l8"
 FIRST_PAIR, SECTION_V = "section-v-first-pair", "section-v"
@@ -25,25 +25,23 @@ FREE = ".error-free"
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    sources = obtain(experiment, setting)
-    replayed = replay_ensemble(
-        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-    )
-    write_logs(experiment, setting, sources, replayed)
-    found = judge_sets(replayed.outputs, sources, experiment.gap_limit_s)
+    runner = Runner(experiment, setting)
+    replayed = runner.replay(runner.obtain())
+    found = judge_sets(replayed.outputs, replayed.sources, experiment.gap_limit_s)
     outcome = Outcome(tables={"frames": frame_table(found)})
     outcome.metrics |= set_metrics(found)
-    shown = replayed
     if experiment.record is not None:
         outcome.metrics |= _ratios(found)
-        outcome.metrics |= _without_errors(experiment, setting)
-        shown = _section_v(experiment, setting, outcome)
+        outcome.metrics |= _without_errors(runner)
+        shown = _section_v(runner, outcome)
+        runner.keep(replayed.sources, replayed.outputs, drawn=None)
+        runner.draw(shown.sources, shown.outputs)
         outcome.claims = _claims(outcome.metrics)
     else:
         outcome.figures["bounds"] = _bounds_figure(outcome.metrics)
         outcome.claims = [_guarantee(outcome.metrics)]
-    show(shown.sources[0], shown.outputs, shown.errors, save=setting.folder / "timeline.rrd")
-    outcome.input_sha256 = hash_streams(sources)
+        runner.keep(replayed.sources, replayed.outputs)
+    outcome.input_sha256 = hash_streams(replayed.sources)
     return outcome
 
 
@@ -93,17 +91,11 @@ def set_metrics(found: Sequence[JudgedSets]) -> dict[str, MetricValue]:
     return metrics
 
 
-def _without_errors(experiment: Experiment, setting: Setting) -> dict[str, MetricValue]:
+def _without_errors(runner: Runner) -> dict[str, MetricValue]:
     """The ratios of the same scenes where nothing errs: their exact sets are the largest."""
-    assert experiment.record is not None
-    parameters = {**experiment.record.parameters, "error_share": 0.0}
-    sources = record_ensemble(
-        experiment.record.scenario, parameters, experiment.seed, experiment.runs, setting.progress
-    )
-    replayed = replay_ensemble(
-        sources, experiment.estimators, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-    )
-    return _ratios(judge_sets(replayed.outputs, sources, experiment.gap_limit_s), FREE)
+    replayed = runner.replay(runner.obtain({"error_share": 0.0}))
+    gap_limit_s = runner.experiment.gap_limit_s
+    return _ratios(judge_sets(replayed.outputs, replayed.sources, gap_limit_s), FREE)
 
 
 def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValue]:
@@ -118,19 +110,19 @@ def _ratios(found: Sequence[JudgedSets], case: str = "") -> dict[str, MetricValu
     return metrics
 
 
-def _section_v(experiment: Experiment, setting: Setting, outcome: Outcome) -> Replayed:
+def _section_v(runner: Runner, outcome: Outcome) -> Replayed:
     """Record and replay the paper's scene's first pair, then all of it; metrics and pictures."""
+    experiment = runner.experiment
     assert experiment.record is not None
+    bare = Record(scenario=experiment.record.scenario)
+    runner = replace(runner, experiment=experiment.model_copy(update={"record": bare}))
     for case, pairs in ((FIRST_PAIR, 1), (SECTION_V, 3)):
         parameters = {"scene": "section-v", "paper_pairs": pairs}
-        sources = record_ensemble(experiment.record.scenario, parameters, experiment.seed, 1)
         settings = {
             name: {**values, "least_landmarks": 2} for name, values in experiment.estimators.items()
         }
-        replayed = replay_ensemble(
-            sources, settings, gap_limit_s=experiment.gap_limit_s, progress=setting.progress
-        )
-        for each in judge_sets(replayed.outputs, sources, experiment.gap_limit_s):
+        replayed = runner.replay(runner.obtain(parameters, runs=1), settings)
+        for each in judge_sets(replayed.outputs, replayed.sources, experiment.gap_limit_s):
             outcome.metrics[f"{each.estimator}.area_m2.{case}"] = float(each.area_m2[0])
         outcome.figures[case] = _set_figure(replayed, case)
     return replayed

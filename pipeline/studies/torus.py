@@ -17,7 +17,8 @@ from pydantic import PositiveFloat, PositiveInt
 from pipeline.ensemble import Replayed, hash_streams, require_memory
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
-from pipeline.studies.cases import replay_cases, rmse_of_runs
+from pipeline.runner import Runner
+from pipeline.studies.repetitions import rmse_of_runs
 from recorders.errors import BadInput
 from recorders.models.headings import turn_together
 from recorders.models.planar import wrap_angle
@@ -203,7 +204,7 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
     outcome = Outcome()
     sources: list[MemorySource] = []
     errors_rad: dict[str, dict[str, Floats]] = {}
-    for case, replayed in replay_cases(experiment, setting, options.cases or {"all": {}}):
+    for case, replayed in Runner(experiment, setting).cases(options.cases or {"all": {}}):
         found = {
             errors.estimator: rmse_of_runs(errors, len(replayed.sources)) / np.sqrt(2.0)
             for errors in replayed.errors
@@ -213,7 +214,7 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.metrics.update({f"{name}.angle_rmse_rad.{case}": each for name, each in rmse.items()})
         outcome.claims += _filter_claims(case, rmse, options.estimator)
         errors_rad[case] = found
-        sources += replayed.sources  # type: ignore[arg-type]
+        sources += replayed.sources
     outcome.input_sha256 = hash_streams(sources)
     outcome.tables["runs"] = pd.concat(
         [pd.DataFrame({"case": case, **found}) for case, found in errors_rad.items()]

@@ -5,7 +5,7 @@ the symmetric measurement equation filter", 2016.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from pipeline.ensemble import hash_streams, replay_in_memory
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome
-from pipeline.studies.cases import replay_cases
+from pipeline.runner import Runner
 from pipeline.studies.vehicles_cases import (
     TRACK_BYTES,
     Case,
@@ -26,7 +26,6 @@ from pipeline.studies.vehicles_cases import (
 )
 from pipeline.studies.vehicles_claims import claims
 from recorders.errors import BadInput
-from replay.engine.sources import MemorySource
 from replay.estimators.vehicle_bounds import bounds, exact_total_error
 
 
@@ -36,7 +35,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     if options.reference not in experiment.estimators:
         raise BadInput(f"experiment '{experiment.title}': estimator {options.reference} is missing")
     cases: list[Case] = []
-    for name, replayed in replay_cases(experiment, setting, options.cases):
+    for name, replayed in Runner(experiment, setting).cases(options.cases):
         scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators, replayed.sets)
         sent = bytes_per_step(replayed.sources, experiment.estimators)
         cases.append(Case(name, replayed.sources, scores, sent))
@@ -57,9 +56,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.figures[f"errors-{case.name}"] = _figure(case)
     shown = {label: few[label] for label in (options.reference, *options.few) if label in few}
     outcome.metrics |= _metrics(f"{cases[0].name}-first-{options.few_runs}-runs", shown)
-    outcome.input_sha256 = hash_streams(
-        [cast(MemorySource, source) for case in cases for source in case.sources]
-    )
+    outcome.input_sha256 = hash_streams(source for case in cases for source in case.sources)
     return outcome
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from recorders.parameters import Parameters
 from recorders.simulators.vehicles import VehiclesParameters
 from replay.engine.blocks import Ragged
-from replay.engine.sources import Source
+from replay.engine.sources import MemorySource, Source
 from replay.estimators.vehicle_streams import vehicle_numbers
 from replay.estimators.vehicle_updates import split_method
 from replay.judging.label_errors import assigned_squared_error, fixed_squared_error, total_error
@@ -62,7 +62,7 @@ class Case(NamedTuple):
     """One case: its runs, every estimator's scores by label, and what each sends per step in bytes."""
 
     name: str
-    sources: Sequence[Source]
+    sources: Sequence[MemorySource]
     scores: Mapping[str, Scores]
     bytes_per_step: Mapping[str, float]
 

@@ -15,12 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from pydantic import PositiveFloat, PositiveInt
 
-from pipeline.ensemble import hash_streams, judge, record_ensemble, replay_in_memory
-from pipeline.experiment import Experiment, Setting, Study, load_scenario
+from pipeline.ensemble import hash_streams, judge, replay_in_memory
+from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome, judged
+from pipeline.runner import Runner
 from pipeline.studies.vehicles_cases import scores_of
 from recorders.errors import BadInput
-from recorders.parameters import Parameters, merge
+from recorders.parameters import Parameters
 from replay.engine.sources import MemorySource
 
 # Of powers of N, no estimator here needs more than this one.
@@ -66,7 +67,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
                 if options.methods[label].place == place and count <= options.methods[label].most
             }
             if chosen:
-                recorded = _record(experiment, options, count, place)
+                recorded = _record(Runner(experiment, setting), options, count, place)
                 rows += [(label, place, count, *_timed(recorded, label, chosen)) for label in chosen]
                 sources += recorded
     columns = ["estimator", "place", "vehicles", "step_ms", "position_rmse_m", "failed_runs"]
@@ -88,16 +89,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     return outcome
 
 
-def _record(
-    experiment: Experiment, options: ScalingOptions, count: int, place: str
-) -> list[MemorySource]:
-    assert experiment.record is not None
-    recorder, values, _ = load_scenario(experiment.record.scenario)
+def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> list[MemorySource]:
     side = np.sqrt(options.area_per_vehicle_m2 * count) if place == "apart" else options.together_m
     square = (-0.5 * side, 0.5 * side) * 2
-    parameters = merge(values, experiment.record.parameters)
-    parameters = merge(parameters, {"vehicles": count, "field_m": square})
-    return record_ensemble(recorder, parameters, experiment.seed, experiment.runs)
+    return runner.obtain({"vehicles": count, "field_m": square})
 
 
 def _timed(

@@ -95,6 +95,16 @@ def open_log(path: str | Path, *, recover: bool = False) -> Log:
         recover: read what is whole of a file that was cut off or damaged; its index is not believed.
 
     Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+
+    >>> from recorders.log import write_log
+    >>> from recorders.recording import record_run
+    >>> recording, run = record_run("landmarks", {"duration_s": 2.0}, seed=7)
+    >>> write_log("run.mcap", recording.streams, run)
+    >>> log = open_log("run.mcap")
+    >>> log.run.scenario, log.run.seed
+    ('landmarks', 7)
+    >>> log.topics["/robot1/odometry"].messages
+    40
     """
     log = Log(Path(path), open_container(Path(path), use_index=not recover))
     if log.loss_statement and not recover:

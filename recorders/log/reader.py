@@ -45,7 +45,14 @@ def read_streams(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> dict[str, Stream]:
-    """Read topics whole, each in time order; see `read_blocks`. A topic without messages is empty."""
+    """Read topics whole, each in time order; see `read_blocks`. A topic without messages is empty.
+
+    >>> from recorders.log import make_stream, open_log, schemas, write_log
+    >>> seen = make_stream("/range", schemas.RANGE, [20, 0, 10], target_id=[1, 1, 1], range_m=[5, 3, 4])
+    >>> write_log("run.mcap", [seen])
+    >>> read_streams(open_log("run.mcap"), ["/range"], start_ns=10)["/range"]["range_m"].tolist()
+    [4.0, 5.0]
+    """
     blocks = read_blocks(
         log, topics, order=order, start_ns=start_ns, end_ns=end_ns, block_messages=sys.maxsize
     )

@@ -6,10 +6,12 @@ from textwrap import shorten
 from types import NoneType
 from typing import Any
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, check_format
 from recorders.parsing import parse_json
 
 RECORD_NAME = "fuselog.run"
+# Raised when a log is written in a way that this reader would misread; a log without it is of the first.
+FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class RunMetadata:
     def to_record(self) -> dict[str, str]:
         """The text pairs of the MCAP metadata record."""
         return {
+            "format": str(FORMAT),
             "scenario": self.scenario,
             "parameters": json.dumps(self.parameters, sort_keys=True),
             "seed": json.dumps(self.seed),
@@ -40,8 +43,10 @@ class RunMetadata:
 
     @classmethod
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
-        """Read the MCAP metadata record back; raises BadInput where it is damaged."""
+        """Read the MCAP metadata record back; raises BadInput where damaged or of another format."""
         try:
+            written_in = _stated({"format": "1", **record}, "format", int)
+            check_format(path, written_in, FORMAT)
             epoch_ns = _stated(record, "epoch_ns", int)
             notes = _stated(record, "notes", dict)
             if epoch_ns >= 2**63:

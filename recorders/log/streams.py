@@ -20,6 +20,14 @@ class Stream:
     `publish_time_ns` says when the quantity was measured, `log_time_ns` when it reached the recorder,
     both (n,) int64 and never negative. `columns` has one array per schema field, (n,), or (n, width)
     for a vector. `position` is the place in the file, for a stable order among equal stamps.
+
+    >>> from recorders.log import make_stream, schemas
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 2, 1], range_m=[5, 3, 4])
+    >>> len(seen), seen["range_m"].tolist()
+    (3, [5.0, 3.0, 4.0])
+    >>> of_first = seen.take(seen["target_id"] == 1)
+    >>> of_first.publish_time_ns.tolist()
+    [0, 20]
     """
 
     topic: str
@@ -72,6 +80,11 @@ def make_stream(
     Raises BadInput where a column is missing or unknown, has another length, has the wrong number of
     axes, holds NaN that its field does not allow or a number that its type cannot keep (a fraction of a
     nanosecond, say), or a time is negative.
+
+    >>> from recorders.log import schemas
+    >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])
+    Traceback (most recent call last):
+    recorders.errors.BadInput: topic /gyro: field range_m has 1 values for 2 messages
     """
     clock = publish_time_ns if sensor_time_ns is None else sensor_time_ns
     given = {"sensor_time_ns": clock, **columns}

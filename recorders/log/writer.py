@@ -127,7 +127,14 @@ def write_log(
     *,
     compression: str = "zstd",
 ) -> None:
-    """Write one log from streams that are all at hand; see `LogWriter`."""
+    """Write one log from streams that are all at hand; see `LogWriter`.
+
+    >>> from recorders.log import make_stream, open_log, read_streams, schemas
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10], target_id=[1, 2], range_m=[5, 3])
+    >>> write_log("run.mcap", [seen])
+    >>> read_streams(open_log("run.mcap"), ["/range"])["/range"]["range_m"].tolist()
+    [5.0, 3.0]
+    """
     with LogWriter(path, run, compression=compression) as log:
         log.write(streams)
 

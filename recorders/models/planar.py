@@ -14,14 +14,23 @@ Components = Any
 
 
 def wrap_angle(angle: Component) -> Component:
-    """The equal angle in [-pi, pi)."""
+    """The equal angle in [-pi, pi).
+
+    >>> round(float(wrap_angle(3 * np.pi / 2) / np.pi), 12)
+    -0.5
+    """
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def drive(
     pose: Components, velocity: Components, duration_s: Component
 ) -> tuple[Component, Component, Component]:
-    """The pose after `duration_s` at a constant forward velocity (m/s) and turn rate (rad/s): an arc."""
+    """The pose after `duration_s` at a constant forward velocity (m/s) and turn rate (rad/s): an arc.
+
+    >>> quarter_circle = drive((0.0, 0.0, 0.0), (np.pi / 2, np.pi / 2), 1.0)
+    >>> [round(float(each), 6) for each in quarter_circle]
+    [1.0, 1.0, 1.570796]
+    """
     half_turn = 0.5 * velocity[1] * duration_s
     chord = velocity[0] * duration_s * np.sinc(half_turn / np.pi)
     direction = pose[2] + half_turn

@@ -6,6 +6,7 @@ file, and then the content.
 
 import logging
 import os
+from collections.abc import Iterator
 from functools import cache
 from hashlib import sha256
 from importlib.resources.abc import Traversable
@@ -60,6 +61,14 @@ def is_private(folder: Path) -> bool:
 def say_once(sentence: str) -> None:
     """A warning that one process gives once, however often its cause is met."""
     logging.getLogger("fuselog").warning(sentence)
+
+
+def kept_files() -> Iterator[Path]:
+    """The files in this user's cache that fuselog wrote, and that are as it wrote them."""
+    for path in sorted(cache_folder().glob("*/*.bin")):
+        ours = not path.is_symlink() and is_private(path.parent)
+        if ours and read_checked(path) is not None:
+            yield path
 
 
 def read_checked(source: Path | Traversable) -> bytes | None:

@@ -17,6 +17,10 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 
     A component of infinite variance counts nothing. NaN where there are no components, where an error or
     a covariance is NaN, or where a covariance is not positive definite.
+
+    >>> errors = np.array([[1.0, 2.0], [0.0, 1.0]])
+    >>> normalized_error_squared(errors, np.diag([1.0, 4.0])).tolist()
+    [2.0, 0.25]
     """
     size = error.shape[-1]
     error = np.where(np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1)), 0.0, error)

@@ -266,6 +266,39 @@ def recursive(
         follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
             at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
         compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
+
+    The shortest range so far, of everything that was seen:
+
+    >>> class Shortest(NamedTuple):
+    ...     range_m: Floats
+    >>> def start(given):
+    ...     return (), Shortest(np.full((given.runs, 1), 1e9))
+    >>> def follow(run, settings, messages, state, results):
+    ...     for row in range(messages.offsets[run], messages.offsets[run + 1]):
+    ...         state.range_m[run, 0] = min(state.range_m[run, 0], messages.value[row, 1])
+    ...         results.mean[row, 0] = state.range_m[run, 0]
+    ...         results.covariance[row, 0, 0] = 0.01
+    >>> from recorders.parameters import Parameters
+    >>> nearest = recursive(
+    ...     "shortest range so far",
+    ...     parameters=Parameters,
+    ...     streams={"/range": schemas.RANGE},
+    ...     whole={},
+    ...     components={"range_m": "linear"},
+    ...     start=start,
+    ...     follow=follow,
+    ...     compiled=False,
+    ... )
+    >>> from recorders.log import RunMetadata
+    >>> from recorders.recording import Recording
+    >>> from replay.engine.replaying import collect, replay
+    >>> from replay.engine.sources import memory_source
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
+    >>> bound = nearest.bind("nearest", source.topics, Parameters())
+    >>> estimates = collect(replay([source], bound))
+    >>> estimates["/estimates/nearest/state"]["mean"].ravel().tolist()
+    [5.0, 3.0, 3.0]
     """
     if (follow is None) == (follow_all is None):
         raise BadInput(f"estimator '{summary}': give follow or follow_all")
@@ -365,6 +398,31 @@ def batch(
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
         solve: solve(given) gets the streams and whole topics of all runs, by the names asked for;
             `each_run` makes it of a function of one run.
+
+    The mean of all ranges:
+
+    >>> def mean_range(streams, parameters):
+    ...     ranges = streams["/range"]
+    ...     mean, covariance = ranges["range_m"].mean().reshape(1, 1), np.full((1, 1, 1), 0.01)
+    ...     return Estimates(ranges.publish_time_ns[-1:], mean, covariance)
+    >>> from recorders.parameters import Parameters
+    >>> average = batch(
+    ...     "mean range",
+    ...     parameters=Parameters,
+    ...     streams={"/range": schemas.RANGE},
+    ...     whole={},
+    ...     components={"range_m": "linear"},
+    ...     solve=each_run(mean_range),
+    ... )
+    >>> from recorders.log import RunMetadata
+    >>> from recorders.recording import Recording
+    >>> from replay.engine.replaying import collect, replay
+    >>> from replay.engine.sources import memory_source
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
+    >>> estimates = collect(replay([source], average.bind("average", source.topics, Parameters())))
+    >>> estimates["/estimates/average/state"]["mean"].tolist()
+    [[4.0]]
     """
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:

@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from recorders.errors import BadInput
@@ -75,10 +76,10 @@ def replay(
         raise next(iter(refused.values()))
     for bound, watch, given in zip(estimators, watches, states, strict=True):
         if isinstance(bound, Batch):
-            for block in ensemble.blocks(bound.streams, order, sys.maxsize):
+            for block in _required(ensemble, bound.streams, order, sys.maxsize):
                 yield watch.receive(watch.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
-    for block in ensemble.blocks(sorted(streamed), order, block_messages):
+    for block in _required(ensemble, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
         for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
             if isinstance(bound, Recursive):
@@ -169,6 +170,17 @@ def _refuse_old_priors(
                     f"{(start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
                     "to start from with --start-from truth or --start-from ESTIMATES"
                 )
+
+
+def _required(
+    ensemble: Ensemble[Source], topics: Sequence[str], order: Clock, block_messages: int
+) -> Iterator[dict[str, Ragged]]:
+    """The blocks of the ensemble; raises BadInput where no run has a message of the topics."""
+    blocks = ensemble.blocks(topics, order, block_messages)
+    first = next(blocks, None)
+    if first is None and topics:
+        raise BadInput(f"{ensemble[0].name}: no messages on {', '.join(topics)} to replay")
+    yield from chain([first] if first is not None else [], blocks)
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:

@@ -58,6 +58,9 @@ class Source(Protocol):
     ) -> Iterator[dict[str, Stream]]:
         """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
+    def whole(self) -> "Source":
+        """The run without a span."""
+
 
 @dataclass(frozen=True)
 class LogSource:
@@ -116,6 +119,10 @@ class LogSource:
             block_messages=block_messages,
         )
 
+    def whole(self) -> "LogSource":
+        """The whole log."""
+        return LogSource(self.log)
+
 
 @dataclass(frozen=True)
 class MemorySource:
@@ -160,6 +167,10 @@ class MemorySource:
         block = {topic: self.in_order(topic, order) for topic in topics if len(self.streams[topic])}
         if block:
             yield block
+
+    def whole(self) -> "MemorySource":
+        """The recording itself."""
+        return self
 
     def in_order(self, topic: str, order: Clock) -> Stream:
         """A topic by one of the clocks; equal stamps as in the file."""
@@ -238,22 +249,14 @@ class Ensemble(list[SourceType]):
     ) -> Iterator[dict[str, Ragged]]:
         """The next block of every run, until all runs are at their end.
 
-        The runs need not be at the same time: each has its own state. Recordings are one block. Raises
-        BadInput where there is no message at all.
+        The runs need not be at the same time: each has its own state. Recordings are one block.
         """
-        is_empty = bool(topics)
-        for block in self._blocks(topics, order, block_messages) if topics else ():
-            if any(len(ragged) for ragged in block.values()):
-                is_empty = False
-                yield block
-        if is_empty:
-            raise BadInput(f"{self[0].name}: no messages on {', '.join(topics)} to replay")
-
-    def _blocks(
-        self, topics: Sequence[str], order: Clock, block_messages: int
-    ) -> Iterator[dict[str, Ragged]]:
+        if not topics:
+            return
         if self._recordings:
-            yield self._laid_out(topics, order)
+            block = self._laid_out(topics, order)
+            if any(len(ragged) for ragged in block.values()):
+                yield block
             return
         empty = {topic: self[0].empty(topic) for topic in topics}
         ended: dict[str, Stream] = {}

@@ -172,6 +172,34 @@ class Model:
         output: the last part of the estimates' topic.
         system: what a channel's metadata has to name as its `system`, if anything.
         needs_sensor: whether a log without any of its sensors does not fit.
+
+    A thing on a line, whose range from the origin is measured:
+
+    >>> from recorders.log import schemas
+    >>> class OnALine(ModelParameters):
+    ...     sigma_m: float = 0.1
+    >>> def move(state, control, duration_s, parameters):
+    ...     return state[0] + duration_s * state[1], state[1]
+    >>> def move_noise(state, duration_s, parameters):
+    ...     return 0.0, 0.01 * duration_s
+    >>> def measure(state, about, parameters):
+    ...     return (np.abs(state[0]),)
+    >>> def measure_noise(parameters):
+    ...     return (parameters.sigma_m**2,)
+    >>> ranges = Sensor("range", schemas.RANGE, {"range_m": "linear"}, measure, measure_noise)
+    >>> state = {"x_m": "linear", "vx_mps": "linear"}
+    >>> model = Model("on a line", state, OnALine, (ranges,), Motion(move, move_noise, linear=True))
+    >>> model.size, model.kinds
+    (2, ('linear', 'linear'))
+
+    `replay.inference.checking.check_model` says whether the functions keep to what is declared:
+
+    >>> from dataclasses import replace
+    >>> from replay.inference.checking import check_model
+    >>> check_model(model)
+    >>> check_model(replace(model, sensors=(replace(ranges, linear=True),)))
+    Traceback (most recent call last):
+    AssertionError: measure (...) is declared linear, but the derivative of range_m by x_m changes ...
     """
 
     summary: str

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -21,7 +20,8 @@ from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import Source
-from replay.engine.tangent import WIDTHS, are_kinds, between, difference, tangent_components, things
+from replay.engine.tangent import WIDTHS, are_kinds, difference, tangent_components, things
+from replay.judging.truths import Truths, truth_at
 
 Floats = NDArray[np.float64]
 POSITION = ("x_m", "y_m", "z_m")
@@ -71,6 +71,15 @@ class Errors:
         return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
 
 
+# The fields of `Errors` that have an entry per estimate.
+PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
+
+
+def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
+    """Some rows of errors."""
+    return replace(errors, **{name: getattr(errors, name)[rows] for name in PER_ROW})
+
+
 class Innovations(NamedTuple):
     """One innovation stream of an ensemble; `degrees` is the number of measured components.
 
@@ -94,42 +103,42 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Where the mean of `runs` chi-square values lies with this probability if all is well."""
+    """Where the mean of `runs` chi-square values lies with this probability if all is well.
+
+    A mean NEES of 3 components over 50 runs is credible within
+
+    >>> [round(bound, 3) for bound in chi_square_interval(3, 50)]
+    [2.36, 3.716]
+    """
     tail = 0.5 * (1 - probability)
     interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
     return float(interval[0]), float(interval[1])
 
 
-def truth_at(
-    truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
-) -> Floats:
-    """The truth's state (n, d) at any stamps, the shortest way between; NaN over gaps above the limit.
-
-    A stamp that the truth has exactly needs no neighbour.
-    """
-    times = truth.publish_time_ns
-    state = truth["state"]
-    if len(times) == 0:
-        return np.full((len(time_ns), len(kinds)), np.nan)
-    right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
-    left = np.where(times[right] > time_ns, right - 1, right).clip(0)
-    span = times[right] - times[left]
-    weight = (time_ns - times[left]) / np.maximum(span, 1)
-    value = between(state[left], state[right], weight, kinds)
-    inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
-    value[~inside] = np.nan
-    return value
-
-
-def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float = 0.2) -> Errors | None:
+def errors_of(
+    estimates: Ragged,
+    truths: Sequence[Truths],
+    gap_limit_s: float = 0.2,
+    *,
+    steps: NDArray[np.int64] | None = None,
+    first_run: int = 0,
+) -> Errors | None:
     """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
 
     An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, or the
     truths have nothing in common with the estimates (see `unjudged`).
 
+    Args:
+        estimates: the stream, or a block of it.
+        truths: of every run.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        steps: (runs,) how many estimates of each run came before.
+        first_run: the number of the first run.
+
     Raises BadInput where the stream does not say what its components are, or a truth states that one
     is of another kind.
     """
+    sources = [each.source for each in truths]
     stream = estimates.stream
     components = _components(stream)
     truth_topic = stream.metadata.get("truth", "")
@@ -140,8 +149,8 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     names, kinds = list(judged), list(judged.values())
     truth = np.concatenate(
         [
-            reference(source, truth_topic, judged, estimates.of_run(run), gap_limit_s)
-            for run, source in enumerate(sources)
+            reference(truth, truth_topic, judged, estimates.of_run(run), gap_limit_s)
+            for run, truth in enumerate(truths)
         ]
     )
     where = f"topic {stream.topic}"
@@ -153,7 +162,8 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
     known = np.isfinite(error).all(axis=1)
     counts = np.diff(estimates.offsets)
     run = np.repeat(np.arange(len(counts)), counts)
-    step = np.arange(len(stream)) - np.repeat(estimates.offsets[:-1], counts)
+    before = estimates.offsets[:-1] if steps is None else estimates.offsets[:-1] - steps
+    step = np.arange(len(stream)) - np.repeat(before, counts)
     epochs = np.array([source.epoch_ns for source in sources])
     rows = match_tangent(stream.metadata, judged, where)
     covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
@@ -161,7 +171,7 @@ def errors_of(estimates: Ragged, sources: Sequence[Source], gap_limit_s: float =
         *split_topic(stream.topic),
         tuple(name for name, _ in tangent),
         tuple(kind for _, kind in tangent),
-        run[known],
+        first_run + run[known],
         step[known],
         stream.publish_time_ns[known],
         (stream.publish_time_ns - epochs[run])[known] * 1e-9,
@@ -208,77 +218,34 @@ def _components(stream: Stream) -> dict[str, Any]:
 
 
 def reference(
-    source: Source, topic: str, components: Components, estimates: Stream, gap_limit_s: float
+    truths: Truths, topic: str, components: Components, estimates: Stream, gap_limit_s: float
 ) -> Floats:
     """The truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
 
     Raises BadInput where the truth lacks a component.
     """
-    truth = source.read([topic])[topic]
+    times = estimates.publish_time_ns
+    truth = truths.around(topic, times, gap_limit_s, estimates.topic)
     if len(truth) == 0:
         return np.full((len(estimates), len(components)), np.nan)
-    columns = match_components(truth.metadata, components, f"{source.name}: topic {topic}")
+    columns = match_components(truth.metadata, components, f"{truths.source.name}: topic {topic}")
     known = replace(truth, columns={"state": truth["state"][:, columns]})
-    return truth_at(known, estimates.publish_time_ns, list(components.values()), gap_limit_s)
+    return truth_at(known, times, list(components.values()), gap_limit_s)
 
 
-def innovations_of(stream: Ragged) -> Innovations:
-    """The innovations of an ensemble."""
+def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
+    """The innovations of an ensemble whose first run has this number."""
     estimator, case = split_topic(stream.stream.topic)
     return Innovations(
         estimator,
         case,
-        np.repeat(np.arange(stream.runs), np.diff(stream.offsets)),
+        first_run + np.repeat(np.arange(stream.runs), np.diff(stream.offsets)),
         stream.stream.publish_time_ns,
         stream["accepted"] != 0,
         stream["normalised_innovation_squared"],
         np.isfinite(stream["innovation"]).sum(axis=1),
         stream.stream.columns.get("log_likelihood"),
     )
-
-
-def error_table(errors: Errors) -> pd.DataFrame:
-    """One row per run and step: error and sigma of every component, NEES."""
-    sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
-    columns: dict[str, object] = {
-        "estimator": errors.estimator,
-        "case": errors.case,
-        "run": errors.run,
-        "step": errors.step,
-        "time_ns": errors.time_ns,
-        "elapsed_s": errors.elapsed_s,
-    }
-    for index, name in enumerate(errors.components):
-        columns[f"error_{name}"] = errors.error[:, index]
-        columns[f"sigma_{name}"] = sigma[:, index]
-    columns["nees"] = errors.nees
-    return pd.DataFrame(columns)
-
-
-def step_table(errors: Errors, probability: float = 0.95) -> pd.DataFrame:
-    """One row per step over the runs: RMSE of position and components, mean NEES with its interval."""
-    steps, index, runs = np.unique(errors.step, return_inverse=True, return_counts=True)
-    table = pd.DataFrame(
-        {"estimator": errors.estimator, "case": errors.case, "step": steps, "runs": runs}
-    )
-
-    def mean(values: Floats) -> Floats:
-        return np.bincount(index, values, len(runs)) / runs
-
-    table["elapsed_s"] = mean(errors.elapsed_s)
-    if errors.position:
-        table["position_rmse_m"] = np.sqrt(mean(np.sum(errors.error[:, errors.position] ** 2, 1)))
-    if errors.rotation:
-        squared = mean(np.sum(errors.error[:, errors.rotation] ** 2, 1))
-        table["orientation_rmse_deg"] = np.degrees(np.sqrt(squared))
-    for column, name in enumerate(errors.components):
-        table[f"rmse_{name}"] = np.sqrt(mean(errors.error[:, column] ** 2))
-    table["nees"] = mean(errors.nees)
-    size = len(errors.components)
-    bounds = {count: chi_square_interval(size, count, probability) for count in set(runs.tolist())}
-    table["nees_low"] = [bounds[count][0] for count in runs.tolist()]
-    table["nees_high"] = [bounds[count][1] for count in runs.tolist()]
-    return table
 
 
 def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:

@@ -1,7 +1,8 @@
 """Metrics: what an estimator's output says, judged, comes to in numbers.
 
-They register by name, as estimators do. NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 5.4.
+They register by name, as estimators do. A metric is fed block by block, and what it makes of them can be
+merged: over the blocks of a long log, over the runs of an ensemble, over the workers of a campaign. NEES
+and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,73 +16,194 @@ from recorders.registry import available, foreign_code, load
 from replay.engine.blocks import Ragged
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, Floats, Innovations, step_table
+from replay.judging.evaluation import Errors, Floats, Innovations, chi_square_interval
+from replay.judging.sums import BinnedSums
 
 
 class Output(NamedTuple):
-    """One output topic of an estimator, of any schema, and the runs that it was replayed from."""
+    """Messages of one output topic of an estimator, of any schema.
+
+    Row r of a run belongs to `sources[run]`, whose number in the whole ensemble is `first_run` + run.
+    """
 
     estimator: str
     case: str
     leaf: str
     rows: Ragged
     sources: Sequence[Source]
+    first_run: int = 0
 
 
 Judged = TypeVar("Judged", bound=Any)
+State = TypeVar("State", bound=Any)
 
 
 @dataclass(frozen=True)
-class Metric(Generic[Judged]):
-    """A registered metric: what it tells, what it judges, and its numbers as `quantity_unit`.
+class Metric(Generic[Judged, State]):
+    """A registered metric: what it tells, what it judges, and how it comes to its numbers.
 
-    `judges` is `Errors` for what follows from estimates and truth, `SetErrors` for that of sets,
-    `Innovations` for what a filter says of its measurements, and `Output` for all else; no numbers where
-    it has nothing to say.
+    Attributes:
+        summary: what it tells, in a line.
+        judges: `Errors` for what follows from estimates and truth, `SetErrors` for that of sets,
+            `Innovations` for what a filter says of its measurements, `Output` for all else.
+        start: the state before anything was judged.
+        add: the state after one block more; it may change the one that it is handed. The blocks of a
+            run come in time.
+        merge: the state of two parts that have no run in common.
+        finish: a state's numbers as `quantity_unit`; none where there is nothing to say.
+
+    Most metrics are made of sums: see `metric_of_sums`.
     """
 
     summary: str
     judges: type[Judged]
-    compute: Callable[[Judged], Mapping[str, float]]
+    start: Callable[[], State]
+    add: Callable[[State, Judged], State]
+    merge: Callable[[State, State], State]
+    finish: Callable[[State], Mapping[str, float]]
+
+    def of(self, judged: Judged) -> Mapping[str, float]:
+        """The numbers of something that is judged whole."""
+        return self.finish(self.add(self.start(), judged))
 
 
-def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any]]:
+Sums = dict[str, Any]
+
+
+def metric_of_sums(
+    summary: str,
+    judges: type[Judged],
+    sums: Callable[[Judged], Mapping[str, Any]],
+    finish: Callable[[Sums], Mapping[str, float]],
+) -> Metric[Judged, Sums]:
+    """A metric whose state is sums by name.
+
+    Args:
+        summary: what it tells.
+        judges: what it judges.
+        sums: of one block: numbers and arrays, which add up, and sets, which unite.
+        finish: the numbers that follow from the sums over all blocks; {} stands for no block at all.
+
+    >>> from replay.judging.evaluation import Errors
+    >>> def counted(errors):
+    ...     return {"near": int((abs(errors.error) < 1).all(axis=1).sum()), "all": len(errors.error)}
+    >>> near = metric_of_sums(
+    ...     "share of estimates with all errors below 1", Errors, counted,
+    ...     lambda sums: {"near_share": sums["near"] / sums["all"]} if sums.get("all") else {},
+    ... )
+    >>> near.finish(near.merge({"near": 1, "all": 2}, {"near": 3, "all": 6}))
+    {'near_share': 0.5}
+    """
+    return Metric(summary, judges, dict, lambda state, judged: _plus(state, sums(judged)), _plus, finish)
+
+
+def _plus(first: Sums, second: Mapping[str, Any]) -> Sums:
+    total = dict(first)
+    for name, value in second.items():
+        if name not in total:
+            total[name] = value
+        else:
+            total[name] = total[name] | value if isinstance(value, set) else total[name] + value
+    return total
+
+
+def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any, Any]]:
     """The registered metrics of these names, of all where none is given; BadInput for an unknown one."""
     return {name: load("metrics", name, Metric) for name in names or available("metrics")}
 
 
-def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any]]) -> dict[str, float]:
-    """What the metrics say of all that was judged, as `estimator.quantity[.case]`.
+class Measurement:
+    """What metrics make of all that is judged, as it comes.
+
+    What is judged together (one output topic of one estimator) is told by a key.
+    """
+
+    def __init__(self, metrics: Mapping[str, Metric[Any, Any]]) -> None:
+        self._metrics = dict(metrics)
+        self._states: dict[tuple[type, str], dict[str, Any]] = {}
+        self._named: dict[tuple[type, str], tuple[str, str]] = {}
+
+    def add(self, key: str, judged: Any) -> None:
+        """Judge a block; raises BadInput where a metric raises."""
+        place = type(judged), key
+        self._named[place] = judged.estimator, judged.case
+        states = self._states.setdefault(place, {})
+        for name, metric in self._metrics.items():
+            if isinstance(judged, metric.judges):
+                with foreign_code(f"metric {name}"):
+                    state = states[name] if name in states else metric.start()
+                    states[name] = metric.add(state, judged)
+
+    def merge(self, other: "Measurement") -> None:
+        """Take in what was made of other runs by the same metrics."""
+        self._named |= other._named
+        for place, theirs in other._states.items():
+            ours = self._states.setdefault(place, {})
+            for name, state in theirs.items():
+                with foreign_code(f"metric {name}"):
+                    ours[name] = self._metrics[name].merge(ours[name], state) if name in ours else state
+
+    def finish(self, of: Callable[[str], bool] | None = None) -> dict[str, float]:
+        """The numbers, as `estimator.quantity[.case]`, of all keys or of some.
+
+        Errors come first, then innovations. Raises BadInput where a metric raises.
+        """
+        values: dict[str, float] = {}
+        for place in sorted(self._states, key=lambda place: _RANKS.get(place[0], 2)):
+            states = self._states[place]
+            if of is not None and not of(place[1]):
+                continue
+            estimator, case = self._named[place]
+            end = f".{case}" if case else ""
+            for name, state in states.items():
+                with foreign_code(f"metric {name}"):
+                    for quantity, value in self._metrics[name].finish(state).items():
+                        values[f"{estimator}.{quantity}{end}"] = float(value)
+        return values
+
+
+_RANKS: dict[type, int] = {Errors: 0, Innovations: 1, Output: 3}
+
+
+def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> dict[str, float]:
+    """What the metrics say of all that was judged, each whole, as `estimator.quantity[.case]`.
 
     Raises BadInput where a metric raises.
     """
-    values: dict[str, float] = {}
-    for each in judged:
-        for name, metric in metrics.items():
-            if isinstance(each, metric.judges):
-                with foreign_code(f"metric {name}"):
-                    numbers = metric.compute(each)
-                    case = f".{each.case}" if each.case else ""
-                    for quantity, value in numbers.items():
-                        values[f"{each.estimator}.{quantity}{case}"] = float(value)
-    return values
+    measurement = Measurement(metrics)
+    for number, each in enumerate(judged):
+        measurement.add(str(number), each)
+    return measurement.finish()
 
 
-def accuracy(errors: Errors) -> dict[str, float]:
+def squares(errors: Errors) -> Sums:
+    """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
+    found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
+    squared = np.sum(errors.error**2, axis=0)
+    if errors.position:
+        found["position_rmse_m"] = float(squared[errors.position].sum())
+    if errors.rotation:
+        found["orientation_rmse_deg"] = np.degrees(np.degrees(squared[errors.rotation].sum()))
+    for column, name in enumerate(errors.components):
+        if column not in errors.position:
+            found[_rmse_of(name)] = float(squared[column])
+    return found | {_rmse_of(name): np.nan for name in errors.unjudged}
+
+
+def accuracy(sums: Sums) -> dict[str, float]:
     """RMSE of position, orientation and every other component over all runs and steps.
 
     NaN, which is written as null, for a component that the truth lacks.
     """
-    values: dict[str, float] = {}
-    if len(errors.error) and errors.position:
-        values["position_rmse_m"] = _rms(errors.error[:, errors.position])
-    if len(errors.error) and errors.rotation:
-        values["orientation_rmse_deg"] = float(np.degrees(_rms(errors.error[:, errors.rotation])))
-    for column, name in enumerate(errors.components):
-        if len(errors.error) and column not in errors.position:
-            values[_rmse_of(name)] = _rms(errors.error[:, [column]])
-    values |= {_rmse_of(name): np.nan for name in errors.unjudged}
-    return values | {"estimates_without_truth": errors.without_truth}
+    if not sums:
+        return {}
+    count = sums["estimates"]
+    values = {
+        name: float(np.sqrt(value / count)) if count else np.nan
+        for name, value in sums.items()
+        if name not in ("estimates", "estimates_without_truth") and (count or np.isnan(value))
+    }
+    return values | {"estimates_without_truth": sums["estimates_without_truth"]}
 
 
 def _rmse_of(component: str) -> str:
@@ -90,89 +212,193 @@ def _rmse_of(component: str) -> str:
     return f"{quantity}_rmse_{unit}".strip("_")
 
 
-def _rms(error: Floats) -> float:
-    """Root mean square of the length of errors (n, d)."""
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+@dataclass
+class Consistent:
+    """Sums of NEES: over all, and by step over the runs.
+
+    Attributes:
+        count, total: of finite NEES of the state.
+        places, of_places: of the position alone.
+        missing: estimates without a NEES, their covariance being singular.
+        by_step: NEES in one column.
+        components: how many the state has.
+    """
+
+    count: int
+    total: float
+    places: int
+    of_places: float
+    missing: int
+    by_step: BinnedSums
+    components: int
 
 
-def consistency(errors: Errors) -> dict[str, float]:
-    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
-    nees = errors.nees[np.isfinite(errors.nees)]
-    if len(nees) == 0:
-        return {}
-    values = {"nees": float(nees.mean())}
-    if len(nees) < len(errors.nees):  # of singular covariances there is none
-        values["estimates_without_nees"] = float(len(errors.nees) - len(nees))
+def _no_nees() -> Consistent:
+    return Consistent(0, 0.0, 0, 0.0, 0, BinnedSums(1), 0)
+
+
+def _add_nees(state: Consistent, errors: Errors) -> Consistent:
+    finite = np.isfinite(errors.nees)
+    state.count += int(finite.sum())
+    state.total += float(errors.nees[finite].sum())
+    state.missing += int((~finite).sum())
+    state.components = len(errors.components)
     if errors.position and len(errors.position) < len(errors.components):
         block = errors.covariance[:, errors.position][:, :, errors.position]
         squared = normalized_error_squared(errors.error[:, errors.position], block)
-        values["position_nees"] = float(np.nanmean(squared))
-    table = step_table(errors)
-    inside = (table["nees"] >= table["nees_low"]) & (table["nees"] <= table["nees_high"])
-    values["nees_steps_within_95"] = float(inside.mean())
+        known = squared[np.isfinite(squared)]
+        state.places += len(known)
+        state.of_places += float(known.sum())
+    state.by_step.add(errors.step, errors.nees[:, None])
+    return state
+
+
+def _merge_nees(first: Consistent, second: Consistent) -> Consistent:
+    first.count += second.count
+    first.total += second.total
+    first.places += second.places
+    first.of_places += second.of_places
+    first.missing += second.missing
+    first.components = max(first.components, second.components)
+    first.by_step.merge(second.by_step)
+    return first
+
+
+def consistency(state: Consistent) -> dict[str, float]:
+    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
+    if state.count == 0:
+        return {}
+    values = {"nees": state.total / state.count}
+    if state.missing:  # of singular covariances there is none
+        values["estimates_without_nees"] = float(state.missing)
+    if state.places:
+        values["position_nees"] = state.of_places / state.places
+    _, runs, sums = state.by_step.filled()
+    low, high = step_bounds(runs, state.components)
+    nees = sums[:, 0] / runs
+    values["nees_steps_within_95"] = float(((nees >= low) & (nees <= high)).mean())
     return values
 
 
-def innovation(innovations: Innovations) -> dict[str, float]:
-    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
-    if len(innovations.squared) == 0:
-        return {}
+def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Floats, Floats]:
+    """Where the mean NEES of `size` components lies over so many runs (n,): low and high (n,)."""
+    counts, place = np.unique(runs, return_inverse=True)
+    bounds = np.array([chi_square_interval(size, int(count), probability) for count in counts])
+    return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
+
+
+def _nis(innovations: Innovations) -> Sums:
     return {
-        "nis_per_component": float(innovations.squared.sum() / innovations.degrees.sum()),
-        "gated_share": float(1 - innovations.accepted.mean()),
+        "messages": len(innovations.squared),
+        "squared": float(innovations.squared.sum()),
+        "degrees": int(innovations.degrees.sum()),
+        "accepted": int(innovations.accepted.sum()),
     }
 
 
-def likelihood(innovations: Innovations) -> dict[str, float]:
+def innovation(sums: Sums) -> dict[str, float]:
+    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
+    if not sums.get("messages"):
+        return {}
+    return {
+        "nis_per_component": sums["squared"] / sums["degrees"],
+        "gated_share": 1 - sums["accepted"] / sums["messages"],
+    }
+
+
+def _log_likelihoods(innovations: Innovations) -> Sums:
+    """NaN where one of what was let in is not stated."""
+    stated = innovations.log_likelihood
+    let_in = np.array([np.nan]) if stated is None else stated[innovations.accepted]
+    return {"log_likelihood": float(let_in.sum()), "runs": set(np.unique(innovations.run).tolist())}
+
+
+def likelihood(sums: Sums) -> dict[str, float]:
     """The log-likelihood of a run's measurements as the filter predicted them: the mean over the runs.
 
     Of the measurements that a gate let in alone, so that it is no measure to tune a gate by. Nothing
     where the estimator does not state it of all of them.
     """
-    stated = innovations.log_likelihood
-    if stated is None or not len(stated) or not np.isfinite(stated[innovations.accepted]).all():
+    if not sums.get("runs") or not np.isfinite(sums["log_likelihood"]):
         return {}
-    runs = len(np.unique(innovations.run))
-    return {"log_likelihood": float(stated[innovations.accepted].sum() / runs)}
+    return {"log_likelihood": sums["log_likelihood"] / len(sums["runs"])}
 
 
-def failures(output: Output) -> dict[str, float]:
-    """How many runs failed."""
+def _failed(output: Output) -> Sums:
     if output.rows.stream.schema.full_name != schemas.FAILURE.full_name:
         return {}
-    return {"failed_runs": float(np.count_nonzero(np.diff(output.rows.offsets)))}
+    return {"runs": set((output.first_run + np.flatnonzero(np.diff(output.rows.offsets))).tolist())}
 
 
-def estimated_share(coverage: Ragged) -> float | None:
-    """The share of the runs' spans for which there are estimates; None where there is no span."""
-    spans_s = (coverage["end_time_ns"] - coverage.stream.publish_time_ns).sum() * 1e-9
-    return float(min(coverage["estimated_s"].sum() / spans_s, 1.0)) if spans_s > 0 else None
+def failures(sums: Sums) -> dict[str, float]:
+    """How many runs failed."""
+    return {"failed_runs": float(len(sums["runs"]))} if sums else {}
 
 
-def coverage(output: Output) -> dict[str, float]:
-    """What share of the span the other figures are of, and how many measurements were not used."""
+def covered(output: Output) -> Sums:
+    """Of the runs' spans, how many seconds there are and were estimated; measurements not used."""
     schema = output.rows.stream.schema.full_name
     if schema == schemas.SKIPPED.full_name:
-        return {"skipped_measurements": float(len(output.rows))}
-    share = estimated_share(output.rows) if schema == schemas.COVERAGE.full_name else None
+        return {"skipped": len(output.rows)}
+    if schema != schemas.COVERAGE.full_name:
+        return {}
+    spans_ns = output.rows["end_time_ns"] - output.rows.stream.publish_time_ns
+    return {
+        "span_s": float(spans_ns.sum() * 1e-9),
+        "estimated_s": float(output.rows["estimated_s"].sum()),
+    }
+
+
+def coverage(sums: Sums) -> dict[str, float]:
+    """What share of the span the other figures are of, and how many measurements were not used."""
+    if "skipped" in sums:
+        return {"skipped_measurements": float(sums["skipped"])}
+    share = estimated_share(sums)
     return {} if share is None else {"estimated_share": share}
 
 
-def solution(output: Output) -> dict[str, float]:
-    """How the batch solutions ended: the share that converged, and the most iterations of one."""
-    if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name or len(output.rows) == 0:
+def estimated_share(sums: Sums) -> float | None:
+    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
+
+
+def _solved(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name:
         return {}
-    converged, iterations = output.rows["converged"] != 0, output.rows["iterations"]
-    values = {"converged_share": float(converged.mean())}
-    if converged.any():
-        values["most_iterations"] = float(iterations[converged].max())
+    converged = output.rows["converged"] != 0
+    return {
+        "solutions": len(converged),
+        "converged": int(converged.sum()),
+        "iterations": set(output.rows["iterations"][converged].tolist()),
+    }
+
+
+def solution(sums: Sums) -> dict[str, float]:
+    """How the batch solutions ended: the share that converged, and the most iterations of one."""
+    if not sums.get("solutions"):
+        return {}
+    values = {"converged_share": sums["converged"] / sums["solutions"]}
+    if sums["iterations"]:
+        values["most_iterations"] = float(max(sums["iterations"]))
     return values
 
 
-ACCURACY = Metric("RMSE of position and other components against truth", Errors, accuracy)
-CONSISTENCY = Metric("NEES against its chi-square bounds", Errors, consistency)
-INNOVATION = Metric("NIS, and the share of measurements that a gate kept out", Innovations, innovation)
-LIKELIHOOD = Metric("log-likelihood of the measurements, per run", Innovations, likelihood)
-FAILURES = Metric("how many runs an estimator could not follow to the end", Output, failures)
-COVERAGE = Metric("what share of the span was estimated, and what was not used", Output, coverage)
-SOLUTION = Metric("how many batch solutions converged, and how fast", Output, solution)
+ACCURACY = metric_of_sums(
+    "RMSE of position and other components against truth", Errors, squares, accuracy
+)
+CONSISTENCY = Metric(
+    "NEES against its chi-square bounds", Errors, _no_nees, _add_nees, _merge_nees, consistency
+)
+INNOVATION = metric_of_sums(
+    "NIS, and the share of measurements that a gate kept out", Innovations, _nis, innovation
+)
+LIKELIHOOD = metric_of_sums(
+    "log-likelihood of the measurements, per run", Innovations, _log_likelihoods, likelihood
+)
+FAILURES = metric_of_sums(
+    "how many runs an estimator could not follow to the end", Output, _failed, failures
+)
+COVERAGE = metric_of_sums(
+    "what share of the span was estimated, and what was not used", Output, covered, coverage
+)
+SOLUTION = metric_of_sums("how many batch solutions converged, and how fast", Output, _solved, solution)

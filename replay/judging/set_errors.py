@@ -5,7 +5,7 @@ set at a time are all things whose truth has the estimate's components and is kn
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.engine.blocks import Ragged
-from replay.engine.sources import Source
-from replay.judging.evaluation import POSITION, split_topic, truth_at
-from replay.judging.metrics import Metric
+from replay.engine.components import Components
+from replay.judging.evaluation import POSITION, reference, split_topic
+from replay.judging.metrics import Sums, metric_of_sums
 from replay.judging.set_distances import gospa, ospa
+from replay.judging.truths import Truths
 
 Floats = NDArray[np.float64]
 CUTOFF_M = 10.0
@@ -47,63 +48,69 @@ class SetErrors(NamedTuple):
 
 def set_errors(
     outputs: Mapping[str, Ragged],
-    sources: Sequence[Source],
+    truths: Sequence[Truths],
     *,
     cutoff_m: float = CUTOFF_M,
     gap_limit_s: float = 0.2,
-) -> list[SetErrors]:
-    """Judge every set estimate among a replay's outputs whose things have truths in all runs."""
-    found = []
+    first_run: int = 0,
+) -> dict[str, SetErrors]:
+    """Judge every set estimate, by its topic, among a replay's outputs, or a block of them.
+
+    Left out are those whose things have no truths in some run; `first_run` is the number of the first.
+    """
+    found = {}
     for topic, sizes in outputs.items():
         elements = outputs.get(f"{topic.rpartition('/')[0]}/element")
         if sizes.stream.schema.full_name != schemas.ESTIMATE_SIZE.full_name or elements is None:
             continue
         components = sizes.stream.components
-        truths = [_truths(source, components) for source in sources]
-        if components and all(truths):
+        things = [_things(each, components) for each in truths]
+        if components and all(things):
+            judge = partial(_judge_run, cutoff_m=cutoff_m, gap_limit_s=gap_limit_s)
             runs = [
-                _judge_run(sizes.of_run(run), elements.of_run(run), truths[run], cutoff_m, gap_limit_s)
-                for run in range(len(sources))
+                judge(sizes.of_run(run), elements.of_run(run), things[run], truths[run])
+                for run in range(len(truths))
             ]
             number = np.repeat(np.arange(len(runs)), [len(each) for each in runs])
             time_ns = sizes.stream.publish_time_ns
-            epochs = np.array([source.epoch_ns for source in sources])
+            epochs = np.array([each.source.epoch_ns for each in truths])
             elapsed_s = (time_ns - epochs[number]) * 1e-9
             rows = np.concatenate(runs)
             judged = (*rows[:, :6].T, *rows[:, 6:].T.astype(np.int64))
-            found.append(SetErrors(*split_topic(topic), number, time_ns, elapsed_s, *judged))
+            run_number = first_run + number
+            found[topic] = SetErrors(*split_topic(topic), run_number, time_ns, elapsed_s, *judged)
     return found
 
 
-def _truths(source: Source, components: Sequence[str]) -> list[Stream]:
-    """The truths of things that have exactly these components, put into their order."""
-    topics = [
-        topic.name
-        for topic in source.topics.values()
-        if topic.schema_name == schemas.TRUTH_STATE.full_name
-        and sorted(topic.metadata.get("components", "").split(",")) == sorted(components)
+def _things(truths: Truths, components: Sequence[str]) -> list[str]:
+    """The topics of things whose truths have exactly these components."""
+    stated = truths.source.topics
+    return [
+        topic
+        for topic in truths.topics
+        if sorted(stated[topic].metadata.get("components", "").split(",")) == sorted(components)
     ]
-    found = []
-    for truth in source.read(topics).values():
-        columns = [truth.components.index(name) for name in components]
-        state = truth["state"].reshape(-1, len(components))[:, columns]
-        found.append(replace(truth, columns={**truth.columns, "state": state}))
-    return found
 
 
 def _judge_run(
-    sizes: Stream, elements: Stream, truths: Sequence[Stream], cutoff_m: float, gap_limit_s: float
+    sizes: Stream,
+    elements: Stream,
+    things: Sequence[str],
+    truths: Truths,
+    *,
+    cutoff_m: float,
+    gap_limit_s: float,
 ) -> Floats:
     """Rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
-    components = sizes.components
-    place = [components.index(name) for name in POSITION if name in components]
-    kinds = ["linear"] * len(components)
-    states = [truth_at(each, sizes.publish_time_ns, kinds, gap_limit_s) for each in truths]
-    true = np.stack(states, axis=1)[..., place]
+    place = [name for name in POSITION if name in sizes.components]
+    state: Components = dict.fromkeys(place, "linear")
+    states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in things]
+    true = np.stack(states, axis=1)
+    columns = [sizes.components.index(name) for name in place]
     ends = np.cumsum(sizes["elements"].astype(np.int64))
     rows = np.empty((len(sizes), 7))
     for step, end in enumerate(ends):
-        estimated = elements["mean"][end - sizes["elements"][step] : end][:, place]
+        estimated = elements["mean"][end - sizes["elements"][step] : end][:, columns]
         there = true[step][np.isfinite(true[step]).all(axis=1)]
         parts = gospa(estimated, there, cutoff_m, ORDER)
         counts = len(estimated), len(there)
@@ -116,18 +123,33 @@ def set_table(found: SetErrors) -> pd.DataFrame:
     return pd.DataFrame(found._asdict())
 
 
-def _measure(found: SetErrors) -> dict[str, float]:
-    if len(found.run) == 0:
-        return {}
-    per_thing = CUTOFF_M**ORDER / 2.0
+def _sums(found: SetErrors) -> Sums:
     return {
-        "ospa_m": float(found.ospa.mean()),
-        "gospa_m": float(found.gospa.mean()),
-        "gospa_localisation_m": float(np.sqrt(found.localisation.mean())),
-        "missed_things": float(found.missed.mean() / per_thing),
-        "false_things": float(found.false.mean() / per_thing),
-        "cardinality_error_things": float((found.estimated - found.true).mean()),
+        "steps": len(found.run),
+        "ospa": float(found.ospa.sum()),
+        "gospa": float(found.gospa.sum()),
+        "localisation": float(found.localisation.sum()),
+        "missed": float(found.missed.sum()),
+        "false": float(found.false.sum()),
+        "excess": int((found.estimated - found.true).sum()),
     }
 
 
-SETS = Metric("OSPA and GOSPA with its parts of estimated sets, cutoff 10 m", SetErrors, _measure)
+def _means(sums: Sums) -> dict[str, float]:
+    steps = sums.get("steps")
+    if not steps:
+        return {}
+    per_thing = CUTOFF_M**ORDER / 2.0
+    return {
+        "ospa_m": sums["ospa"] / steps,
+        "gospa_m": sums["gospa"] / steps,
+        "gospa_localisation_m": float(np.sqrt(sums["localisation"] / steps)),
+        "missed_things": sums["missed"] / steps / per_thing,
+        "false_things": sums["false"] / steps / per_thing,
+        "cardinality_error_things": sums["excess"] / steps,
+    }
+
+
+SETS = metric_of_sums(
+    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m", SetErrors, _sums, _means
+)

@@ -14,6 +14,7 @@ from replay.engine.sources import Source
 from replay.estimators.feasible_sets import excess_rad, signed_area
 from replay.estimators.set_membership import Known, frames
 from replay.judging.evaluation import reference, split_topic
+from replay.judging.truths import Truths
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def _judge(
     run = np.repeat(np.arange(sizes.runs), np.diff(sizes.offsets))
     topic = sizes.stream.metadata["truth"]
     truth = [
-        reference(source, topic, PLACE, sizes.of_run(number), gap_limit_s)
+        reference(Truths(source), topic, PLACE, sizes.of_run(number), gap_limit_s)
         for number, source in enumerate(sources)
     ]
     places = np.concatenate(truth)

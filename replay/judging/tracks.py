@@ -4,6 +4,7 @@ A thing's own track is found by assigning tracks to things one to one, so that a
 are in the track of their thing: a track that swallows two things counts for one of them.
 """
 
+import operator
 from typing import NamedTuple
 
 import numpy as np
@@ -90,20 +91,26 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
     return at_ns, began - np.searchsorted(np.sort(end_ns), at_ns, side="right")
 
 
-def track_tables(output: Output) -> list[pd.DataFrame]:
-    """A table per run of a stream of tracks; none where the log does not say whose the reports are.
+Reports = dict[int, list[tuple[Integers, Integers]]]
+
+
+def reports_of(output: Output) -> Reports:
+    """Of every run the true things and the tracks (n,) of its reports; {} where that is not known.
 
     The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
+    Raises BadInput where the log is not the one that these are estimates of.
     """
     stream = output.rows.stream
-    if stream.schema.full_name != schemas.TRACK_ESTIMATE.full_name:
-        return []
     topic = f"{stream.metadata.get('reports', '').rpartition('/')[0]}/{IDENTITY}"
-    tables = []
+    is_known = all(topic in source.topics for source in output.sources)
+    if stream.schema.full_name != schemas.TRACK_ESTIMATE.full_name or not is_known:
+        return {}
+    found: Reports = {}
     for run, source in enumerate(output.sources):
-        if topic not in source.topics or output.rows.offsets[run] == output.rows.offsets[run + 1]:
-            return []
         tracks = output.rows.of_run(run)
+        found[output.first_run + run] = []
+        if len(tracks) == 0:
+            continue
         identity = source.read([topic])[topic]
         times, [first_ns, last_ns] = identity.publish_time_ns, tracks.publish_time_ns[[0, -1]]
         things = identity["thing_id"][(times >= first_ns) & (times <= last_ns)]
@@ -112,25 +119,50 @@ def track_tables(output: Output) -> list[pd.DataFrame]:
                 f"{source.name}: {len(things)} identities for {len(tracks)} reports on {stream.topic}; "
                 "give the log that these are estimates of"
             )
-        tables.append(track_table(things.astype(np.int64), tracks["track_id"].astype(np.int64)))
-    return tables
+        both = things.astype(np.int64), tracks["track_id"].astype(np.int64)
+        found[output.first_run + run].append(both)
+    return found
 
 
-def _measure(output: Output) -> dict[str, float]:
-    tables = track_tables(output)
+def track_tables(reports: Reports) -> list[pd.DataFrame]:
+    """A table per run; none where a run has no reports."""
+    if not all(reports.values()):
+        return []
+    return [
+        track_table(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        for parts in reports.values()
+    ]
+
+
+def _add(state: Reports, output: Output) -> Reports:
+    for run, parts in reports_of(output).items():
+        state.setdefault(run, []).extend(parts)
+    return state
+
+
+def _finish(reports: Reports) -> dict[str, float]:
+    tables = track_tables(reports)
     if not tables:
         return {}
     found = pd.concat(tables)
     own, largest = kept(found), kept(found, "largest_share")
+    tracks = np.concatenate([each for parts in reports.values() for _, each in parts])
     return {
         "judged_things": own.things,
         "kept_track_percent": 100.0 * own.kept_share,
         "kept_largest_percent": 100.0 * largest.kept_share,
         "own_track_mean_percent": 100.0 * own.mean_share,
         "largest_track_mean_percent": 100.0 * largest.mean_share,
-        "tracks": float(np.unique(output.rows["track_id"]).size),
+        "tracks": float(np.unique(tracks).size),
         "switches": float(found["switches"].sum()),
     }
 
 
-TRACKS = Metric("how things with more than 50 reports kept one track of their own", Output, _measure)
+TRACKS = Metric(
+    "how things with more than 50 reports kept one track of their own",
+    Output,
+    dict,
+    _add,
+    operator.or_,
+    _finish,
+)

@@ -5,12 +5,14 @@ Computer Speech & Language 2006. Scores are alike where they are great; a compar
 its score is not below the threshold.
 """
 
+import operator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.log import Stream, schemas
+from recorders.log.streams import concatenate
 from replay.judging.metrics import Metric, Output
 
 Floats = NDArray[np.float64]
@@ -140,13 +142,21 @@ def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> 
     return results
 
 
-def _measure(output: Output) -> dict[str, float]:
-    """Rates of a fusion, means over the runs; nothing of other outputs."""
-    stream = output.rows.stream
-    if stream.schema.full_name != schemas.SCORE_VECTOR.full_name or output.leaf != "fused":
-        return {}
-    runs = [_rates(fused_of(output.rows.of_run(run))) for run in range(output.rows.runs)]
-    return {name: float(np.mean([run[name] for run in runs])) for name in runs[0]}
+Runs = dict[int, list[Stream]]
+
+
+def _add(state: Runs, output: Output) -> Runs:
+    """The fused scores of every run; nothing of other outputs."""
+    if output.rows.stream.schema.full_name == schemas.SCORE_VECTOR.full_name and output.leaf == "fused":
+        for run in range(output.rows.runs):
+            state.setdefault(output.first_run + run, []).append(output.rows.of_run(run))
+    return state
+
+
+def _means(state: Runs) -> dict[str, float]:
+    """Rates of a fusion, means over the runs."""
+    runs = [_rates(fused_of(concatenate(parts))) for parts in state.values()]
+    return {name: float(np.mean([run[name] for run in runs])) for name in runs[0]} if runs else {}
 
 
 def _rates(fused: Fused) -> dict[str, float]:
@@ -170,4 +180,6 @@ def _rates(fused: Fused) -> dict[str, float]:
     return values
 
 
-VERIFICATION = Metric("verification and identification rates of fused scores", Output, _measure)
+VERIFICATION = Metric(
+    "verification and identification rates of fused scores", Output, dict, _add, operator.or_, _means
+)

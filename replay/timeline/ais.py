@@ -14,7 +14,7 @@ from recorders.log import Stream, schemas
 from replay.engine.blocks import gather
 from replay.judging.evaluation import Floats
 from replay.judging.metrics import Output
-from replay.judging.tracks import live_counts, track_tables
+from replay.judging.tracks import live_counts, reports_of, track_tables
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, escaped, thin
 from replay.timeline.plane import ROOT, plane_view, trail_of, turn_up
 from replay.timeline.plots import LINE, plot_view
@@ -128,7 +128,7 @@ def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.
     """Vessels with their shares, most reports first."""
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
-    for table in track_tables(output):
+    for table in track_tables(reports_of(output)):
         shown = table[["thing", "reports", "share", "tracks", "switches"]][:LISTED_VESSELS]
         for thing, reports, share, count, switches in shown.itertuples(index=False):
             lines.append(f"|{thing}|{reports}|{share:.3f}|{count}|{switches}|")

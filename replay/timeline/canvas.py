@@ -143,16 +143,18 @@ class Canvas:
         epoch_ns: the run's time zero.
         end_ns: when the last estimate or truth is.
         steps_ns: the distinct times of estimates, which `step` counts.
+        is_still: nothing that moves is sent: it is there already.
     """
 
     recording: rr.RecordingStream
     epoch_ns: int
     end_ns: int
     steps_ns: Times
+    is_still: bool = False
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
         """Send the rows of one entity, all at once."""
-        if len(time_ns) == 0:
+        if len(time_ns) == 0 or self.is_still:
             return
         step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
         index = [

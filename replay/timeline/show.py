@@ -1,22 +1,132 @@
 """Shows one run of a replay in Rerun: in a file, in a live viewer, or both from one pass."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.errors import BadInput, choices, printable
+from recorders.log import Stream
 from recorders.registry import available, load
 from replay.engine.blocks import Ragged, gather
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors
-from replay.timeline.canvas import Canvas, Scene, Timeline
+from replay.judging.evaluation import Errors, errors_at
+from replay.timeline.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from replay.timeline.generic import TIMELINE as GENERIC
 from replay.timeline.sinks import open_recording
+from replay.timeline.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
+
+# A receiver is sent so many messages of outputs at once.
+LIVE_MESSAGES = 20_000
+
+
+class Drawing:
+    """The timeline of one run, drawn while it is replayed.
+
+    A receiver is sent every block as it comes. A file is drawn when all is there, from what is kept: the
+    run itself while it is short, else evenly in time. Use it as a context: it is finished at the end,
+    unless something was raised.
+
+    Args:
+        source: the run.
+        identity: what tells this recording from others; a viewer mixes those of one identity.
+        focus: the case that is seen first, such as `robot3`.
+        save: the .rrd file to write.
+        connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
+
+    Raises BadInput where neither is given or a sink fails (see `open_recording`), or there is no such
+    focus.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        identity: str,
+        focus: str | None = None,
+        save: Path | None = None,
+        connect: str | None = None,
+    ) -> None:
+        if save is None and connect is None:
+            raise BadInput(
+                "a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both"
+            )
+        self._source, self._focus, self._save = source, focus, save
+        scenario = source.run.scenario if source.run else ""
+        known = available("timelines")
+        self._timeline: Timeline = load("timelines", scenario) if scenario in known else GENERIC
+        self._names = (
+            f"fuselog-{scenario}" if scenario else "fuselog",
+            hashlib.sha256(f"{source.run or source.name}{identity}".encode()).hexdigest()[:16],
+        )
+        self._sensed = Sensed(source, is_live=connect is not None)
+        self._kept = Thin(KEPT_ROWS, KEPT_ERRORS)
+        self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
+        self._sent = 0
+        self._stack = ExitStack()
+        self._live = None
+        if connect is not None:
+            self._live = self._stack.enter_context(open_recording(*self._names, connect=connect))
+            self._live.send_recording_name(printable(source.name))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool | None:
+        if error is None:
+            self._finish()
+        return self._stack.__exit__(kind, error, traceback)
+
+    def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
+        """Take in a block of the run's outputs, and the errors of its estimates."""
+        self._kept.add(outputs, errors)
+        if self._live is not None:
+            self._fresh.add(outputs, errors)
+            if self._fresh.added >= LIVE_MESSAGES:
+                self._send(self._live, self._fresh.last_ns)
+
+    def _send(self, live: rr.RecordingStream, until_ns: int) -> None:
+        """Send what has come since the last time, and what was sensed up to a stamp."""
+        sensed = self._sensed.read_to(until_ns)
+        self._draw(live, Scene(sensed, self._fresh.outputs, self._fresh.errors, self._focus))
+        self._fresh = Thin(DRAWN_ROWS, DRAWN_ROWS)
+        self._sent += 1
+
+    def _finish(self) -> None:
+        if self._live is not None:
+            self._send(self._live, np.iinfo(np.int64).max)
+        scene = Scene(self._sensed.all(), self._kept.outputs, self._kept.errors, self._focus)
+        if self._live is not None and self._sent > 1:  # what moves is there; ranges are of the last part
+            self._draw(self._live, scene, is_still=True)
+        if self._save is not None:
+            with open_recording(*self._names, save=self._save) as recording:
+                recording.send_recording_name(printable(self._source.name))
+                self._draw(recording, scene)
+
+    def _draw(self, recording: rr.RecordingStream, scene: Scene, *, is_still: bool = False) -> None:
+        if self._focus is not None and self._focus not in scene.cases:
+            known = choices(self._focus, scene.cases)
+            raise BadInput(f"nothing called '{self._focus}' to show; {known}")
+        canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
+        layout = self._timeline.draw(canvas, scene)
+        recording.send_blueprint(
+            rrb.Blueprint(
+                layout,
+                rrb.TimePanel(timeline="sim_time", state="collapsed"),
+                collapse_panels=True,
+            )
+        )
 
 
 def show(
@@ -46,22 +156,9 @@ def show(
     if not 0 <= run < runs:
         raise BadInput(f"no run {run} to show; the runs are 0 to {runs - 1}")
     of_run = {topic: ragged.of_run(run) for topic, ragged in outputs.items()}
-    scene = Scene(source, of_run, [_errors_of_run(each, run) for each in errors], focus)
-    if focus is not None and focus not in scene.cases:
-        raise BadInput(f"nothing called '{focus}' to show; {choices(focus, scene.cases)}")
-    scenario = source.run.scenario if source.run else ""
-    timeline: Timeline = load("timelines", scenario) if scenario in available("timelines") else GENERIC
-    application = f"fuselog-{scenario}" if scenario else "fuselog"
-    with open_recording(application, _identity(scene), save=save, connect=connect) as recording:
-        recording.send_recording_name(printable(source.name))
-        layout = timeline.draw(_canvas(scene, recording), scene)
-        recording.send_blueprint(
-            rrb.Blueprint(
-                layout,
-                rrb.TimePanel(timeline="sim_time", state="collapsed"),
-                collapse_panels=True,
-            )
-        )
+    own = [errors_at(each, each.run == run) for each in errors]
+    with Drawing(source, identity=_identity(of_run), focus=focus, save=save, connect=connect) as drawing:
+        drawing.add(of_run, own)
 
 
 def recorded_outputs(source: Source) -> dict[str, Ragged]:
@@ -70,28 +167,22 @@ def recorded_outputs(source: Source) -> dict[str, Ragged]:
     return {topic: gather([stream]) for topic, stream in source.read(topics).items()}
 
 
-def _errors_of_run(errors: Errors, run: int) -> Errors:
-    rows = errors.run == run
-    per_row = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
-    return replace(errors, **{name: getattr(errors, name)[rows] for name in per_row})
-
-
-def _canvas(scene: Scene, recording: rr.RecordingStream) -> Canvas:
+def _canvas(
+    scene: Scene, recording: rr.RecordingStream, estimates: Iterable[Stream], is_still: bool
+) -> Canvas:
     epoch_ns = scene.source.epoch_ns
     none = np.empty(0, np.int64)
-    steps_ns = np.unique(
-        np.concatenate([none, *(each.publish_time_ns for each in scene.outputs.values())])
-    )
+    steps_ns = np.unique(np.concatenate([none, *(each.publish_time_ns for each in estimates)]))
     truths = [truth.publish_time_ns[-1:] for case in scene.cases for truth in scene.truths_of(case)]
     end_ns = int(np.concatenate([[epoch_ns], steps_ns[-1:], *truths]).max())
-    return Canvas(recording, epoch_ns, end_ns, steps_ns)
+    return Canvas(recording, epoch_ns, end_ns, steps_ns, is_still)
 
 
-def _identity(scene: Scene) -> str:
-    """A recording's id: the run and what was estimated, so that a viewer never mixes two replays."""
-    digest = hashlib.sha256(repr(scene.source.run or scene.source.name).encode())
-    for topic, stream in scene.outputs.items():
+def _identity(outputs: Mapping[str, Stream]) -> str:
+    """What was estimated, in short."""
+    digest = hashlib.sha256()
+    for topic, stream in outputs.items():
         digest.update(topic.encode())
         for column in (stream.publish_time_ns, *stream.columns.values()):
             digest.update(np.ascontiguousarray(column).tobytes())
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()

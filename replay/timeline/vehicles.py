@@ -18,6 +18,7 @@ from replay.engine.blocks import gather
 from replay.judging.evaluation import Floats
 from replay.judging.label_errors import assigned_squared_error, fixed_squared_error
 from replay.judging.set_errors import CUTOFF_M, set_errors
+from replay.judging.truths import Truths
 from replay.timeline.canvas import (
     MUTED,
     TRUTH,
@@ -290,7 +291,7 @@ def _draw_errors(
         draw_curve(canvas, "plots/error", name, *curve, errors, LINE)
         draw_curve(canvas, "plots/gospa", name, *curve, gospa, LINE)
     outputs = {topic: gather([stream]) for topic, stream in scene.outputs.items()}
-    for found in set_errors(outputs, [scene.source]):
+    for found in set_errors(outputs, [Truths(scene.source)]).values():
         if found.case == "network":
             colour = scene.colour(found.estimator)
             draw_curve(canvas, "plots/gospa", found.estimator, colour, found.time_ns, found.gospa, LINE)

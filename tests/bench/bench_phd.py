@@ -25,6 +25,7 @@ from replay.estimators.gaussian_mixture_phd import (
 )
 from replay.judging.set_distances import gospa
 from replay.judging.set_errors import CUTOFF_M, set_errors
+from replay.judging.truths import Truths
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS = 6
@@ -54,7 +55,7 @@ def main() -> list[Row]:
     scenes = [simulate(seed) for seed in range(RUNS)]
     sources = [source(scene) for scene in scenes]
     outputs = replay_in_memory(sources, {"gm-phd": PARAMETERS.model_dump(exclude_none=True)})
-    [found] = set_errors(outputs, sources)
+    [found] = set_errors(outputs, [*map(Truths, sources)]).values()
     ours_m = float(found.gospa.mean())
     ours_us = 1e6 * filter_seconds(sources)
     rows = []

@@ -1,4 +1,7 @@
-"""What LCD sets cost: seconds against spec/s2kf.md and the issue's limits; run it, or call main()."""
+"""What LCD sets cost, beside an independent implementation and our limits; run it, or call main().
+
+Source: Steinbring and Hanebeck, JAIF 2014, section V; "the sheet" is that implementation's table.
+"""
 
 import tempfile
 from pathlib import Path

@@ -176,6 +176,8 @@ def _break_results() -> None:
     for name, text in {
         "garbled": "{",
         "list": "[]",
+        "newer": '{"format": 2, "claims": {}, "new": 1}',
+        "older": '{"format": 0, "fuselog": "0.0.1"}',
         "foreign": '{"experiment": "x", "metrics": {}, "claims": []}',
     }.items():
         Path(f"result-{name}").mkdir()

@@ -78,6 +78,7 @@ def test_the_solent_meets_its_targets(real_data: Path, tmp_path: Path):
     assert np.all([value is not None for value in result.metrics.values()])
 
 
+@pytest.mark.paper
 def test_on_the_command_line_block_by_block(
     tmp_path: Path, fuselog: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ):

@@ -9,6 +9,8 @@ import pytest
 
 from pipeline.experiment import load_experiment, run_experiment
 
+pytestmark = pytest.mark.paper
+
 
 def run(name: str, folder: Path, settings: dict, runs: int) -> dict:
     label, experiment = load_experiment(name, settings, {"runs": runs})

@@ -192,6 +192,12 @@ TABLE: dict[str, tuple[str, ...]] = {
     "report result-garbled": ("result-garbled/result.json", "run the experiment again"),
     "report result-list": ("result-list/result.json", "no result"),
     "report result-foreign": ("result-foreign/result.json", "'fuselog' is missing"),
+    "report result-newer": (
+        "result-newer/result.json",
+        "a newer fuselog",
+        "(format 2, this one reads 1)",
+    ),
+    "report result-older": ("result-older/result.json", "an older fuselog", "write it again"),
     "report result-damaged": ("result-damaged", "run it again"),
     # where to write
     "record landmarks --out folder": ("'folder' is a directory",),

@@ -6,6 +6,8 @@ import pytest
 from pipeline.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.paper
+
 RUNS = 100
 
 

@@ -7,6 +7,8 @@ import rerun.chunk as rc
 from pipeline.experiment import load_experiment, run_experiment
 from replay.judging.verification import relative_rate_increase
 
+pytestmark = pytest.mark.paper
+
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):

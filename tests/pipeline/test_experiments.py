@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from pipeline.commands import _hash_files
-from pipeline.ensemble import hash_streams, judge, record_ensemble
+from pipeline.ensemble import hash_streams, record_ensemble
 from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
 from pipeline.results import Claim, Outcome, result_folder, write_outcome
 from pipeline.studies.localization import summarise
@@ -24,6 +24,7 @@ from recorders.log import RunMetadata, make_stream, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.blocks import gather
 from replay.engine.sources import memory_source
+from replay.judging.judge import Judge
 
 Fuselog = Callable[..., Any]
 RUN = ["run", "landmarks", "--set", "duration_s=2", "--runs", "3", "--seed", "5"]
@@ -50,11 +51,32 @@ def test_a_result_folder_holds_what_it_promises(result: Path) -> None:
     assert {f"logs/run-000{run}.mcap" for run in range(2)} <= names
     assert "logs/run-0002.mcap" not in names
     assert {f"estimates/run-000{run}.mcap" for run in range(2)} <= names
-    assert {"tables/errors.parquet", "tables/errors.csv", "figures/errors-robot1.svg"} <= names
+    tables = {f"tables/{name}.parquet" for name in ("summary", "steps", "runs", "times")}
+    assert tables | {"figures/errors-robot1.svg"} <= names
+    assert not any(name.startswith("tables/errors") for name in names)  # which --errors asks for
     assert (result / "timeline.rrd").is_file()
     pd.testing.assert_frame_equal(
         pd.read_csv(result / "tables/steps.csv"), pd.read_parquet(result / "tables/steps.parquet")
     )
+
+
+def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fuselog) -> None:
+    """A file per estimator and case; the sums of the other tables are made of the same errors."""
+    assert fuselog(*RUN, "--errors", "--logs", "1", "--out", str(tmp_path / "all")).code == 0
+    folder = tmp_path / "all" / "tables"
+    files = sorted(path.stem for path in (folder / "errors").iterdir())
+    assert files == ["dead-reckoning-robot1", "ekf-robot1", "ukf-robot1"]
+    errors = pd.read_parquet(folder / "errors" / "ekf-robot1.parquet")
+    runs = pd.read_parquet(folder / "runs.parquet").query("estimator == 'ekf'")
+    squared = errors["error_x_m"] ** 2 + errors["error_y_m"] ** 2
+    rmse = np.sqrt(squared.groupby(errors["run"]).mean())
+    np.testing.assert_allclose(rmse, runs["position_rmse_m"], rtol=1e-12)
+    judged = ["evaluate", str(tmp_path / "all/estimates/run-0000.mcap"), "--errors"]
+    assert fuselog(*judged, "--out", str(tmp_path / "again")).code == 0
+    again = pd.read_parquet(tmp_path / "again/tables/errors/ekf-robot1.parquet")
+    pd.testing.assert_frame_equal(again, errors[errors["run"] == 0].reset_index(drop=True))
+    said = fuselog(*judged)
+    assert (said.code, "--errors: goes into a result folder" in said.err) == (2, True)
 
 
 def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
@@ -63,7 +85,7 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     assert "Infinity" not in text
     values = json.loads(text)
     assert list(values) == [
-        *["experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
+        *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"]
     ]
     assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"
@@ -238,7 +260,9 @@ def test_topics_that_look_like_formulas_are_drawn(tmp_path: Path) -> None:
     ]
     source = memory_source(Recording(truths), RunMetadata("test", epoch_ns=0))
     outputs = {stream.topic: gather([stream]) for stream in estimates}
-    outcome = summarise(judge([source], outputs, 1.0))
+    judge = Judge([source], gap_limit_s=1.0)
+    judge.add(outputs)
+    outcome = summarise(judge)
     with result_folder(tmp_path / "r") as part:
         write_outcome(part, "test", {"title": ""}, outcome)
     assert len(list((tmp_path / "r/figures").iterdir())) == 2
@@ -327,6 +351,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.paper
 def test_nothing_is_refuted_by_estimates_that_are_missing(tmp_path: Path) -> None:
     """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
     label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})

@@ -5,6 +5,8 @@ import pytest
 
 from tests.faults import kills, outputs
 
+pytestmark = pytest.mark.paper
+
 
 @pytest.mark.parametrize(("part", "most"), [(outputs, 40), (kills, 4)])
 def test_a_slice_of_the_faults_holds(part, most):

@@ -10,6 +10,8 @@ from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
 from replay.engine.sources import memory_source
 
+pytestmark = pytest.mark.paper
+
 
 def test_broad_reaches_its_target(real_data, tmp_path):
     """No more than 3.5 degrees on average; per trial the numbers that the filter's own runs gave."""

@@ -7,7 +7,10 @@ from pipeline.experiment import load_experiment, run_experiment
 from pipeline.results import Result
 from recorders.errors import BadInput
 
-# spec/s2kf.md, one data seed of 1000 runs: RMSE of mean and covariance
+pytestmark = pytest.mark.paper
+
+# Fig. 7 of Steinbring and Hanebeck, JAIF 2014, by an independent implementation (the sheet):
+# RMSE of mean and covariance, one data seed of 1000 runs
 REACTOR = {
     "ukf": (0.210, 0.511),
     "gf-25": (0.375, 1.332),

@@ -5,6 +5,8 @@ import pytest
 from pipeline.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.paper
+
 
 def verdicts(result):
     return [claim.verdict for claim in result.claims]

@@ -246,6 +246,7 @@ def _check_refusal(said: Said, folder: Path, expected: dict[str, str], words: st
     assert _state(folder) == expected
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("situation", SITUATIONS)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_file_of_the_user_is_changed(command: str, situation: str, here: Path, before: Path) -> None:

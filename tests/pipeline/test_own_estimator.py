@@ -108,6 +108,7 @@ def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
     return [json.loads(line) for line in process.stdout.splitlines()]
 
 
+@pytest.mark.paper
 def test_the_page_works_as_written(package: Path) -> None:
     """Every command of the page runs with its package; its model serves every method as it should."""
     commands = [line for block in _blocks("sh") for line in block.splitlines()]
@@ -139,6 +140,7 @@ def test_the_page_works_as_written(package: Path) -> None:
     assert schema == "radio.SignalStrength"
 
 
+@pytest.mark.paper
 def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
     """The compiled recursion equals the same function in plain Python, as the page promises."""
     plain = (
@@ -167,6 +169,7 @@ def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
             np.testing.assert_allclose(column, two[name], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.paper
 def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
     """A plugin's mistake is one sentence that says whose it is, and hurts no other plugin."""
     record = "fuselog record beacons --set duration_s=5 --out"

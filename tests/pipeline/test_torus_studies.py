@@ -9,6 +9,8 @@ from pipeline.experiment import load_experiment, run_experiment
 from pipeline.studies.torus import PropagationOptions, propagation_errors
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.paper
+
 OPTIONS, MC_RUNS = PropagationOptions(), 12
 # the sheet's rows: rho, then by c the errors of mu and C of the five samples, and of the UKF's
 FIGURE_3 = {

@@ -10,6 +10,8 @@ import pytest
 
 from pipeline.experiment import load_experiment, run_experiment
 
+pytestmark = pytest.mark.paper
+
 
 def run(name: str, folder: Path, settings: dict[str, Any], runs: int) -> dict[str, Any]:
     label, experiment = load_experiment(name, settings, {"runs": runs})

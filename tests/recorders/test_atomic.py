@@ -37,6 +37,7 @@ def fill(place: Path, check=accept) -> None:
         (new / "a").write_text("new")
 
 
+@pytest.mark.unix
 def test_what_a_user_calls_part_or_old_is_left_alone(tmp_path):
     """Not emptied, not deleted, not followed where it is a link."""
     target = tmp_path / "thesis"
@@ -113,6 +114,8 @@ KILLED = """
 """
 
 
+@pytest.mark.paper
+@pytest.mark.unix
 @pytest.mark.parametrize(("name", "inside"), [("f.txt", "f.txt"), ("r", "r/a")])
 def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, name, inside):
     """SIGKILL before every third line: the place holds the old or the new, or gets it back."""
@@ -159,6 +162,7 @@ def test_places_whose_names_go_on_are_others(tmp_path):
     assert contents(tmp_path) == {"r/a": "new", "r.v2/a": "old"}
 
 
+@pytest.mark.unix
 def test_a_leftover_is_known_by_more_than_its_name(tmp_path, caplog):
     """What only looks like one stays, and that is said."""
     place = tmp_path / "f"
@@ -195,6 +199,7 @@ def test_errors_of_the_disk_say_where_and_others_go_through(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.unix
 def test_a_scratch_folder_of_a_killed_process_is_cleared(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
     program = (

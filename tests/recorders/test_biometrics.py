@@ -11,6 +11,8 @@ from recorders.recording import record_run
 from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
 from replay.judging.verification import identified
 
+pytestmark = pytest.mark.paper
+
 TWO = Matchers.model_validate(
     {"matchers": [{"name": "face", "modality": "face"}, {"name": "finger", "modality": "finger"}]}
 ).matchers

@@ -202,7 +202,7 @@ def test_a_log_of_these_numbers_has_these_bytes(tmp_path):
     assert hashlib.sha256(path.read_bytes()).hexdigest() == GOLDEN_SHA256
 
 
-GOLDEN_SHA256 = "3044ad158beec77bca358a9ea7874f3d78a50d9ba1d3f0e36e89db96e4762b11"
+GOLDEN_SHA256 = "8c85692bf71e1e73babfef3cbd43b6db8b3d2465bdea5c9622c6fb40291561c6"
 
 
 def test_the_noted_span_of_publish_time_is_that_of_the_chunk(path):

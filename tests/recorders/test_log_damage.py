@@ -22,6 +22,7 @@ from tests.recorders.log_samples import assert_same, some_streams
 RUN = RunMetadata("demo", {"speed_mps": 3}, seed=123, epoch_ns=456)
 STREAMS = some_streams(6, count=6)[:2]
 TOPICS = [stream.topic for stream in STREAMS]
+RECORD = RUN.to_record()
 
 
 def written(folder, compression: str):
@@ -100,6 +101,7 @@ def messages_by_chunk(raw: bytes) -> list[tuple[int, Counter]]:
     return ends
 
 
+@pytest.mark.paper
 def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole):
     """No cut gives a wrong, half or doubled message; the three compressions take turns at the bytes."""
     raw, honest, path = whole
@@ -119,6 +121,7 @@ def test_a_log_cut_off_anywhere_is_refused_or_read_to_its_last_whole_chunk(whole
                 assert_same(stream, honest[topic], slice(kept[topic]))
 
 
+@pytest.mark.paper
 def test_a_flipped_bit_is_told_or_changes_nothing(whole):
     """Either a sentence, or exactly the log as it was written; with recover no message is another."""
     raw, honest, path = whole
@@ -432,3 +435,21 @@ def test_run_metadata_of_wrong_types_are_told(changes, sentence):
     del record["notes"]
     with pytest.raises(BadInput, match="'notes' is missing"):
         RunMetadata.from_record(record, "run.mcap")
+
+
+def test_a_log_of_another_format_is_refused_and_one_of_before_formats_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+    for stated, sentence in {
+        "2": "a newer fuselog wrote it (format 2, this one reads 1); update fuselog",
+        "0": "an older fuselog wrote it (format 0, this one reads 1); write it again",
+        '"x"': 'format is "x", expected a whole number',
+    }.items():
+        monkeypatch.setattr(RunMetadata, "to_record", lambda _, f=stated: {**RECORD, "format": f})
+        write_log(path, STREAMS, RUN)
+        with pytest.raises(BadInput, match=re.escape(sentence)) as refusal:
+            _ = open_log(path).run
+        assert str(refusal.value).startswith(f"{path}: ")
+    before = {name: text for name, text in RECORD.items() if name != "format"}
+    monkeypatch.setattr(RunMetadata, "to_record", lambda _: before)
+    write_log(path, STREAMS, RUN)
+    assert open_log(path).run == RUN

@@ -7,6 +7,7 @@ from recorders.log import read_streams
 from tests.faults import crafted, cuts, damaged_logs, flips
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("campaign", "most"), [(flips, 60), (cuts, 60), (crafted, 12)], ids=str)
 def test_faults_hold(campaign, most):
     """Exactly the right numbers, a stated part of them, or one sentence."""

@@ -483,6 +483,7 @@ def test_messages_beside_indexed_chunks_are_read(tmp_path):
         assert found["target_id"][found.log_time_ns == 1100][-2:].tolist() == [6, 6]
 
 
+@pytest.mark.paper
 def test_a_chunk_without_messages_has_no_time(tmp_path):
     """The index of one states the time 0, at which such a log does not begin."""
     path = tmp_path / "run.mcap"
@@ -612,6 +613,7 @@ def assert_reads_as(log, honest, clock: str) -> None:
         assert_same(concatenate(blocks), stream)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("clock", ["publish_time", "log_time"])
 @pytest.mark.parametrize("lie", LIES, ids=lambda lie: lie.__name__)
 def test_an_index_that_lies_is_found_out(tmp_path, lie, clock):

@@ -32,6 +32,7 @@ def path(tmp_path_factory):
     return tmp_path_factory.mktemp("log") / "run.mcap"
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("schema", SCHEMAS.values(), ids=list(SCHEMAS))
 @settings(max_examples=12)
 @given(data=st.data(), compression=st.sampled_from(COMPRESSIONS))

@@ -15,7 +15,8 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.judging.evaluation import errors_of
-from replay.judging.metrics import accuracy, consistency
+from replay.judging.metrics import ACCURACY, CONSISTENCY
+from replay.judging.truths import Truths
 
 # A set of one robot: two barcodes known, one not; times out of order; comments as in the real files.
 SMALL = {
@@ -148,6 +149,7 @@ def set_6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> MemorySo
     return source
 
 
+@pytest.mark.paper
 def test_set_6_has_every_message_but_the_unknown_barcodes(set_6: MemorySource):
     """Counts are the files' rows (less four lines of comments); 43, 34 and 50 are in no table."""
     counts = {topic: len(stream) for topic, stream in set_6.streams.items()}
@@ -164,6 +166,7 @@ def test_set_6_has_every_message_but_the_unknown_barcodes(set_6: MemorySource):
     }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_filters_localize_the_robots_of_set_6(name: str, set_6: MemorySource):
     """From the truth's start: RMSE at most .22 m (robot 4: .30), NEES of the position at most 3.
@@ -173,10 +176,12 @@ def test_filters_localize_the_robots_of_set_6(name: str, set_6: MemorySource):
     """
     outputs = collect(replay([set_6], bind(name, [set_6], {})))
     for robot in range(1, 6):
-        errors = errors_of(outputs[f"/estimates/{name}/robot{robot}/pose"], [set_6], gap_limit_s=0.2)
+        errors = errors_of(
+            outputs[f"/estimates/{name}/robot{robot}/pose"], [Truths(set_6)], gap_limit_s=0.2
+        )
         assert errors is not None
-        assert accuracy(errors)["position_rmse_m"] <= (0.30 if robot == 4 else 0.22)
-        assert 0.5 <= consistency(errors)["position_nees"] <= 3
+        assert ACCURACY.of(errors)["position_rmse_m"] <= (0.30 if robot == 4 else 0.22)
+        assert 0.5 <= CONSISTENCY.of(errors)["position_nees"] <= 3
         truth = set_6.streams[f"/robot{robot}/truth"].publish_time_ns
         assert len(errors.nees) > 50000  # judged all along, but not where the truth is silent
         after_its_end = (
@@ -188,7 +193,9 @@ def test_filters_localize_the_robots_of_set_6(name: str, set_6: MemorySource):
 def test_dead_reckoning_drifts_where_the_landmarks_hold(set_6: MemorySource):
     """The RMSE above is the landmarks' doing: without them it is metres."""
     outputs = collect(replay([set_6], bind("dead-reckoning", [set_6], {})))
-    errors = errors_of(outputs["/estimates/dead-reckoning/robot1/pose"], [set_6], gap_limit_s=0.2)
+    errors = errors_of(
+        outputs["/estimates/dead-reckoning/robot1/pose"], [Truths(set_6)], gap_limit_s=0.2
+    )
     assert errors is not None
-    assert accuracy(errors)["position_rmse_m"] > 1
+    assert ACCURACY.of(errors)["position_rmse_m"] > 1
     assert_allclose(np.linalg.norm(errors.error[0, :2]), 0, atol=0.01)

@@ -23,6 +23,7 @@ def test_simulated(name: str) -> None:
     assert_is_golden(name, {})
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", IMPORTED)
 def test_imported(name: str, real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scratch = tmp_path_factory.getbasetemp() / "goldens"

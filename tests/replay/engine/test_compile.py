@@ -70,6 +70,7 @@ def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]
     return done.stdout.splitlines()
 
 
+@pytest.mark.paper
 def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp_path: Path):
     """Neither a compilation at every start, nor the old model after a change."""
     cache = tmp_path / "cache"
@@ -92,6 +93,7 @@ EXTENSION = """
 """
 
 
+@pytest.mark.paper
 def test_what_is_imported_by_name_is_compiled_anew_when_its_module_changes(tmp_path: Path):
     """By itself numba goes on with the old one: it looks at the file of the kernel alone."""
     cache = tmp_path / "cache"
@@ -123,6 +125,7 @@ CALLED_FROM_PYTHON = """
 """
 
 
+@pytest.mark.paper
 def test_a_change_in_another_file_is_noticed(tmp_path: Path):
     """Of a function, and of the order of a named tuple's fields: numba sees neither."""
     cache = tmp_path / "cache"
@@ -166,6 +169,7 @@ def found_in_the_cache() -> bool:
     return bool(loop.keywords["loop"].stats.cache_hits)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "damage", ["emptied", "cut", "flipped", "unlike its checksum", "not ours", "another kernel's"]
 )
@@ -218,6 +222,7 @@ def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch
     ]
 
 
+@pytest.mark.unix
 def test_only_a_folder_of_this_user_alone_is_used(
     kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog
 ):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from pipeline import ensemble
+from pipeline.ensemble import Part
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.parameters import Parameters
@@ -32,7 +34,8 @@ from replay.engine.plain import (
 from replay.engine.replaying import Report, collect, replay
 from replay.engine.sources import LogSource, MemorySource, Source, memory_source
 from replay.engine.supervision import find_unsound
-from replay.judging.metrics import estimated_share
+from replay.judging.judge import Judge
+from replay.judging.metrics import COVERAGE, Output
 
 STEP_NS = 10**8
 COUNT = 200
@@ -108,7 +111,10 @@ def run(
     bound = estimator.bind("m", runs[0].topics, estimator.parameters())
     out = collect(replay(runs, bound, report=report, **options))
     assert report.seconds["m"] > 0
-    return out, [estimated_share(each) for each in report.coverage]
+    return out, [
+        COVERAGE.of(Output("", "", "coverage", each, [])).get("estimated_share")
+        for each in report.coverage
+    ]
 
 
 CASES = {
@@ -307,16 +313,24 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
     modes = [0, RAISE, INDEFINITE, 0, SILENT, 0, RAISE]  # the last part is one run, which raises
     sources = [make_run(mode) for mode in modes]
     paths = [tmp_path / f"{number}.mcap" for number in range(len(modes))]
-    ensemble.replay_to_logs(sources, {"m": {}}, paths)
+    places = [(path, path) for path in paths]
+    parts = [
+        Part(sources[now], now.start, False, places[now]) for now in ensemble.parts_of(len(sources))
+    ]
+    judge = ensemble.replay_parts(parts, {"m": {}}, gap_limit_s=0.2).judge
     topics = list(open_log(paths[0]).topics)
     read = [LogSource(open_log(path)).read(topics) for path in paths]
     outputs = {topic: gather([each[topic] for each in read]) for topic in topics}
-    said = ensemble.judge(sources, outputs, 0.2).failures
+    again = Judge(sources, gap_limit_s=0.2)
+    again.add(outputs)
+    said = judge.failures
+    assert said == again.failures
     assert len(said) == 4
     for sentence, mode in zip(said, [mode for mode in modes if mode], strict=True):
         assert CASES[mode] in sentence
+    bad = [replace(part, sources=[make_run(RAISE)], estimates=()) for part in parts]
     with pytest.raises(BadInput, match="estimator m raised ZeroDivisionError"):
-        ensemble.replay_to_logs([make_run(RAISE)] * 3, {"m": {}}, paths[:3])
+        ensemble.replay_parts(bad, {"m": {}}, gap_limit_s=0.2)
 
 
 @pytest.mark.parametrize(

@@ -318,6 +318,7 @@ def test_all_runs_at_once_are_one_call() -> None:
         recursive("none", **given)
 
 
+@pytest.mark.paper
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
 def test_long_compiling_is_said_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path

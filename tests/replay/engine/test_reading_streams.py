@@ -15,7 +15,7 @@ from replay.engine.estimator import bind
 from replay.engine.failures import sentences_of
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.metrics import Output, coverage
+from replay.judging.metrics import COVERAGE, Output
 
 VEHICLES = {"duration_s": 20.0}
 
@@ -112,7 +112,7 @@ def test_a_fix_without_covariance_is_left_out_and_counted(estimator: str) -> Non
     (sentence,) = sentences_of(skipped.stream)
     assert "/vehicle2/fix" in sentence
     assert "--set sigma_fix_m=" in sentence
-    assert coverage(Output("", "", "skipped", skipped, [])) == {"skipped_measurements": 1.0}
+    assert COVERAGE.of(Output("", "", "skipped", skipped, [])) == {"skipped_measurements": 1.0}
 
     stated = covariance.copy()
     stated[7] = [0.25, 0.0, 0.0, 0.25]

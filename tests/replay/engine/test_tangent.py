@@ -18,7 +18,8 @@ from replay.engine.tangent import (
     vector_part_covariance,
 )
 from replay.judging.evaluation import errors_of, truth_at
-from replay.judging.metrics import accuracy
+from replay.judging.metrics import ACCURACY
+from replay.judging.truths import Truths
 
 QUATERNION = ["quaternion"] * 4
 
@@ -120,13 +121,13 @@ def judged(kinds: list[str]):
         mean=-as_array(estimate),
         covariance=np.tile(1e-4 * np.eye(3).ravel(), (20, 1)),
     )
-    return errors_of(gather([estimates]), [memory_source(recording, RunMetadata("none"))])
+    return errors_of(gather([estimates]), [Truths(memory_source(recording, RunMetadata("none")))])
 
 
 def test_nees_and_total_error_are_those_of_the_rotation():
     errors = judged(QUATERNION)
     np.testing.assert_allclose(errors.nees, 9.0, rtol=1e-9)
-    numbers = accuracy(errors)
+    numbers = ACCURACY.of(errors)
     assert numbers["orientation_rmse_deg"] == pytest.approx(np.degrees(0.03))
     assert numbers["body_y_rmse_rad"] == pytest.approx(0.02)
 

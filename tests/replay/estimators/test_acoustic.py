@@ -1,4 +1,4 @@
-"""Shooter localization against the numbers of /spec/acoustic (Osborne et al. 2014)."""
+"""Shooter localization against an independent implementation of Osborne et al., JAIF 2014."""
 
 import tomllib
 from functools import cache
@@ -19,6 +19,8 @@ from replay.estimators.acoustic import Detections, Mode, Setting
 from replay.inference.least_squares import Solution, Status, fisher_information
 from replay.judging.consistency import ellipse_area
 from replay.judging.evaluation import chi_square_interval
+
+pytestmark = pytest.mark.paper
 
 SCENARIOS = Path(__file__).parents[3] / "data" / "scenarios"
 MEDIUM = Medium()

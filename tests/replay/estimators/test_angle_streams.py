@@ -15,6 +15,7 @@ from replay.engine.sources import MemorySource, memory_source
 from replay.estimators import optical
 from replay.estimators.optical import Scene
 from replay.judging.evaluation import errors_of
+from replay.judging.truths import Truths
 
 
 def source(scenario: str, run: int = 0, **parameters: object) -> MemorySource:
@@ -55,7 +56,7 @@ def test_every_pass_is_a_batch_of_its_own_and_ensembles_equal_single_runs() -> N
         alone, ours = solve([run], "los-biases")["state"].stream, together["state"].of_run(number)
         np.testing.assert_array_equal(alone["mean"], ours["mean"])
         np.testing.assert_array_equal(alone["covariance"], ours["covariance"])
-    errors = errors_of(together["state"], runs)
+    errors = errors_of(together["state"], [*map(Truths, runs)])
     assert errors is not None
     assert errors.without_truth == 0
     assert errors.kinds.count("angle") == 9
@@ -115,7 +116,7 @@ def test_every_shot_is_located_on_its_own(mode: str) -> None:
     assert np.diff(outputs["solution"].offsets).tolist() == [20] * 5
     last = max(runs[0].streams[f"/sensor{s}/detections"].publish_time_ns[0] for s in range(1, 6))
     assert outputs["solution"].stream.publish_time_ns[0] == last
-    errors = errors_of(outputs["state"], runs)
+    errors = errors_of(outputs["state"], [*map(Truths, runs)])
     assert errors is not None
     size = len(errors.components)
     assert errors.nees.mean() == pytest.approx(size, abs=5.0 * np.sqrt(2.0 * size / len(errors.nees)))

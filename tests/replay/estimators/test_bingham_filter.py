@@ -22,6 +22,8 @@ from replay.estimators.bingham import (
 )
 from replay.estimators.grid import run_axis_grid_filter
 
+pytestmark = pytest.mark.paper
+
 RUNS, STEPS = 1000, 100
 
 

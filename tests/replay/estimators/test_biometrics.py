@@ -36,6 +36,8 @@ from replay.judging.verification import (
     verification_rate,
 )
 
+pytestmark = pytest.mark.paper
+
 # Mean and standard deviation over seeds, of the specification; cases as in PAPER_FUSED.
 TRIMMED = {
     "qda": ((94.15, 97.36, 97.16, 99.27, 99.12), (0.55, 0.33, 0.21, 0.21, 0.22)),

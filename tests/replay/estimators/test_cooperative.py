@@ -12,7 +12,9 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
 from replay.estimators.covariance_intersection import fuse_sighting
-from replay.judging.metrics import accuracy, consistency
+from replay.judging.metrics import ACCURACY, CONSISTENCY
+
+pytestmark = pytest.mark.paper
 
 POSES = np.array([[0.0, 0.0, 0.3], [2.0, 1.0, -1.0]])
 COVARIANCES = np.array(
@@ -126,8 +128,8 @@ def judged(mrclam6):
     for mode in ("alone", "naive", "ci", "joint"):
         estimators = {mode: {"kind": f"cooperative:{mode}"}}
         errors = replay_ensemble(sources, estimators, gap_limit_s=0.2).errors
-        rmse = np.array([accuracy(each)["position_rmse_m"] for each in errors])
-        found[mode] = rmse, np.array([consistency(each)["position_nees"] for each in errors])
+        rmse = np.array([ACCURACY.of(each)["position_rmse_m"] for each in errors])
+        found[mode] = rmse, np.array([CONSISTENCY.of(each)["position_nees"] for each in errors])
     return found
 
 

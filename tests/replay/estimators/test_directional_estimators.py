@@ -7,7 +7,7 @@ from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
 from replay.engine.sources import memory_source
-from replay.judging.metrics import consistency
+from replay.judging.metrics import CONSISTENCY
 
 FILTERS = {
     "axis": {"bingham-axis": {}, "kalman-axis": {}},
@@ -32,13 +32,13 @@ def test_the_covariance_of_an_orientation_is_that_of_its_error():
     """NEES of three components, over 60 runs from the truth's own noise."""
     sources = record_ensemble("orientation", {"steps": 40}, 0, 60)
     replayed = replay_ensemble(sources, {"bingham-orientation": {}}, gap_limit_s=0.2)
-    assert consistency(replayed.errors[0])["nees"] == pytest.approx(3.0, abs=0.15)
+    assert CONSISTENCY.of(replayed.errors[0])["nees"] == pytest.approx(3.0, abs=0.15)
 
 
 def test_the_covariance_of_headings_is_that_of_their_error():
     sources = record_ensemble("torus-headings", {"measurement_sigma_rad": 0.3}, 0, 60)
     replayed = replay_ensemble(sources, {"torus": {}}, gap_limit_s=0.2)
-    assert consistency(replayed.errors[0])["nees"] == pytest.approx(2.0, abs=0.15)
+    assert CONSISTENCY.of(replayed.errors[0])["nees"] == pytest.approx(2.0, abs=0.15)
 
 
 def test_a_parameter_goes_before_what_the_channel_states():

@@ -34,6 +34,8 @@ from replay.estimators.pseudo_ellipsoids import (
     slack,
 )
 
+pytestmark = pytest.mark.paper
+
 ARENA = Arena(np.array([-5.0, -5.0]), np.array([5.0, 5.0]))
 LANDMARKS = np.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.0]])
 

@@ -21,6 +21,7 @@ from replay.estimators.gaussian_mixture_phd import (
     settings_of,
 )
 from replay.judging.set_errors import set_errors
+from replay.judging.truths import Truths
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source
 
 STATED = {"variance_m2": "0.5", "detection_probability": "0.9", "clutter_per_m2": "1e-3"}
@@ -131,7 +132,7 @@ def test_without_priors_things_are_found():
     streams = {name: each for name, each in whole.streams.items() if not name.endswith("prior")}
     bare = type(whole)(streams, whole.run, whole.name)
     outputs = replay_in_memory([bare], {"gm-phd": {"acceleration_sigma_mps2": 0.2}})
-    [found] = set_errors(outputs, [bare])
+    [found] = set_errors(outputs, [Truths(bare)]).values()
     assert found.missed[10:].mean() / 50 < 0.8
 
 

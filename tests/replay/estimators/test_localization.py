@@ -18,6 +18,7 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.judging.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.judging.truths import Truths
 from replay.sampling.samplers import unscented
 
 Floats = NDArray[np.float64]
@@ -190,6 +191,7 @@ RICH = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("order", ["publish_time", "log_time"])
 @pytest.mark.parametrize(("name", "steps"), [("ekf", Ekf()), ("ukf", Ukf(0.0)), ("ukf", Ukf(0.7))])
 def test_filters_equal_the_textbook(name: str, steps: Ekf | Ukf, order: Clock):
@@ -313,7 +315,7 @@ class Honesty(NamedTuple):
 
 def honesty(name: str, runs: list[MemorySource], **noise: float) -> Honesty:
     outputs = replayed(name, runs, gate_probability=1.0, **noise)
-    errors = errors_of(outputs["pose"], runs)
+    errors = errors_of(outputs["pose"], [*map(Truths, runs)])
     assert isinstance(errors, Errors)
     nees = errors.nees.reshape(100, -1)
     innovations = innovations_of(outputs["innovation"])

@@ -101,7 +101,7 @@ def predicted(method, mean, covariance, *samples):
 
 
 def test_reactor_step_has_the_moments_of_the_sheet():
-    """spec/s2kf.md, one step from m = [.5, 3.5], C = 10 I: models, appendix and UKF in one."""
+    """Steinbring and Hanebeck, JAIF 2014, one step from m = [.5, 3.5], C = 10 I: appendix and UKF."""
     mean, covariance = np.array([0.5, 3.5]), 10 * np.eye(2)
     exact = predicted("analytic", mean, covariance)
     np.testing.assert_allclose(exact[0], [0.172, 3.664], atol=1e-12)
@@ -143,7 +143,7 @@ def innovated(mean, covariance, measured, samples):
 
 
 def test_extended_target_first_update_has_the_moments_of_the_sheet():
-    """spec/s2kf.md, prior I + C^v: analytic moments, and the UKF's blindness for the size."""
+    """The same paper's target from I + C^v: analytic moments, and the UKF's blindness for the size."""
     mean, covariance = np.array([1.0, 1, 0, 0]), np.diag([1.0001, 1.0001, 1.001, 1.001])
     samples = samples_of("ukf", 8)
     difference, found, with_state = innovated_exactly(mean, covariance, np.zeros(4))

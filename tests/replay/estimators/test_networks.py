@@ -15,6 +15,8 @@ from replay.engine.sources import memory_source
 from replay.estimators.covariance_intersection import RULES
 from replay.estimators.networks import ALONE, CENTRALISED, TRAP, Rule
 
+pytestmark = pytest.mark.paper
+
 RUNS = 120
 
 

@@ -1,4 +1,4 @@
-"""Bias estimation from lines of sight against the numbers of /spec/los-bias (Belfadel et al. 2014)."""
+"""Bias estimation from lines of sight against an independent one of Belfadel et al., JAIF 2014."""
 
 import tomllib
 from pathlib import Path
@@ -14,6 +14,8 @@ from replay.estimators import optical
 from replay.estimators.optical import Scene
 from replay.inference.least_squares import Status, cramer_rao_bound, solve
 from replay.judging.evaluation import chi_square_interval
+
+pytestmark = pytest.mark.paper
 
 SCENARIOS = Path(__file__).parents[3] / "data" / "scenarios"
 # (bias in deg, noise in rad): as the paper states them, and as they reproduce its table III.

@@ -15,8 +15,10 @@ from replay.engine.sources import LogSource, memory_source
 from replay.estimators.feasible_sets import arena_around, box, exact_set, excess_rad, rings
 from replay.estimators.pseudo_ellipsoids import fit, room
 from replay.estimators.set_membership import Known, frames
-from replay.judging.evaluation import truth_at
 from replay.judging.set_evaluation import judge_sets
+from replay.judging.truths import truth_at
+
+pytestmark = pytest.mark.paper
 
 SHAPES = ("exact", "box", "l4", "l8")
 

@@ -63,6 +63,7 @@ def test_product_sums_have_the_sheet_s_numbers() -> None:
     assert_allclose(product_sums(P), pseudo.expected, atol=1e-12)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("kind", ["powers", "products", "complex"])
 def test_covariance_equals_monte_carlo(kind: str) -> None:
     """W W' against the covariance of many draws; 5 standard errors of each entry."""

@@ -18,6 +18,8 @@ from replay.estimators.torus import (
     run_unscented_filter,
 )
 
+pytestmark = pytest.mark.paper
+
 STEPS = 50
 DRIFT = (0.3, -0.2)
 

@@ -27,6 +27,9 @@ from replay.estimators.vehicles import Joint, collapse, position_rows
 from replay.judging.evaluation import errors_of
 from replay.judging.label_errors import assigned_squared_error, fixed_squared_error, total_error
 from replay.judging.set_distances import gospa
+from replay.judging.truths import Truths
+
+pytestmark = pytest.mark.paper
 
 Floats = NDArray[np.float64]
 TOLERANCE = 1e-4
@@ -252,7 +255,9 @@ def test_rates_delays_and_losses_mixed(order: str) -> None:
     clock: Clock = "publish_time" if order == "publish_time" else "log_time"
     for method in ("known-static", "set-topology", "hungarian-static"):
         outputs = replay_in_memory(sources, {"m": {"kind": f"vehicles:{method}"}}, order=clock)
-        errors = errors_of(outputs["/estimates/m/vehicle3/state"], sources, gap_limit_s=2.0)
+        errors = errors_of(
+            outputs["/estimates/m/vehicle3/state"], [*map(Truths, sources)], gap_limit_s=2.0
+        )
         assert errors is not None
         assert len(errors.error) >= 3 * 120
         rmse = np.sqrt(np.mean(np.sum(errors.error[:, errors.position] ** 2, axis=1)))

@@ -57,6 +57,7 @@ def nees(model: str, method: str, **settings: Any) -> tuple[float, float]:
     return float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("model", "method"), CELLS)
 def test_every_cell_is_consistent(model: str, method: str) -> None:
     """The mean NEES per component is 1 within 4 standard errors where the model is near linear."""

@@ -19,6 +19,7 @@ from tests.replay.inference.wheel import make_wheel
 MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "wheel": make_wheel()}
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", MODELS)
 def test_right_models_pass(name: str) -> None:
     """All that are registered, and those of the tests: angles, an axis, a quaternion, all noises."""
@@ -162,6 +163,7 @@ WRONG: dict[str, tuple[Model, str]] = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_models_are_found(case: str) -> None:
     model, words = WRONG[case]

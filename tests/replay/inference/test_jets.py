@@ -28,6 +28,8 @@ from replay.engine.compile import compile_over_runs
 from replay.inference import jets
 from replay.inference.jets import jet, slope_of, value_of
 
+pytestmark = pytest.mark.paper
+
 # --- one function at a time ------------------------------------------------------------------------
 
 # Smooth at every x in (0.1, 0.9) and y in (1.1, 1.9).

@@ -96,6 +96,7 @@ TABLE = {
 }
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", TABLE)
 def test_filters_give_the_sheets_table(name: str) -> None:
     """Section 1: 160 stamps, 220 messages of which one is missing altogether, 313 components."""
@@ -270,6 +271,7 @@ def test_what_the_reset_changes(variances: list[float], changes: list[float]) ->
         assert_allclose(relative, change, rtol=2e-4 if change < 1e-3 else 1e-6)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("name", "q", "bias", "variances", "likelihood"),
     [
@@ -314,6 +316,7 @@ def test_attitude_with_the_reset(
     assert_allclose(found["innovation"]["log_likelihood"].sum(), likelihood, rtol=EXACT)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("name", "nees", "error"), [("EKF", 6.77, 0.37), ("IEKF", 6.06, 0.25)])
 def test_attitude_is_consistent_over_sixty_runs(name: str, nees: float, error: float) -> None:
     """Mean NEES of all steps of all runs, one ensemble: without the reset they are 9.37 and 6.56."""

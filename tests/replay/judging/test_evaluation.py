@@ -26,16 +26,10 @@ from recorders.recording import Recording
 from replay.engine.blocks import Ragged, gather
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.evaluation import (
-    chi_square_interval,
-    error_table,
-    errors_of,
-    innovations_of,
-    step_table,
-    truth_at,
-    unjudged,
-)
-from replay.judging.metrics import accuracy, consistency, innovation, likelihood
+from replay.judging.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
+from replay.judging.judge import Judge, error_table
+from replay.judging.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
+from replay.judging.truths import Truths, truth_at
 
 SECOND = 1_000_000_000
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
@@ -99,7 +93,7 @@ def test_empty_truth_is_unknown_everywhere():
     """As a log gives it back: its vectors have no width."""
     none = empty_stream("/truth", schemas.TRUTH_STATE, POSE)
     assert np.isnan(at(none, [1.0, 2.0])).all()
-    errors = errors_of(gather([estimates([1], [[0, 0, 0]], np.eye(3))]), [source(none)])
+    errors = errors_of(gather([estimates([1], [[0, 0, 0]], np.eye(3))]), [*map(Truths, [source(none)])])
     assert errors is not None
     assert errors.without_truth == 1
     assert len(errors.nees) == 0
@@ -138,7 +132,7 @@ def test_errors_of_a_known_case():
     first = estimates([10, 15], [[2, 2, -3.1], [1, 4, 3.1]], covariance)
     second = estimates([12], [[1, 2, 3.2]], covariance)
     sources = [source(still, epoch_ns=10 * SECOND), source(still)]
-    errors = errors_of(gather([first, second]), sources, gap_limit_s=20)
+    errors = errors_of(gather([first, second]), [*map(Truths, sources)], gap_limit_s=20)
     assert errors is not None
     assert (errors.estimator, errors.case) == ("ekf", "robot1")
     turn = 2 * np.pi - 6.2
@@ -152,33 +146,33 @@ def test_errors_of_a_known_case():
         "position_rmse_m": np.sqrt(5 / 3),
         "heading_rmse_rad": np.sqrt((turn**2 + 0.01) / 3),
     }
-    assert accuracy(errors) == pytest.approx(expected)
-    assert consistency(errors)["position_nees"] == pytest.approx((2 / 7 + 16 / 7) / 3)
+    assert ACCURACY.of(errors) == pytest.approx(expected)
+    assert CONSISTENCY.of(errors)["position_nees"] == pytest.approx((2 / 7 + 16 / 7) / 3)
 
 
 def test_estimates_without_truth_are_counted_not_judged():
     gappy = truth([0, 1, 5], [[0, 0, 0], [0, 0, 0], [0, 0, 0]])
     stream = gather([estimates([0.5, 3, 5, 6], [[1, 0, 0]] * 4, np.eye(3))])
-    errors = errors_of(stream, [source(gappy)], gap_limit_s=1)
+    errors = errors_of(stream, [*map(Truths, [source(gappy)])], gap_limit_s=1)
     assert errors is not None
     assert errors.without_truth == 2
     assert_array_equal(errors.step, [0, 2])
-    assert accuracy(errors)["position_rmse_m"] == 1
+    assert ACCURACY.of(errors)["position_rmse_m"] == 1
 
 
 def test_without_truth_or_with_that_of_something_else_nothing_is_judged():
     stream = gather([estimates([1], [[0, 0, 0]], np.eye(3))])
     elsewhere = source(replace(truth([1], [[0, 0, 0]]), topic="/other"))
-    assert errors_of(stream, [elsewhere]) is None
+    assert errors_of(stream, [*map(Truths, [elsewhere])]) is None
     nothing = truth([1], [[0, 0, 0]], components="a,b,heading_deg")
-    assert errors_of(stream, [source(nothing)]) is None
+    assert errors_of(stream, [*map(Truths, [source(nothing)])]) is None
     assert unjudged(stream, [source(nothing)]) == ("x_m", "y_m", "heading_rad")
     turned = truth([1], [[0, 0, 0]], kinds="linear,angle,angle")
     with pytest.raises(BadInput, match="component y_m is stated as angle; it must be linear"):
-        errors_of(stream, [source(turned)])
+        errors_of(stream, [*map(Truths, [source(turned)])])
     nameless = gather([estimates([1], [[0, 0, 0]], np.eye(3), kinds="linear,linear,quaternions")])
     with pytest.raises(BadInput, match="must name components and, for each, a kind"):
-        errors_of(nameless, [source(truth([1], [[0, 0, 0]]))])
+        errors_of(nameless, [*map(Truths, [source(truth([1], [[0, 0, 0]]))])])
 
 
 def test_components_are_matched_by_name():
@@ -189,7 +183,7 @@ def test_components_are_matched_by_name():
         components="speed_mps,heading_rad,x_m,y_m",
         kinds="linear,angle,linear,linear",
     )
-    errors = errors_of(gather([estimates([1], [[1, 2, 3]], np.eye(3))]), [source(mixed)])
+    errors = errors_of(gather([estimates([1], [[1, 2, 3]], np.eye(3))]), [*map(Truths, [source(mixed)])])
     assert errors is not None
     assert_array_equal(errors.error, [[0, 0, 0]])
 
@@ -199,7 +193,7 @@ def test_a_component_without_truth_is_left_out_of_errors_and_nees():
     covariance = np.array([[2.0, 0.5, 0.9], [0.5, 3.0, 0.2], [0.9, 0.2, 0.01]])
     stream = gather([estimates([1], [[2, 9, 1]], covariance)])
     place = truth([1], [[7, 1]], components="y_m,x_m", kinds="linear,linear")
-    errors = errors_of(stream, [source(place)])
+    errors = errors_of(stream, [*map(Truths, [source(place)])])
     assert errors is not None
     assert errors.components == ("x_m", "y_m")
     assert errors.unjudged == unjudged(stream, [source(place)]) == ("heading_rad",)
@@ -207,7 +201,7 @@ def test_a_component_without_truth_is_left_out_of_errors_and_nees():
     assert_array_equal(errors.covariance, [covariance[:2, :2]])
     expected = np.array([1, 2]) @ np.linalg.inv(covariance[:2, :2]) @ [1, 2]
     assert_allclose(errors.nees, expected, rtol=1e-12)
-    judged = accuracy(errors)
+    judged = ACCURACY.of(errors)
     assert np.isnan(judged.pop("heading_rmse_rad"))
     assert judged == pytest.approx({"position_rmse_m": np.sqrt(5), "estimates_without_truth": 0})
 
@@ -216,7 +210,7 @@ def test_of_an_ensemble_only_what_all_truths_have_is_judged():
     stream = estimates([1], [[2, 9, 1]], np.eye(3))
     whole = truth([1], [[0, 0, 0]])
     partial = truth([1], [[7, 1]], components="y_m,x_m", kinds="linear,linear")
-    errors = errors_of(gather([stream, stream]), [source(whole), source(partial)])
+    errors = errors_of(gather([stream, stream]), [*map(Truths, [source(whole), source(partial)])])
     assert errors is not None
     assert_array_equal(errors.error, [[2, 9], [1, 2]])
 
@@ -231,7 +225,7 @@ def test_an_orientation_is_judged_whole_or_not_at_all():
     partial = truth(
         [1], [[0, 0, 0, 3]], components="q_x,q_y,q_z,x_m", kinds="linear,linear,linear,linear"
     )
-    errors = errors_of(stream, [source(partial)])
+    errors = errors_of(stream, [*map(Truths, [source(partial)])])
     assert errors is not None
     assert errors.unjudged == ("q_w", "q_x", "q_y", "q_z")
     assert_array_equal(errors.covariance, [[[4]]])
@@ -243,9 +237,9 @@ def test_an_indefinite_position_block_counts_for_nothing():
     good, bad = np.diag([4.0, 1.0, 0.01]), np.array([[1, 2, 0], [2, 1, 0], [0, 0, 0.01]])
     stream = estimates([1, 2, 3], [[2, 0, 0], [2, 2, 0], [0, 3, 0]], good)
     stream.columns["covariance"][1] = bad.ravel()
-    errors = errors_of(gather([stream]), [source(truth([1, 2, 3], [[0, 0, 0]] * 3))])
+    errors = errors_of(gather([stream]), [*map(Truths, [source(truth([1, 2, 3], [[0, 0, 0]] * 3))])])
     assert errors is not None
-    assert consistency(errors)["position_nees"] == pytest.approx((1 + 9) / 2)
+    assert CONSISTENCY.of(errors)["position_nees"] == pytest.approx((1 + 9) / 2)
     assert np.isnan(errors.nees[1])
 
 
@@ -283,7 +277,7 @@ def test_chi_square_intervals_of_the_books():
     assert_allclose(chi_square_interval(3, 1, 0.9), chi2.ppf([0.05, 0.95], 3))
 
 
-def ensemble(runs: int, steps: int, seed: int) -> tuple[Ragged, list[MemorySource]]:
+def ensemble(runs: int, steps: int, seed: int) -> tuple[Ragged, list[Truths]]:
     """Estimates whose errors are Gaussian with the covariance that they state; run 0 ends half way."""
     generator = np.random.default_rng(seed)
     covariance = np.diag([0.04, 0.09, 0.01])
@@ -298,22 +292,25 @@ def ensemble(runs: int, steps: int, seed: int) -> tuple[Ragged, list[MemorySourc
         )
         for length in lengths
     ]
-    return gather(parts), [source(still)] * runs
+    return gather(parts), [Truths(source(still)) for _ in range(runs)]
 
 
 def test_honest_estimates_lie_within_the_bounds_at_95_of_100_steps():
     """2000 independent steps: 95 % +- 1.5 % (three standard deviations) are inside."""
     errors = errors_of(*ensemble(40, 2000, 3), gap_limit_s=2)
     assert errors is not None
-    assert abs(consistency(errors)["nees_steps_within_95"] - 0.95) < 0.015
+    assert abs(CONSISTENCY.of(errors)["nees_steps_within_95"] - 0.95) < 0.015
     liars = replace(errors, nees=errors.nees * 1.3)
-    assert consistency(liars)["nees_steps_within_95"] < 0.8
+    assert CONSISTENCY.of(liars)["nees_steps_within_95"] < 0.8
 
 
 def test_the_table_of_steps_counts_the_runs_that_are_there():
-    errors = errors_of(*ensemble(5, 10, 4), gap_limit_s=2)
+    stream, truths = ensemble(5, 10, 4)
+    errors = errors_of(stream, truths, gap_limit_s=2)
     assert errors is not None
-    table = step_table(errors)
+    judge = Judge([each.source for each in truths], {}, gap_limit_s=2)
+    judge.add({stream.stream.topic: stream})
+    [table] = judge.steps.values()
     assert table["runs"].tolist() == [5] * 5 + [4] * 5
     last = errors.error[errors.step == 9]
     assert table["rmse_x_m"].iloc[9] == pytest.approx(np.sqrt(np.mean(last[:, 0] ** 2)))
@@ -341,11 +338,11 @@ def test_innovations_count_the_components_that_were_measured():
     )
     innovations = innovations_of(gather([stream]))
     assert innovations.degrees.tolist() == [2, 1, 2]
-    assert innovation(innovations) == pytest.approx(
+    assert INNOVATION.of(innovations) == pytest.approx(
         {"nis_per_component": 53.5 / 5, "gated_share": 1 / 3}
     )
-    assert innovation(innovations_of(gather([stream.take(slice(0, 0))]))) == {}
-    assert likelihood(innovations) == {"log_likelihood": -3.0}
+    assert INNOVATION.of(innovations_of(gather([stream.take(slice(0, 0))]))) == {}
+    assert LIKELIHOOD.of(innovations) == {"log_likelihood": -3.0}
 
 
 def test_innovations_of_logs_from_before_the_log_likelihood_are_judged(tmp_path: Path):
@@ -365,5 +362,5 @@ def test_innovations_of_logs_from_before_the_log_likelihood_are_judged(tmp_path:
     write_log(tmp_path / "old.mcap", [stream], RunMetadata("landmarks", epoch_ns=0))
     read = read_streams(open_log(tmp_path / "old.mcap"), [stream.topic])[stream.topic]
     innovations = innovations_of(gather([read]))
-    assert innovation(innovations) == {"nis_per_component": 1.5, "gated_share": 0.0}
-    assert likelihood(innovations) == {}
+    assert INNOVATION.of(innovations) == {"nis_per_component": 1.5, "gated_share": 0.0}
+    assert LIKELIHOOD.of(innovations) == {}

@@ -8,14 +8,14 @@ from recorders.log import make_stream, schemas
 from replay.engine.blocks import Ragged
 from replay.judging.evaluation import Errors, Innovations
 from replay.judging.metrics import (
-    Metric,
+    ACCURACY,
+    FAILURES,
+    INNOVATION,
+    LIKELIHOOD,
     Output,
-    accuracy,
-    failures,
     find_metrics,
-    innovation,
-    likelihood,
     measure,
+    metric_of_sums,
 )
 
 
@@ -48,21 +48,22 @@ def test_registered_metrics_by_name() -> None:
 def test_accuracy_is_the_length_of_the_position_error_and_each_other_component() -> None:
     """3, 4, 5 triangles; units go to the end of the name."""
     error = np.array([[3.0, 4.0, 0.1], [0.0, 0.0, -0.1]])
-    assert accuracy(make_errors(error, ("x_m", "y_m", "heading_rad"))) == pytest.approx(
+    assert ACCURACY.of(make_errors(error, ("x_m", "y_m", "heading_rad"))) == pytest.approx(
         {"position_rmse_m": np.sqrt(12.5), "heading_rmse_rad": 0.1, "estimates_without_truth": 2}
     )
-    assert accuracy(make_errors(np.empty((0, 1)), ("x_m",))) == {"estimates_without_truth": 2}
+    assert ACCURACY.of(make_errors(np.empty((0, 1)), ("x_m",))) == {"estimates_without_truth": 2}
 
 
 def test_metrics_get_what_they_judge_and_keys_name_estimator_quantity_and_case() -> None:
     judged = make_errors(np.array([[1.0], [3.0]]), ("depth_m",))
-    metric = Metric("largest error", Errors, lambda errors: {"worst_m": errors.error.max()})
-    other = Metric("of innovations", Innovations, lambda _: {"never": 1.0})
-    assert measure([judged], {"worst": metric, "other": other}) == {"e.worst_m.a": 3.0}
+    metric = metric_of_sums("sum of errors", Errors, lambda errors: {"sum_m": errors.error.sum()}, dict)
+    other = metric_of_sums("of innovations", Innovations, lambda _: {"never": 1.0}, dict)
+    assert measure([judged], {"sum": metric, "other": other}) == {"e.sum_m.a": 4.0}
     values = measure([judged], find_metrics(["consistency"]))
     assert values["e.nees.a"] == 5.0
+    bad = metric_of_sums("", Errors, lambda errors: {"x": errors.error[9, 9]}, dict)
     with pytest.raises(BadInput, match="metric bad raised IndexError"):
-        measure([judged], {"bad": Metric("", Errors, lambda errors: {"x": errors.error[9, 9]})})
+        measure([judged], {"bad": bad})
 
 
 def test_innovations_count_per_measured_component() -> None:
@@ -71,7 +72,7 @@ def test_innovations_count_per_measured_component() -> None:
     seen = Innovations(
         "e", "", three, three, np.array([True, False]), np.array([4.0, 2.0]), np.array([2, 1])
     )
-    assert innovation(seen) == {"nis_per_component": 2.0, "gated_share": 0.5}
+    assert INNOVATION.of(seen) == {"nis_per_component": 2.0, "gated_share": 0.5}
 
 
 def test_the_log_likelihood_is_the_mean_over_the_runs_of_what_was_let_in() -> None:
@@ -79,13 +80,13 @@ def test_the_log_likelihood_is_the_mean_over_the_runs_of_what_was_let_in() -> No
     runs = np.array([0, 0, 2])
     accepted = np.array([True, False, True])
     told = Innovations("e", "", runs, runs, accepted, np.ones(3), runs, np.array([-1.0, 0.0, -4.0]))
-    assert likelihood(told) == {"log_likelihood": -2.5}
-    assert likelihood(told._replace(log_likelihood=np.array([-1.0, 0.0, np.nan]))) == {}
-    assert likelihood(told._replace(log_likelihood=None)) == {}
-    assert likelihood(told._replace(log_likelihood=np.array([-1.0, np.nan, -4.0]))) != {}
+    assert LIKELIHOOD.of(told) == {"log_likelihood": -2.5}
+    assert LIKELIHOOD.of(told._replace(log_likelihood=np.array([-1.0, 0.0, np.nan]))) == {}
+    assert LIKELIHOOD.of(told._replace(log_likelihood=None)) == {}
+    assert LIKELIHOOD.of(told._replace(log_likelihood=np.array([-1.0, np.nan, -4.0]))) != {}
 
 
 def test_failed_runs_are_counted_once() -> None:
     stream = make_stream("/estimates/e/a/failure", schemas.FAILURE, [1, 2], reason=[0, 0])
     output = Output("e", "a", "failure", Ragged(stream, np.array([0, 0, 2, 2])), [])
-    assert failures(output) == {"failed_runs": 1.0}
+    assert FAILURES.of(output) == {"failed_runs": 1.0}

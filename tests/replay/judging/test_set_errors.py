@@ -9,6 +9,7 @@ from replay.engine.blocks import gather
 from replay.engine.sources import MemorySource, memory_source
 from replay.judging.metrics import measure
 from replay.judging.set_errors import SETS, set_errors
+from replay.judging.truths import Truths
 
 SECOND = 1_000_000_000
 PLANE = {"components": "x_m,speed_mps,y_m", "kinds": "linear,linear,linear"}
@@ -61,7 +62,7 @@ def test_sets_of_changing_size_are_judged_element_by_element():
         estimates([5.0], [[(7.0, 7.0)]]),
     ]
     outputs = {pair[0].topic: gather(pair) for pair in zip(*parts, strict=True)}
-    [found] = set_errors(outputs, [first, second], gap_limit_s=3.0)
+    [found] = set_errors(outputs, [Truths(first), Truths(second)], gap_limit_s=3.0).values()
     assert (found.estimator, found.case) == ("e", "")
     np.testing.assert_array_equal(found.run, [0, 0, 0, 1])
     np.testing.assert_allclose(found.elapsed_s, [0.0, 1.0, 2.0, 5.0])
@@ -88,5 +89,6 @@ def test_sets_of_changing_size_are_judged_element_by_element():
 def test_the_cutoff_is_that_which_is_asked_for():
     outputs = {stream.topic: gather([stream]) for stream in estimates([0.0], [[(0.0, 4.0)]])}
     source = run(0.0, a={0.0: (0.0, 0.0)})
-    assert set_errors(outputs, [source], cutoff_m=3.0)[0].gospa[0] == pytest.approx(3.0)
-    assert set_errors(outputs, [source], cutoff_m=5.0)[0].gospa[0] == pytest.approx(4.0)
+    for cutoff_m, expected in ((3.0, 3.0), (5.0, 4.0)):
+        [found] = set_errors(outputs, [Truths(source)], cutoff_m=cutoff_m).values()
+        assert found.gospa[0] == pytest.approx(expected)

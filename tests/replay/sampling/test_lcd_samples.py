@@ -7,7 +7,10 @@ from recorders.errors import BadInput
 from replay.sampling import lcd_distance, lcd_samples, moment_corrected
 from replay.sampling.distance import lcd_distance_and_gradient
 
-# N, L, D / pi^(N/2), smallest and largest eigenvalue of the raw covariance (spec/s2kf.md)
+pytestmark = pytest.mark.paper
+
+# N, L, D / pi^(N/2), smallest and largest eigenvalue of the raw covariance: sets of an independent
+# implementation of Steinbring and Hanebeck, JAIF 2014, section V
 REFERENCE = [
     (2, 5, 1.98423761e-2, 0.8232, 0.8232),
     (2, 10, 5.52653726e-3, 0.9022, 0.9069),

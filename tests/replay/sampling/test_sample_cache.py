@@ -119,6 +119,7 @@ def test_a_failed_write_leaves_nothing(folder, monkeypatch):
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.paper
 def test_processes_may_share_a_cache(folder):
     """Three at once, on an empty cache: the same samples for all, one whole file, no remains."""
     with ProcessPoolExecutor(3, mp_context=get_context("spawn")) as pool:

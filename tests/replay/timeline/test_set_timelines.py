@@ -10,6 +10,7 @@ from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
 from replay.judging.evaluation import errors_of, gaussian_estimates
 from replay.judging.set_evaluation import areas_of, frames_of
+from replay.judging.truths import Truths
 from replay.timeline.networks import ARRIVED, LOST
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read
@@ -18,7 +19,7 @@ from tests.replay.timeline.test_timeline import read
 def drawn(scenario, parameters, estimators, folder):
     source = memory_source(*record_run(scenario, parameters, 1))
     outputs = collect(replay([source], [b for name in estimators for b in bind(name, [source], {})]))
-    errors = [errors_of(each, [source]) for each in gaussian_estimates(outputs)]
+    errors = [errors_of(each, [Truths(source)]) for each in gaussian_estimates(outputs)]
     path = folder / "run.rrd"
     show(source, outputs, [each for each in errors if each is not None], save=path)
     return source, outputs, read(path)

@@ -32,6 +32,7 @@ from replay.engine.replaying import collect
 from replay.engine.replaying import replay as replayed
 from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.judging.evaluation import Errors, chi_square_interval, errors_of, gaussian_estimates
+from replay.judging.truths import Truths
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
@@ -57,7 +58,7 @@ def replay_landmarks(runs: int, duration_s: float) -> Replayed:
     sources = [memory_source(*record_run("landmarks", scenario, 3, run)) for run in range(runs)]
     bound = [each for name in ("dead-reckoning", "ekf") for each in bind(name, sources, {})]
     outputs = collect(replayed(sources, bound))
-    found = [errors_of(each, sources) for each in gaussian_estimates(outputs)]
+    found = [errors_of(each, [*map(Truths, sources)]) for each in gaussian_estimates(outputs)]
     return Replayed(sources, outputs, [each for each in found if each is not None])
 
 
@@ -231,6 +232,7 @@ def test_the_same_replay_is_the_same_recording_and_another_is_not(
     assert read(rrd, static=True) == read(again, static=True)
 
 
+@pytest.mark.paper
 def test_a_long_run_is_thinned_and_says_so(tmp_path: Path) -> None:
     long = replay_landmarks(1, 300.0)
     show(long.sources[0], long.outputs, long.errors, save=tmp_path / "long.rrd")
@@ -381,6 +383,7 @@ def test_one_pass_goes_to_a_file_and_to_a_running_receiver(
         socket.create_connection(("127.0.0.1", port), timeout=1)
 
 
+@pytest.mark.paper
 def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp_path: Path) -> None:
     def refused(url: str) -> None:
         begin = time.monotonic()
@@ -401,6 +404,7 @@ def test_a_receiver_that_is_not_there_is_refused_at_once(ensemble: Replayed, tmp
         refused(url)
 
 
+@pytest.mark.unix
 def test_a_receiver_that_goes_away_is_told_and_nothing_half_written(tmp_path: Path) -> None:
     path = tmp_path / "kept.rrd"
     path.write_text("what was there before")

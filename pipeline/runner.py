@@ -1,0 +1,175 @@
+"""What every study does: obtain runs, replay and judge them, keep the first logs, draw the first run.
+
+A study keeps what is its own: cases, claims, tables, figures.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.ensemble import (
+    Part,
+    Replayed,
+    Settings,
+    add_to_hash,
+    estimates_metadata,
+    parts_of,
+    record_ensemble,
+    replay_ensemble,
+    replay_parts,
+)
+from pipeline.experiment import Experiment, Setting, load_scenario
+from pipeline.results import ErrorTables
+from recorders.errors import BadInput
+from recorders.log import LogWriter
+from recorders.parameters import merge
+from recorders.recording import import_run
+from replay.engine.blocks import Ragged, gather
+from replay.engine.sources import MemorySource, memory_source
+from replay.judging.judge import Judge
+
+
+@dataclass(frozen=True)
+class Runner:
+    """The runs of an experiment, in its setting."""
+
+    experiment: Experiment
+    setting: Setting
+
+    def obtain(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        seed: int | None = None,
+        first_run: int = 0,
+        runs: int | None = None,
+    ) -> list[MemorySource]:
+        """Runs in memory: simulated, or the one that is imported.
+
+        Args:
+            parameters: what differs in those of the scenario.
+            seed: another than the experiment's.
+            first_run: the number of the first run.
+            runs: how many, by default those of the experiment.
+
+        Raises BadInput where the experiment does not say what to record or to import.
+        """
+        experiment, setting = self.experiment, self.setting
+        if experiment.import_ and setting.data:
+            source = experiment.import_
+            return [memory_source(*import_run(source.source, setting.data, source.parameters))]
+        if not experiment.record:
+            raise BadInput(f"experiment '{experiment.title}': give what to [record] or to [import]")
+        recorder, values, _ = load_scenario(experiment.record.scenario)
+        return record_ensemble(
+            recorder,
+            merge(merge(values, experiment.record.parameters), parameters or {}),
+            experiment.seed if seed is None else seed,
+            experiment.runs if runs is None else runs,
+            setting.progress,
+            first_run=first_run,
+            all_runs=experiment.runs,
+        )
+
+    def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:
+        """What the experiment's estimators, or others, make of runs; all in memory."""
+        return replay_ensemble(
+            sources,
+            self.experiment.estimators if estimators is None else estimators,
+            gap_limit_s=self.experiment.gap_limit_s,
+            progress=self.setting.progress,
+        )
+
+    def keep(
+        self,
+        sources: Sequence[MemorySource],
+        outputs: Mapping[str, Ragged],
+        folder: str = "",
+        *,
+        drawn: str | None = "",
+    ) -> None:
+        """Write logs and estimates of the first runs to a folder, and the first timeline to another.
+
+        `drawn` is None where no timeline is wanted. The other runs can be recorded again from the seed.
+        """
+        count = min(self.setting.logs, len(sources))
+        for run in self.setting.progress(range(count), "writing logs", count):
+            log, estimates = self._places(folder, run)
+            _write_log(sources[run], log)
+            metadata = estimates_metadata(sources[run], self.experiment.estimators, estimates, log)
+            with LogWriter(estimates, metadata) as writer:
+                writer.write([ragged.of_run(run) for ragged in outputs.values()])
+        if drawn is not None:
+            self.draw(sources, outputs, drawn)
+
+    def draw(
+        self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
+    ) -> None:
+        """Draw the first run into a folder."""
+        from replay.timeline.show import show
+
+        place = self.setting.folder / folder
+        place.mkdir(parents=True, exist_ok=True)
+        of_run = {topic: gather([rows.of_run(0)]) for topic, rows in outputs.items()}
+        judged = Judge(sources[:1], {}, gap_limit_s=self.experiment.gap_limit_s).add(of_run)
+        show(sources[0], of_run, judged.errors, save=place / "timeline.rrd")
+
+    def run(self) -> Replayed:
+        """All of it: the experiment's runs, replayed in memory, and the first ones kept."""
+        replayed = self.replay(self.obtain())
+        self.keep(replayed.sources, replayed.outputs)
+        return replayed
+
+    def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
+        """The same for every case, given by name and what differs in the scenario's parameters.
+
+        What is kept goes to a folder of the case, but the first case's timeline is the experiment's.
+        """
+        for number, (name, differing) in enumerate(cases.items()):
+            replayed = self.replay(self.obtain(differing))
+            self.keep(replayed.sources, replayed.outputs, name, drawn=name if number else "")
+            yield name, replayed
+
+    def judge(self) -> tuple[Judge, str]:
+        """All of it in one streamed pass: the judge of all runs, and a hash of the data that went in.
+
+        Memory holds a part of the runs at a time.
+        """
+        experiment, setting = self.experiment, self.setting
+        digest = hashlib.sha256()
+
+        def parts() -> Iterator[Part]:
+            for now in parts_of(experiment.runs):
+                sources = self.obtain(first_run=now.start, runs=now.stop - now.start)
+                places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
+                for source, (log, _) in zip(sources, places, strict=False):
+                    _write_log(source, log)
+                for source in sources:
+                    add_to_hash(digest, source)
+                estimates = [(path, log) for log, path in places]
+                yield Part(sources, now.start, len(sources) == experiment.runs, estimates)
+
+        with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
+            done = replay_parts(
+                parts(),
+                experiment.estimators,
+                gap_limit_s=experiment.gap_limit_s,
+                metrics=experiment.metrics,
+                save=setting.folder / "timeline.rrd",
+                on_errors=errors.add if errors else None,
+                progress=setting.progress,
+            )
+        return done.judge, digest.hexdigest()
+
+    def _places(self, folder: str, run: int) -> tuple[Path, Path]:
+        """Where a run's log and its estimates go."""
+        name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
+        return place / "logs" / name, place / "estimates" / name
+
+
+def _write_log(source: MemorySource, path: Path) -> None:
+    with LogWriter(path, source.run) as writer:
+        writer.write(source.streams.values())

@@ -1,0 +1,385 @@
+"""The judge: what the outputs of a replay are worth, block by block as they come.
+
+What it keeps are sums: of every metric, by step over the runs, and for each run by time. So memory does
+not grow with the length of a log, except by two numbers for each step of NEES.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from recorders.log import schemas
+from replay.engine.blocks import Ragged
+from replay.engine.failures import sentences_of
+from replay.engine.sources import Source
+from replay.judging.evaluation import (
+    Errors,
+    Floats,
+    Innovations,
+    errors_at,
+    errors_of,
+    innovations_of,
+    split_topic,
+    unjudged,
+)
+from replay.judging.metrics import (
+    Measurement,
+    Metric,
+    Output,
+    Sums,
+    covered,
+    estimated_share,
+    find_metrics,
+    step_bounds,
+)
+from replay.judging.set_errors import SetErrors, set_errors
+from replay.judging.sums import BinnedSums
+from replay.judging.truths import Truths
+
+GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
+FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
+COVERAGE = schemas.COVERAGE.full_name
+# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
+TOLD = ("failure", "skipped", "coverage")
+# Less than this share of a span is said; a run's first measurements may well be before the prior.
+LEAST_SHARE = 0.995
+# A table has at most so many steps; of more, neighbours share a row.
+STEPS = 1 << 17
+# The sums over time of one run: at most so many bins, of a millisecond times a power of two.
+TIME_BINS = 64
+TIME_BIN_NS = 1_000_000
+
+
+class Judged(NamedTuple):
+    """What is judged of a block: the errors of estimates and of sets, and the innovations."""
+
+    errors: list[Errors]
+    sets: list[SetErrors]
+    innovations: list[Innovations]
+
+
+@dataclass
+class Quantities:
+    """Sums of one estimate stream: what tables and figures are made of.
+
+    The columns of both sums are elapsed time, squared error of the position, of the rotation and of
+    each component, and NEES.
+    """
+
+    errors: Errors  # the last block: for names and kinds
+    by_step: BinnedSums
+    by_time: BinnedSums
+
+    def merge(self, other: "Quantities") -> None:
+        """Take in the sums of other runs."""
+        self.by_step.merge(other.by_step)
+        self.by_time.merge(other.by_time)
+
+
+@dataclass
+class Told:
+    """What a stream says of the replay itself, for sentences."""
+
+    failed: dict[int, str] = field(default_factory=dict)
+    speaking: set[int] | None = None
+    skipped: Counter[str] = field(default_factory=Counter)
+    covered: Sums = field(default_factory=dict)
+
+
+class Judge:
+    """Judges an ensemble, or a part of one, as its replay goes on.
+
+    Args:
+        sources: the runs.
+        metrics: what to compute; see `find_metrics`.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        first_run: the number of the first run in the whole ensemble.
+        settle_s: errors up to so long after the epoch are left out.
+        on_errors: is handed the errors of every block.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        metrics: Mapping[str, Metric[Any, Any]] | None = None,
+        *,
+        gap_limit_s: float,
+        first_run: int = 0,
+        settle_s: float | None = None,
+        on_errors: Callable[[Errors], None] | None = None,
+    ) -> None:
+        self.runs = len(sources)
+        self._sources = sources
+        self._names = {first_run + run: source.name for run, source in enumerate(sources)}
+        self._truths = [Truths(source) for source in sources]
+        self._gap_limit_s = gap_limit_s
+        self._first_run = first_run
+        self._settle_s = settle_s
+        self._on_errors = on_errors
+        self._measured = Measurement(find_metrics() if metrics is None else metrics)
+        self._quantities: dict[str, Quantities] = {}
+        self._steps: dict[str, NDArray[np.int64]] = {}
+        self._told: dict[str, Told] = {}
+        self._unjudged: dict[str, str] = {}
+
+    def add(self, outputs: Mapping[str, Ragged]) -> Judged:
+        """Judge a block of a replay's outputs, by topic."""
+        judged = Judged([], [], [])
+        for topic, rows in outputs.items():
+            schema = rows.stream.schema.full_name
+            if schema == GAUSSIAN:
+                self._add_estimates(topic, rows, judged)
+            elif schema == INNOVATION:
+                innovations = innovations_of(rows, self._first_run)
+                judged.innovations.append(innovations)
+                self._measured.add(topic, innovations)
+            self._listen(topic, rows)
+            named = (*split_topic(topic), topic.rpartition("/")[2])
+            self._measured.add(topic, Output(*named, rows, self._sources, self._first_run))
+        found = set_errors(
+            outputs, self._truths, gap_limit_s=self._gap_limit_s, first_run=self._first_run
+        )
+        for topic, sets in found.items():
+            judged.sets.append(sets)
+            self._measured.add(topic, sets)
+        return judged
+
+    def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
+        begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
+        if topic not in self._unjudged:
+            self._unjudged[topic] = _unjudged_sentence(rows, self._sources)
+        errors = errors_of(rows, self._truths, self._gap_limit_s, steps=begun, first_run=self._first_run)
+        self._steps[topic] = begun + np.diff(rows.offsets)
+        if errors is None:
+            return
+        if self._settle_s is not None:
+            errors = errors_at(errors, errors.elapsed_s > self._settle_s + 1e-9)
+        judged.errors.append(errors)
+        self._measured.add(topic, errors)
+        if self._on_errors is not None:
+            self._on_errors(errors)
+        columns = _columns_of(errors)
+        if topic not in self._quantities:
+            width = columns.shape[1]
+            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS)
+            self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
+        kept = self._quantities[topic]
+        kept.by_step.add(errors.step, columns)
+        kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
+
+    def _listen(self, topic: str, rows: Ragged) -> None:
+        """Take in what a stream says of the replay itself."""
+        schema = rows.stream.schema.full_name
+        told = self._told.setdefault(topic, Told())
+        speaking = np.flatnonzero(np.diff(rows.offsets)).tolist()
+        if schema == GAUSSIAN:
+            spoke = {self._first_run + run for run in speaking}
+            told.speaking = spoke | (told.speaking or set())
+        elif schema == FAILURE:
+            for run in speaking:
+                found = rows.of_run(run)
+                elapsed_s = (int(found.publish_time_ns[0]) - self._sources[run].epoch_ns) * 1e-9
+                reason = sentences_of(found.take(slice(0, 1)))[0]
+                sentence = f"{_what(topic)} failed at {elapsed_s:.3f} s: {reason}"
+                told.failed.setdefault(self._first_run + run, sentence)
+        elif schema == SKIPPED:
+            told.skipped.update(sentences_of(rows.stream))
+        elif schema == COVERAGE:
+            sums = covered(Output("", "", "", rows, self._sources))
+            told.covered = {name: told.covered.get(name, 0.0) + value for name, value in sums.items()}
+
+    def merge(self, other: "Judge") -> None:
+        """Take in what was judged of other runs."""
+        self.runs += other.runs
+        self._names |= other._names
+        self._measured.merge(other._measured)
+        self._unjudged |= other._unjudged
+        for topic, quantities in other._quantities.items():
+            if topic in self._quantities:
+                self._quantities[topic].merge(quantities)
+            else:
+                self._quantities[topic] = quantities
+        for topic, theirs in other._told.items():
+            ours = self._told.setdefault(topic, Told())
+            ours.failed |= theirs.failed
+            ours.skipped.update(theirs.skipped)
+            if theirs.speaking is not None:
+                ours.speaking = theirs.speaking | (ours.speaking or set())
+            for name, value in theirs.covered.items():
+                ours.covered[name] = ours.covered.get(name, 0.0) + value
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """The numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
+        return self._measured.finish()
+
+    @property
+    def tells(self) -> bool:
+        """Whether there are numbers, but for what a replay says of itself."""
+        return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
+
+    @property
+    def unjudged(self) -> list[str]:
+        """A sentence for every estimate of which the truth lacks components."""
+        return [sentence for sentence in self._unjudged.values() if sentence]
+
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for every run that an estimator could not follow to the end, or not at all."""
+        said: dict[tuple[str, int], str] = {}
+        for topic, told in self._told.items():
+            silent = self._names.keys() - told.speaking if told.speaking is not None else set()
+            said |= {(_what(topic), run): f"{_what(topic)} gave no estimates" for run in sorted(silent)}
+        for topic, told in self._told.items():
+            said |= {(_what(topic), run): sentence for run, sentence in told.failed.items()}
+        return [f"{self._names[run]}: {sentence}" for (_, run), sentence in said.items()]
+
+    @property
+    def losses(self) -> list[str]:
+        """A sentence for every case that was not estimated throughout, and for measurements not used."""
+        said = []
+        for topic, told in self._told.items():
+            share = estimated_share(told.covered)
+            if share is not None and share < LEAST_SHARE:
+                percent = f"{100 * share:.1f} % of the span was estimated"
+                said.append(f"{_what(topic)}: {percent}; its figures are of that")
+            for reason, count in told.skipped.items():
+                said.append(f"{_what(topic)}: {count} not used: {reason}")
+        return said
+
+    @property
+    def steps(self) -> dict[str, pd.DataFrame]:
+        """For every estimate stream with truth, by topic, a row per step: see `step_table`."""
+        return {topic: step_table(each) for topic, each in self._quantities.items()}
+
+    @property
+    def runs_table(self) -> pd.DataFrame:
+        """One row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
+        return _joined(run_table(each) for each in self._quantities.values())
+
+    @property
+    def times(self) -> pd.DataFrame:
+        """The same for each run's spans of time; `until_s` is where a span ends, after the epoch."""
+        return _joined(time_table(each) for each in self._quantities.values())
+
+    @property
+    def judged(self) -> dict[str, Errors]:
+        """Of every estimate stream that has errors, by topic, the last block: its names and kinds."""
+        return {topic: each.errors for topic, each in self._quantities.items()}
+
+
+def _joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    filled = [table for table in tables if len(table)]
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+
+
+def _what(topic: str) -> str:
+    return " ".join(filter(None, split_topic(topic)))
+
+
+def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
+    names = unjudged(estimates, sources)
+    if not names:
+        return ""
+    verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
+    truth = estimates.stream.metadata["truth"]
+    return f"{_what(estimates.stream.topic)}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+
+
+def _columns_of(errors: Errors) -> Floats:
+    """Rows (n, 4 + d) of what is summed; see `Quantities`."""
+    squared = errors.error**2
+    return np.column_stack(
+        [
+            errors.elapsed_s,
+            squared[:, errors.position].sum(axis=1),
+            squared[:, errors.rotation].sum(axis=1),
+            squared,
+            errors.nees,
+        ]
+    )
+
+
+def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
+    """Columns of RMSE by quantity and of the mean NEES."""
+    mean = sums / count[:, None]
+    columns: dict[str, Floats] = {}
+    if errors.position:
+        columns["position_rmse_m"] = np.sqrt(mean[:, 1])
+    if errors.rotation:
+        columns["orientation_rmse_deg"] = np.degrees(np.sqrt(mean[:, 2]))
+    for column, name in enumerate(errors.components):
+        columns[f"rmse_{name}"] = np.sqrt(mean[:, 3 + column])
+    return {**columns, "nees": mean[:, -1]}
+
+
+def step_table(quantities: Quantities) -> pd.DataFrame:
+    """One row per step over the runs: RMSE of position and components, mean NEES with its interval.
+
+    Where there are more than `STEPS` steps, a row is of several; `step` is the first of them.
+    """
+    errors, by_step = quantities.errors, quantities.by_step
+    cells, count, sums = by_step.filled()
+    low, high = step_bounds(np.ceil(count / by_step.width), len(errors.components))
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "step": cells[:, 1] * by_step.width,
+        "runs": np.ceil(count / by_step.width).astype(np.int64),
+        "elapsed_s": sums[:, 0] / count,
+        **_means(errors, count, sums),
+    }
+    return pd.DataFrame({**columns, "nees_low": low, "nees_high": high})
+
+
+def time_table(quantities: Quantities) -> pd.DataFrame:
+    """One row per run and span of time."""
+    errors, by_time = quantities.errors, quantities.by_time
+    cells, count, sums = by_time.filled()
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": cells[:, 0],
+        "until_s": (cells[:, 1] + 1) * by_time.width * 1e-9,
+        "estimates": count.astype(np.int64),
+    }
+    return pd.DataFrame({**columns, **_means(errors, count, sums)})
+
+
+def run_table(quantities: Quantities) -> pd.DataFrame:
+    """One row per run."""
+    errors = quantities.errors
+    cells, count, sums = quantities.by_time.filled()
+    runs, place = np.unique(cells[:, 0], return_inverse=True)
+    counts: Floats = np.bincount(place, count, len(runs)).astype(float)
+    totals: Floats = np.stack([np.bincount(place, each, len(runs)) for each in sums.T], axis=1)
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": runs,
+        "estimates": counts.astype(np.int64),
+    }
+    return pd.DataFrame({**columns, **_means(errors, counts, totals)})
+
+
+def error_table(errors: Errors) -> pd.DataFrame:
+    """One row per run and step: error and sigma of every component, NEES."""
+    sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": errors.run,
+        "step": errors.step,
+        "time_ns": errors.time_ns,
+        "elapsed_s": errors.elapsed_s,
+    }
+    for index, name in enumerate(errors.components):
+        columns[f"error_{name}"] = errors.error[:, index]
+        columns[f"sigma_{name}"] = sigma[:, index]
+    columns["nees"] = errors.nees
+    return pd.DataFrame(columns)

@@ -1,0 +1,88 @@
+"""Sums in bins: what is kept of errors whose number nobody knows beforehand."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+class BinnedSums:
+    """Sums of rows of numbers (n, columns) by group and by bin of a position, a whole number from 0 on.
+
+    Bin b holds the positions from b width to (b + 1) width. Where there is a limit, the width doubles
+    as often as needed, so that the sums never take more than `limit` bins a group.
+    """
+
+    def __init__(self, columns: int, *, width: int = 1, limit: int | None = None) -> None:
+        self.width = width
+        self._limit = limit
+        # first column: how many rows there were
+        self._sums: Floats = np.zeros((1, 0, 1 + columns))
+        self._bins = 0
+        self._groups = 0
+
+    def add(self, position: Integers, values: Floats, group: Integers | None = None) -> None:
+        """Add rows (n, columns) at positions (n,), of groups (n,), by default all of group 0."""
+        if len(position) == 0:
+            return
+        group = np.zeros(len(position), np.int64) if group is None else group
+        self._widen(int(position.max()))
+        bins = np.maximum(position, 0) // self.width
+        low, high = int(bins.min()), int(bins.max()) + 1
+        first, last = int(group.min()), int(group.max()) + 1
+        self._reserve(last, high)
+        cell = (group - first) * (high - low) + (bins - low)
+        shape, part = (last - first, high - low), self._sums[first:last, low:high]
+        part[:, :, 0] += np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+        for column in range(values.shape[1]):
+            sums = np.bincount(cell, values[:, column], shape[0] * shape[1])
+            part[:, :, 1 + column] += sums.reshape(shape)
+
+    def merge(self, other: "BinnedSums") -> None:
+        """Add the sums of others, which have the same columns."""
+        theirs = other._sums[: other._groups, : other._bins]
+        while self.width < other.width:
+            self._double()
+        width = other.width
+        while width < self.width:
+            theirs, width = _halved(theirs), 2 * width
+        self._reserve(len(theirs), theirs.shape[1])
+        self._sums[: len(theirs), : theirs.shape[1]] += theirs
+        while self._limit is not None and self._bins > self._limit:
+            self._double()
+
+    def filled(self) -> tuple[Integers, Floats, Floats]:
+        """Of every cell that has rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
+        used = self._sums[: self._groups, : self._bins]
+        cells = np.argwhere(used[:, :, 0] > 0)
+        rows = used[cells[:, 0], cells[:, 1]]
+        return cells, rows[:, 0], rows[:, 1:]
+
+    def _widen(self, position: int) -> None:
+        while self._limit is not None and position // self.width >= self._limit:
+            self._double()
+
+    def _double(self) -> None:
+        self._sums = _halved(self._sums[:, : self._bins])
+        self._bins = self._sums.shape[1]
+        self.width *= 2
+
+    def _reserve(self, groups: int, bins: int) -> None:
+        """Have room, with some to spare: growing again and again must not copy again and again."""
+        there = self._sums.shape
+        self._groups, self._bins = max(self._groups, groups), max(self._bins, bins)
+        if groups > there[0] or bins > there[1]:
+            wanted = [
+                have if need <= have else max(need, have + have // 2)
+                for need, have in ((groups, there[0]), (bins, there[1]))
+            ]
+            grown = np.zeros((*wanted, there[2]))
+            grown[: there[0], : there[1]] = self._sums
+            self._sums = grown
+
+
+def _halved(sums: Floats) -> Floats:
+    """Two bins made one."""
+    even = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, 0)))
+    return even[:, 0::2] + even[:, 1::2]

@@ -1,0 +1,55 @@
+"""`make docs-claims`: run the experiments, keep their results, and make the pages' tables from them."""
+
+import tempfile
+from pathlib import Path
+
+import click
+
+from pipeline.command_line import main as fuselog
+from pipeline.experiment import load_experiment, shipped
+from recorders.errors import choices
+from tests.claims import pages
+from tests.goldens.recipes import DATA, unpack
+
+
+@click.group()
+def main() -> None:
+    """Results of the shipped experiments, and the pages that are made from them."""
+
+
+@main.command()
+@click.argument("names", nargs=-1)
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path, exists=True),
+    envvar="FUSELOG_DATA",
+    required=True,
+    help="The folder of real data [default: FUSELOG_DATA of the environment].",
+)
+def run(names: tuple[str, ...], data: Path) -> None:
+    """Run the experiments NAMES, or all; keep their results."""
+    known = shipped("experiments")
+    for name in names:
+        if name not in known:
+            raise click.BadParameter(f"no experiment '{name}'; {choices(name, known)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        places = unpack(data, DATA, Path(scratch))
+        for name in names or known:
+            given = load_experiment(name, {}, {})[1].import_
+            source = ["--data", str(places[given.source])] if given else []
+            folder = Path(scratch) / "results" / name
+            if fuselog(["run", name, "--logs", "0", "--out", str(folder), *source]) != 0:
+                raise click.ClickException(f"{name}: its result stays as it was")
+            click.echo(pages.store(folder))
+
+
+@main.command()
+def render() -> None:
+    """Make what the pages say of results anew."""
+    for path in pages.PAGES:
+        page = path.read_text(encoding="utf-8")
+        path.write_text(pages.rendered(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+"""README, pages and stored results agree: what one of them says and another does not is found here."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.experiment import load_experiment, shipped
+from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from tests.claims import pages
+
+README = (pages.ROOT / "README.md").read_text(encoding="utf-8")
+ONES = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
+# Numbers of results that the README's sentences hold.
+STATED = [
+    "{broad[bingham.movement_rmse_deg]:.2f} deg on BROAD",
+    "{ais[report-tracker.kept_track_percent]:.0f} % of AIS vessels keep one track",
+]
+
+
+@pytest.mark.parametrize("path", pages.PAGES, ids=lambda path: path.stem)
+def test_a_page_says_what_the_results_say(path: Path) -> None:
+    page = path.read_text(encoding="utf-8")
+    assert pages.rendered(page) == page, "make docs makes it anew"
+    for link in re.findall(r"\]\((?!http)([^)#]+)\)", page):
+        assert (path.parent / link).exists(), link
+
+
+def test_every_experiment_has_its_result_and_every_claim_its_page() -> None:
+    """The results are of the experiments as they ship: a changed one is to be run again."""
+    assert set(pages.stored()) == set(shipped("experiments"))
+    templates = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES)
+    for name, result in pages.stored().items():
+        _, experiment = load_experiment(name, {}, {})
+        settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
+        assert result.settings == settings, f"make docs-claims NAMES={name}"
+        assert templates.count(f"{{{name}.claims}}") == (result.verdicts != "0, 0, 0"), name
+
+
+def test_the_readme_counts_what_there_is() -> None:
+    rows = re.findall(r"^\| .*?\| (`.*?) \| ([\d, ;]+) \|", README, re.MULTILINE)
+    assert f"## The {ONES[len(rows)]} systems" in README
+    assert f"{ONES[len(rows)]} published systems" in README
+    named = []
+    for experiments, counts in rows:
+        first, *others = re.findall(r"`(.*?)`", experiments)
+        stem = first.partition("-")[0]
+        names = [first, *(f"{stem}{each}" if each.startswith("-") else each for each in others)]
+        assert counts.split("; ") == [pages.stored()[name].verdicts for name in names], names
+        named += names
+    assert set(named) == {name for name, each in pages.stored().items() if each.verdicts != "0, 0, 0"}
+    for stated in STATED:
+        assert stated.format_map(pages.stored()) in README, stated
+    demo = load_experiment("landmarks", {}, {})[1]
+    assert f"replays {ONES[len(demo.estimators)]} estimators" in README
+
+
+def test_a_changed_result_changes_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    claims = [Claim("a | b", "1", "2", "refuted", "why"), Claim("c", "1", "1", "confirmed")]
+    outcome = Outcome({"ekf.rmse_m": 0.25, "ekf.nees.case": [1.0, float("nan")]}, claims)
+    with result_folder(tmp_path / "result") as folder:
+        write_outcome(folder, "mine", {"seed": 3, "runs": 7, "data": "/home/me"}, outcome)
+    monkeypatch.setattr(pages, "FOLDER", tmp_path / "kept")
+    kept = json.loads(pages.store(tmp_path / "result").read_text(encoding="utf-8"))
+    assert kept["settings"] == {"seed": 3, "runs": 7}
+    assert "files" not in kept
+    monkeypatch.setattr(pages, "stored", lambda: {"mine": pages.Stored(kept)})
+    template = "{mine[ekf.rmse_m]:.2f} and {mine[ekf.nees.case][0]:.0f}\n\n{mine.claims}"
+    text = pages.rendered(f"A\n<!-- results\n{template}\n-->\nold\n<!-- end -->\nZ")
+    assert text.partition("-->\n")[2] == (
+        "0.25 and 1\n\n"
+        "`fuselog run mine` (seed 3, 7 runs): 1 confirmed, 1 refuted, 0 not reproducible.\n\n"
+        "| claim | paper | ours | verdict |\n|---|---|---|---|\n"
+        "| a \\| b | 1 | 2 | refuted: why |\n| c | 1 | 1 | confirmed |\n<!-- end -->\nZ"
+    )
+    assert pages.rendered(text) == text
+    kept["metrics"]["ekf.rmse_m"] = 0.5
+    assert "0.50 and 1\n" in pages.rendered(text)

@@ -1,0 +1,60 @@
+"""What the repository says of itself: the rooms, the commands, the systems it is tried on."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def test_the_picture_of_the_house_is_what_is_checked() -> None:
+    """Rooms in the order of import-linter's contracts, and every room that there is."""
+    (picture,) = re.findall(r"```\n(pipeline .*?)```", CONTRIBUTING, re.DOTALL)
+    shown = re.findall(r"^ *(\w+)", picture, re.MULTILINE)
+    outer, inner, _ = PYPROJECT["tool"]["importlinter"]["contracts"]
+    rooms = [room for layer in inner["layers"] for room in layer.split(" | ")]
+    assert shown == [
+        each for top in outer["layers"] for each in [top, *(rooms if top == "replay" else [])]
+    ]
+    assert set(rooms) == {path.parent.name for path in ROOT.glob("replay/*/__init__.py")}
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", ".pre-commit-config.yaml"])
+def test_what_is_named_is_there(name: str) -> None:
+    """Targets of make, and files."""
+    text = (ROOT / name).read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z-]+):", MAKEFILE, re.MULTILINE))
+    named = set(re.findall(r"(?:`|^|entry: )make ([a-z-]+)", text, re.MULTILINE))
+    assert named
+    assert named <= targets
+    for path in re.findall(r"`((?:replay|recorders|pipeline|tests|data|docs|\.github)/[^` <]*)`", text):
+        assert "gliders" in path or (ROOT / path).exists(), path
+
+
+def test_ci_runs_the_two_commands_everywhere() -> None:
+    workflow: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text("utf-8"))
+    job = workflow["jobs"]["commands"]
+    matrix = job["strategy"]["matrix"]
+    assert matrix["system"] == ["ubuntu-latest", "macos-latest", "windows-latest"]
+    assert matrix["python"] == ["3.11", "3.12", "3.13", "3.14"]
+    assert f">={matrix['python'][0]}" == PYPROJECT["project"]["requires-python"]
+    assert job["defaults"]["run"]["shell"] == "bash"
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    assert commands[-2:] == ["make demo PYTHON=python", "make test PYTHON=python"]
+
+
+def test_no_file_cites_what_is_outside_the_repository() -> None:
+    for folder in ("recorders", "replay", "pipeline", "tests", "docs", "data"):
+        for path in (ROOT / folder).rglob("*.*"):
+            if path.suffix in (".py", ".md", ".toml") and path != Path(__file__):
+                found = re.search(
+                    r"\b(?:shared|spec|tech|papers)/[a-z]", path.read_text(encoding="utf-8")
+                )
+                assert not found, f"{path}: {found}"

@@ -1,0 +1,67 @@
+"""The command in a shell: names are completed as the README says; progress is for who watches."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+RUN = ["run", "landmarks", "--runs", "3", "--set", "duration_s=2", "--logs", "0"]
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
+def test_the_readmes_line_completes_commands_and_options() -> None:
+    """What bash offers after `fuselog re` and `fuselog cache --`, once the line has been run."""
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^eval .*_FUSELOG_COMPLETE=bash_source.*$", page, re.MULTILINE)
+    for words, expected in {
+        "fuselog re": {"record", "replay", "report"},
+        "fuselog cache --": {"--clear"},
+    }.items():
+        last = len(words.split()) - 1
+        script = (
+            f"{line}\nCOMP_WORDS=({words}); COMP_CWORD={last}\n"
+            "_fuselog_completion fuselog\nprintf '%s\\n' \"${COMPREPLY[@]}\""
+        )
+        environment = {**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+        done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True)
+        assert expected <= set(done.stdout.split()), done
+
+
+@pytest.mark.paper
+def test_nothing_is_said_of_progress_where_nobody_watches(
+    tmp_path: Path, start_fuselog: Callable[..., Any]
+) -> None:
+    """Of kernels that are compiled neither: with --json the output is one document and nothing else."""
+    fresh = {**os.environ, "FUSELOG_CACHE": str(tmp_path / "cache"), "NUMBA_DISABLE_JIT": "1"}
+    process = start_fuselog(*RUN, "--json", "--out", str(tmp_path / "r"), env=fresh)
+    out, err = process.communicate()
+    assert err == ""
+    assert json.loads(out)["experiment"] == "landmarks"
+
+
+@pytest.mark.paper
+@pytest.mark.unix
+def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable[..., Any]) -> None:
+    import pty
+
+    ours, theirs = pty.openpty()
+    with os.fdopen(ours, "rb", 0) as watched:
+        process = start_fuselog(*RUN, "--json", "--out", str(tmp_path / "r"), stderr=theirs)
+        os.close(theirs)
+        shown = b""
+        with suppress(OSError):  # Linux has no other end of a pseudo-terminal
+            while part := watched.read(4096):
+                shown += part
+        out, _ = process.communicate()
+    assert b"%" in shown
+    assert json.loads(out)["experiment"] == "landmarks"

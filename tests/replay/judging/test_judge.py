@@ -1,0 +1,169 @@
+"""The judge: the same numbers whatever the blocks and parts that it gets, and truths read along."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from recorders.log import Clock, Stream
+from recorders.recording import record_run
+from replay.engine.blocks import Ragged, gather
+from replay.engine.estimator import bind
+from replay.engine.replaying import Report, collect, replay
+from replay.engine.sources import MemorySource, memory_source
+from replay.judging.judge import Judge
+from replay.judging.sums import BinnedSums
+from replay.judging.truths import Truths
+
+GAP_S = 0.2
+
+
+@pytest.fixture(scope="module")
+def sources() -> list[MemorySource]:
+    return [memory_source(*record_run("landmarks", {"duration_s": 8.0}, 5, run)) for run in range(3)]
+
+
+@pytest.fixture(scope="module")
+def outputs(sources: list[MemorySource]) -> dict[str, Ragged]:
+    report = Report()
+    bound = [each for label in ("ekf", "dead-reckoning") for each in bind(label, sources, {})]
+    found = collect(replay(sources, bound, report=report))
+    return found | collect([report.coverage])
+
+
+def judged(sources: list[MemorySource], blocks: list[dict[str, Ragged]], first_run: int = 0) -> Judge:
+    judge = Judge(sources, gap_limit_s=GAP_S, first_run=first_run)
+    for block in blocks:
+        judge.add(block)
+    return judge
+
+
+def cut(outputs: dict[str, Ragged], time_ns: int) -> list[dict[str, Ragged]]:
+    """The outputs up to a stamp, and from there on."""
+    sides = []
+    for is_early in (True, False):
+        sides.append(
+            {
+                topic: gather(
+                    [
+                        rows.of_run(run).take((rows.of_run(run).publish_time_ns <= time_ns) == is_early)
+                        for run in range(rows.runs)
+                    ]
+                )
+                for topic, rows in outputs.items()
+            }
+        )
+    return sides
+
+
+def assert_alike(one: Judge, other: Judge) -> None:
+    """Sums of sums round otherwise, and nothing else differs."""
+    assert one.metrics == pytest.approx(other.metrics, rel=1e-12)
+    assert one.metrics.keys() == other.metrics.keys()
+    for table in ("runs_table", "times"):
+        pd.testing.assert_frame_equal(getattr(one, table), getattr(other, table), rtol=1e-12)
+    for topic, steps in one.steps.items():
+        pd.testing.assert_frame_equal(steps, other.steps[topic], rtol=1e-12)
+    assert (one.failures, one.losses, one.unjudged) == (other.failures, other.losses, other.unjudged)
+
+
+@pytest.mark.parametrize("at_s", [0.01, 1.0, 4.03, 7.99])
+def test_blocks_change_no_number(
+    sources: list[MemorySource], outputs: dict[str, Ragged], at_s: float
+) -> None:
+    blocks = cut(outputs, sources[0].epoch_ns + round(at_s * 1e9))
+    assert_alike(judged(sources, blocks), judged(sources, [outputs]))
+
+
+def test_parts_of_the_runs_merge_to_the_whole(
+    sources: list[MemorySource], outputs: dict[str, Ragged]
+) -> None:
+    def of_runs(runs: list[int]) -> dict[str, Ragged]:
+        return {topic: gather([rows.of_run(run) for run in runs]) for topic, rows in outputs.items()}
+
+    parts = judged(sources[:2], [of_runs([0, 1])])
+    parts.merge(judged(sources[2:], [of_runs([2])], first_run=2))
+    assert_alike(parts, judged(sources, [outputs]))
+    assert set(parts.runs_table["run"]) == {0, 1, 2}
+
+
+def test_the_runs_add_up_to_the_metrics(sources: list[MemorySource], outputs: dict[str, Ragged]) -> None:
+    """Every table comes from the same errors: weighted by its estimates, each gives the RMSE again."""
+    judge = judged(sources, [outputs])
+    expected = judge.metrics["ekf.position_rmse_m.robot1"]
+    for table in (judge.runs_table, judge.times):
+        own = table[table["estimator"] == "ekf"]
+        rmse = np.sqrt(np.average(own["position_rmse_m"] ** 2, weights=own["estimates"]))
+        assert rmse == pytest.approx(expected, rel=1e-12)
+        assert np.average(own["nees"], weights=own["estimates"]) == pytest.approx(
+            judge.metrics["ekf.nees.robot1"], rel=1e-12
+        )
+
+
+class InBlocks(MemorySource):
+    """A recording that is read sixteen messages of a topic at a time."""
+
+    def blocks(
+        self,
+        topics: Sequence[str],
+        order: Clock,  # noqa: ARG002
+        block_messages: int,  # noqa: ARG002
+    ) -> Iterator[dict[str, Stream]]:
+        """Of a truth, whose messages are in order."""
+        for first in range(0, max(len(self.streams[topic]) for topic in topics), 16):
+            rows = slice(first, first + 16)
+            yield {topic: self.streams[topic].take(rows) for topic in topics}
+
+
+def test_truths_are_read_along_and_again_for_who_comes_late(sources: list[MemorySource]) -> None:
+    """What all readers have passed is forgotten, but read anew for one that begins from the start."""
+    [topic, *_] = [topic for topic in sources[0].streams if topic.endswith("truth")]
+    whole = sources[0].streams[topic].publish_time_ns
+    truths = Truths(InBlocks(sources[0].streams, sources[0].run, "run"))
+
+    def held(rows: slice, reader: str) -> int:
+        found = truths.around(topic, whole[rows] + 1, GAP_S, reader)
+        needed = slice(rows.start, rows.stop + 1)  # a neighbour on each side
+        assert set(whole[needed]) <= set(found.publish_time_ns)
+        return len(found)
+
+    rows = [slice(at, at + 10) for at in range(0, len(whole) - 11, 10)]
+    assert max(held(each, "one") for each in rows) <= 10 + 2 * 16
+    assert held(rows[0], "two") < len(whole)
+    assert held(rows[-1], "one") >= len(whole) - 16  # the second reader is still at the beginning
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 5000), st.integers(0, 3), st.floats(-9, 9)), min_size=1, max_size=60
+    ),
+    st.integers(1, 60),
+    st.sampled_from([None, 4, 32]),
+)
+def test_binned_sums_are_the_same_in_any_cut(
+    rows: list[tuple[int, int, float]], at: int, limit: int | None
+) -> None:
+    position, group, value = (np.array(each) for each in zip(*rows, strict=True))
+
+    def summed(part: slice) -> BinnedSums:
+        sums = BinnedSums(1, limit=limit)
+        sums.add(position[part], value[part, None].astype(float), group[part])
+        return sums
+
+    whole, merged, added = summed(slice(None)), summed(slice(0, at)), summed(slice(0, at))
+    merged.merge(summed(slice(at, None)))
+    added.add(position[at:], value[at:, None].astype(float), group[at:])
+    for sums in (merged, added):
+        assert sums.width == whole.width
+        for one, other in zip(sums.filled(), whole.filled(), strict=True):
+            assert_allclose(one, other, atol=1e-12)
+    cells, count, _ = whole.filled()
+    assert limit is None or len(np.unique(cells[:, 1])) <= limit
+    assert count.sum() == len(rows)
+    for (number, at_bin), n in zip(cells.tolist(), count.tolist(), strict=True):
+        assert n == np.sum((group == number) & (position // whole.width == at_bin))
+    assert_array_equal(np.unique(cells[:, 0]), np.unique(group))

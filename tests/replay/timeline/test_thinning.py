@@ -1,0 +1,84 @@
+"""What is kept of a long run for its timeline, and what a receiver sees while a replay goes on."""
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from pipeline.ensemble import Part, replay_parts
+from recorders.log import make_stream, open_log, schemas, write_log
+from recorders.recording import record_run
+from replay.engine.sources import LogSource
+from replay.timeline.thinning import thinned_stream
+from replay.timeline.viewer import listen
+from tests.replay.timeline.test_timeline import read
+
+
+@given(
+    st.lists(st.integers(0, 10**6), min_size=1, max_size=200),
+    st.lists(st.integers(0, 200), max_size=4),
+)
+def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[int]) -> None:
+    """At most so many rows, whole stamps, the last one among them."""
+    times = np.sort(stamps)
+    stream = make_stream("/x", schemas.VECTOR_MEASUREMENT, times, value=times[:, None].astype(float))
+    whole, parts = thinned_stream("x", 20), thinned_stream("x", 20)
+    whole.add(stream)
+    for rows in np.split(np.arange(len(times)), sorted(min(cut, len(times)) for cut in cuts)):
+        parts.add(stream.take(rows))
+    for kept in (whole.rows, parts.rows):
+        assert len(kept) <= max(40, np.unique(times, return_counts=True)[1].max())
+        assert kept.publish_time_ns[-1] == times[-1]
+        for stamp in np.unique(kept.publish_time_ns):
+            assert np.sum(kept.publish_time_ns == stamp) == np.sum(times == stamp)
+    if len(times) <= 40:
+        assert_array_equal(whole.rows.publish_time_ns, times)
+
+
+def test_a_receiver_sees_estimates_before_the_replay_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log of several blocks: errors and their plots are there while blocks are still to come."""
+    monkeypatch.setattr("replay.timeline.show.LIVE_MESSAGES", 500)
+    log, live = tmp_path / "log.mcap", tmp_path / "live.rrd"
+    recording, run = record_run("landmarks", {"duration_s": 1500.0}, 3, 0)
+    write_log(log, recording.streams, run)
+    seen: list[int] = []
+
+    def drawn() -> int:
+        with suppress(RuntimeError, FileNotFoundError):  # the receiver is still writing
+            plots = read(live).get("/plots/robot1/nees_3/ekf", {})
+            return len(plots.get("sim_time", []))
+        return 0
+
+    def watched(items: Iterable[Any], title: str, total: int | None) -> Iterator[Any]:
+        for item in items:
+            yield item
+            end = time.monotonic() + 5.0
+            while len(seen) == 2 and not drawn() and time.monotonic() < end:
+                time.sleep(0.1)
+            seen.append(drawn() if len(seen) in (2, 3) else 0)
+
+    with listen(tmp_path, "--save", str(live)) as receiver:
+        part = Part([LogSource(open_log(log))])
+        replay_parts(
+            [part],
+            {"ekf": {}},
+            gap_limit_s=0.2,
+            connect=receiver.url,
+            block_messages=3000,
+            progress=watched,
+        )
+        assert len(seen) > 6  # blocks
+        assert 0 < seen[2] < 30_000
+        end = time.monotonic() + 10.0
+        while drawn() < 20_000 and time.monotonic() < end:
+            time.sleep(0.1)
+        assert drawn() >= 20_000
