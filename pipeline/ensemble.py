@@ -26,8 +26,8 @@ from recorders.log import Clock, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound, bind
-from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, ensemble_blocks, replay
-from replay.engine.sources import MemorySource, Source, memory_source
+from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
+from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
 from replay.judging.judge import TIME_BINS, Judge
 from replay.judging.metrics import Metric, Output, find_metrics, measure
@@ -251,8 +251,8 @@ def judge_logs(
         judge = Judge(
             sources[now], metrics, gap_limit_s=gap_limit_s, first_run=now.start, on_errors=on_errors
         )
-        blocks = ensemble_blocks(estimates[now], held[0], "publish_time", BLOCK_MESSAGES) if held else ()
-        for block in blocks:
+        runs = ensemble_of(estimates[now])
+        for block in runs.blocks(held[0], "publish_time", BLOCK_MESSAGES) if held else ():
             judged = judge.add(block)
             if drawing is not None and now.start == 0:
                 drawing.add(*of_run(block, judged.errors, 0))
@@ -297,7 +297,7 @@ def record_ensemble(
     executor: Executor | None = None,
     first_run: int = 0,
     all_runs: int = 0,
-) -> list[MemorySource]:
+) -> Ensemble[MemorySource]:
     """Record so many runs of a scenario, each from its own random stream of `seed`.
 
     Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
@@ -313,7 +313,7 @@ def record_ensemble(
     require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
     numbers = range(first_run + 1, first_run + runs)
     others = executor.map(record, numbers) if executor else map(record, numbers)
-    return list(progress(chain([first], others), f"recording {scenario}", runs))
+    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:

@@ -1,6 +1,7 @@
 """What the channels of a log state, and which of its topics are numbered: what estimators bind by."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -23,20 +24,22 @@ def stated(
     """
     for topic in topics:
         if name in topic.metadata:
-            text = topic.metadata[name]
-            try:
-                value = float(text)
-            except ValueError:
-                raise BadInput(
-                    f"topic {topic.name} states {name} = {text}, which is no number"
-                ) from None
-            if parameters is not None:
-                build(parameters, {name: value}, f"topic {topic.name}")
-            return value
+            return _number(topic.name, name, topic.metadata[name], parameters)
     if needed:
         mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
         raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
     return np.nan
+
+
+@lru_cache(maxsize=256)
+def _number(topic: str, name: str, text: str, parameters: type[Parameters] | None) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise BadInput(f"topic {topic} states {name} = {text}, which is no number") from None
+    if parameters is not None:
+        build(parameters, {name: value}, f"topic {topic}")
+    return value
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:

@@ -19,7 +19,7 @@ from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
 from replay.engine.compile import DoesNotCompile
 from replay.engine.components import Components
-from replay.engine.sources import Source
+from replay.engine.sources import Source, ensemble_of
 
 
 @dataclass(frozen=True)
@@ -145,19 +145,8 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
-    for source in sources[1:]:
-        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
-            here, there = first.topics[topic], source.topics.get(topic)
-            if there is None or _stated(there) != _stated(here):
-                raise BadInput(
-                    f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
-                    "ensemble hold the same topics, replay this one on its own"
-                )
+    read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
+    ensemble_of(sources).require_alike(read)
     return [
         each if each.parameters is not None else replace(each, parameters=parameters) for each in bound
     ]
-
-
-def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
-    """What an estimator is told of a topic when it is bound."""
-    return topic.schema_name, topic.metadata

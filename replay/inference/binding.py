@@ -169,24 +169,31 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     given = {name: getattr(parameters, name) for name in names}
     everything = [topic for topic in (found.control, found.prior) if topic is not None]
     everything += [topic for _, topic in found.sensors]
-    where = f"estimator {label}"
-    check_state(where, model)
-    recorders = [_Recorder(given) for _ in range(1 + len(found.sensors))]
-    check_motion(where, model, stage.motion, recorders[0])
-    for (sensor, _), recorder in zip(found.sensors, recorders[1:], strict=True):
-        check_sensor(where, model, sensor, recorder)
+    needed = _needed(f"estimator {label}", stage, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
     return np.array(
         [
             [
-                stated([*first, *everything], name, model.parameters, needed=name in recorder.read)
+                stated([*first, *everything], name, model.parameters, needed=name in read)
                 if given[name] is None
                 else float(given[name])
                 for name in names
             ]
-            for first, recorder in zip(own, recorders, strict=True)
+            for first, read in zip(own, needed, strict=True)
         ]
     )
+
+
+@lru_cache(maxsize=64)
+def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tuple[set[str], ...]:
+    """The parameters that motion and sensors read; BadInput where the model is not what it says."""
+    model, values = stage.model, dict(given)
+    check_state(where, model)
+    motion, *sensors = recorders = [_Recorder(values) for _ in range(1 + len(stage.sensors))]
+    check_motion(where, model, stage.motion, motion)
+    for sensor, recorder in zip(stage.sensors, sensors, strict=True):
+        check_sensor(where, model, sensor, recorder)
+    return tuple(each.read for each in recorders)
 
 
 def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:

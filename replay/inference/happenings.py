@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -50,6 +51,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
+@lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
     """How many numbers an event has, and the first of the control's among them."""
     width, control = (

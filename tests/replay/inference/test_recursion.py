@@ -17,6 +17,7 @@ from recorders.recording import Recording
 from replay.engine.blocks import Ragged
 from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.inference.happenings import times_alone, with_ticks
+from replay.inference.recursion import no_results
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A
@@ -313,3 +314,26 @@ def test_ticks_are_multiples_of_their_interval_beside_the_sensors_stamps() -> No
     at_own = np.isin(times_ns, own)
     assert_allclose(ticked["mean"][at_own], plain["mean"], atol=0.05)  # shorter steps of the motion
     assert_array_equal(ticked["mean"][0], vehicle_a.MEAN)
+
+
+def test_results_are_one_piece_of_memory_and_columns_of_their_own():
+    """Runs of 2 and 3 estimates, and of 1 and 4 innovations in two slots."""
+    due, noted = np.array([0, 2, 5]), np.array([0, 1, 5])
+    estimates, innovations = no_results(due, noted, VEHICLE_A, 2)
+    n, t = VEHICLE_A.size, VEHICLE_A.tangent
+    columns = [*estimates[1:], *innovations[1:]]
+    shapes = [(5,), (5, n), (5, t, t), (5,), (5,), (5, 2), (5, 2, 2), (5, 3)]
+    assert [column.shape for column in columns] == shapes
+    for number, column in enumerate(columns):
+        column[...] = number
+    for number, column in enumerate(columns):
+        assert_array_equal(column, number)
+        assert column.flags.c_contiguous
+        assert np.shares_memory(column, _whole(columns[1]))
+    assert_array_equal(estimates.end, [0, 2])
+    assert_array_equal(innovations.end, [0, 1])
+
+
+def _whole(column: Any) -> Any:
+    """The memory that a column is a part of."""
+    return column if column.base is None else _whole(column.base)
