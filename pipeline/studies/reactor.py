@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
+from pipeline.charts import Chart
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Record, Setting, Study
 from pipeline.results import Claim, MetricValue, Outcome, judged
@@ -19,8 +19,8 @@ from pipeline.studies.linearization import (
     Ensemble,
     Options,
     averages,
-    draw_errors,
     ensembles,
+    error_panel,
     falling,
     listed,
     rmse,
@@ -48,7 +48,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             sources += ensemble.sources
         steps = pd.concat(tables).assign(case=case)
         outcome.tables[f"steps-{case}"] = steps
-        outcome.figures[f"errors-{case}"] = error_figure(steps, CASES[case])
+        outcome.figures[f"errors-{case}"] = error_chart(steps, CASES[case])
         outcome.metrics |= metrics(steps, case)
         outcome.claims += claims(steps, CASES[case])
     outcome.input_sha256 = hash_streams(sources)
@@ -181,16 +181,17 @@ def claims(steps: pd.DataFrame, case: str) -> list[Claim]:
     return [replace(each, claim=f"{each.claim} ({case})") for each in found]
 
 
-def error_figure(steps: pd.DataFrame, case: str) -> Figure:
+def error_chart(steps: pd.DataFrame, case: str) -> Chart:
     """Fig. 7: RMSE of mean and covariance against the exact moments, over the steps."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
     approximate = steps[steps["estimator"] != REFERENCE]
-    draw_errors(left, approximate, "mean_rmse", "RMSE of the mean")
-    draw_errors(right, approximate, "covariance_rmse", "RMSE of the covariance")
-    left.legend(fontsize="small")
-    figure.suptitle(f"Batch reactor against the analytic moments, {case}")
-    return figure
+    return Chart(
+        title=f"Batch reactor against the analytic moments, {case}",
+        columns=2,
+        panels=[
+            error_panel(approximate, "mean_rmse", "RMSE of the mean"),
+            error_panel(approximate, "covariance_rmse", "RMSE of the covariance"),
+        ],
+    )
 
 
 REACTOR = Study(

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
+from pipeline.charts import Axis, Chart, Panel, curve
 from pipeline.ensemble import Replayed, hash_streams, require_memory
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Claim, Outcome
@@ -128,7 +129,7 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
         own = found[f"five-w{100 * options.central_weights[0]:g}"]
         outcome.claims += _propagation_claims(case, own, found["ukf"], found["random"])
     outcome.tables["errors"] = pd.concat(tables)
-    outcome.figures["errors"] = propagation_figure(outcome.tables["errors"], options)
+    outcome.figures["errors"] = propagation_chart(outcome.tables["errors"], options)
     return outcome
 
 
@@ -169,23 +170,29 @@ def _propagation_claims(
     return claims
 
 
-def propagation_figure(table: pd.DataFrame, options: PropagationOptions) -> Figure:
+def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
     """Errors over the correlation: a column per coupling, mean above and covariance below."""
-    columns = len(options.couplings_rad)
-    figure = Figure(figsize=(2.6 * columns + 1, 5), layout="constrained")
-    axes = np.reshape(figure.subplots(2, columns, sharex=True), (2, columns))
-    for column, coupling_rad in enumerate(options.couplings_rad):
-        of_coupling = table[table["coupling_rad"] == coupling_rad]
-        for name, rows in of_coupling.groupby("samples", sort=False):
-            for row, quantity in enumerate(("mean_error_rad", "covariance_error_rad2")):
-                axes[row, column].plot(rows["correlation"], rows[quantity], label=name, lw=1)
-                axes[row, column].set_yscale("log")
-        axes[0, column].set_title(f"c = {coupling_rad:g} rad")
-        axes[1, column].set_xlabel("correlation")
-    axes[0, 0].set_ylabel("error of the mean (rad)")
-    axes[1, 0].set_ylabel("error of the covariance (rad²)")
-    axes[0, 0].legend(fontsize=7)
-    return figure
+    quantities = {
+        "mean_error_rad": "error of the mean (rad)",
+        "covariance_error_rad2": "error of the covariance (rad²)",
+    }
+    panels = []
+    for quantity, label in quantities.items():
+        for coupling_rad in options.couplings_rad:
+            of_coupling = table[table["coupling_rad"] == coupling_rad]
+            series = [
+                curve(str(name), rows["correlation"], rows[quantity])
+                for name, rows in of_coupling.groupby("samples", sort=False)
+            ]
+            panels.append(
+                Panel(
+                    title=f"c = {coupling_rad:g} rad",
+                    x=Axis(label="correlation"),
+                    y=Axis(label=label, log=True),
+                    series=series,
+                )
+            )
+    return Chart(columns=len(options.couplings_rad), panels=panels)
 
 
 class FilterOptions(Parameters):
