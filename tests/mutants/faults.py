@@ -290,8 +290,8 @@ FAULTS = [
     ),
     Fault(
         "replay/judging/evaluation.py",
-        "tail = 0.5 * (1 - probability)",
-        "tail = 1 - probability",
+        "tail = 0.5 * (1 - probability)\n    interval",
+        "tail = 1 - probability\n    interval",
         EVALUATION,
     ),
     Fault(
@@ -479,7 +479,7 @@ FAULTS = [
         "tests/pipeline/test_experiments.py",
     ),
     Fault(
-        "pipeline/results.py",
+        "pipeline/claims.py",
         'if not re.search(r"\\bnan\\b", claim.ours):',
         "if True:",
         "tests/pipeline/test_experiments.py",

@@ -14,9 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.claims import Claim
 from pipeline.ensemble import hash_files, hash_streams, record_ensemble
 from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
-from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from pipeline.results import Outcome, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
