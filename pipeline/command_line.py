@@ -241,7 +241,8 @@ def view(path: Path, **options: Any) -> None:
 
 
 @fuselog.command(short_help="Run an experiment: record, replay, evaluate, draw.")
-@click.argument("experiment")
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option(
@@ -252,8 +253,16 @@ def view(path: Path, **options: Any) -> None:
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
 @json_option
 @set_option
-def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> None:
+def run(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    **options: Any,
+) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
+
+    Or replay logs as an experiment: fuselog run LOG.mcap ... -e ekf -e ukf --out DIR
 
     --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
     --set gap_limit_s=1 an entry of the experiment.
@@ -261,7 +270,7 @@ def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> 
     from pipeline.commands import run_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
-    run_named(experiment, over, **options)
+    run_named(experiment, labels, over, **options)
 
 
 @fuselog.command(short_help="Render results as one self-contained HTML page.")

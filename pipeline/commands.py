@@ -3,7 +3,6 @@
 Rerun and matplotlib take long to import: only what draws imports them.
 """
 
-import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -11,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.ensemble import Part, judge_logs, parts_of, replay_parts
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.ensemble import Part, hash_files, judge_logs, parts_of, replay_parts
+from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
 from pipeline.starting import Origin, from_estimates, from_truth
@@ -246,7 +245,7 @@ def evaluate_logs(
                 "metrics": list(metrics),
             }
             outcome = summarise(judge)
-            outcome.input_sha256 = _hash_files([*estimates, *places])
+            outcome.input_sha256 = hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
     _state_losses([*opened, *(source.log for source in sources)])
     _print_outcome(judge, estimators, as_json=as_json, written=[out] if out else [])
@@ -281,14 +280,6 @@ def _check_same_run(estimates: Log, log: Log) -> None:
             f"{estimates.path}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
             f"{log.path} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
         )
-
-
-def _hash_files(paths: Sequence[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
 
 
 def _print_outcome(
@@ -375,7 +366,8 @@ def _draw_log(
 
 
 def run_named(
-    name: str,
+    named: Sequence[str],
+    labels: Sequence[str],
     over: Mapping[str, Any],
     *,
     logs: int,
@@ -385,10 +377,20 @@ def run_named(
     as_json: bool,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment and print its metrics and claims."""
-    label, experiment = load_experiment(name, parse_settings(settings), over)
+    """Run an experiment, or replay logs as one, and print its metrics and claims."""
+    values = parse_settings(settings)
+    files = [Path(each) for each in named if each.endswith(".mcap")]
+    if files:
+        if len(files) < len(named) or over or data is not None:
+            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        experiment = experiment_of_logs(files, labels, values)
+        label = experiment.title
+    else:
+        if len(named) > 1 or labels:
+            raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+        label, experiment = load_experiment(named[0], values, over)
     folder = out or Path("out") / label
-    inputs = [Path(name)] if name.endswith(".toml") else []
+    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
     result = run_experiment(
         label, experiment, folder, data=data, logs=logs, errors=errors, progress=progress

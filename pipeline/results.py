@@ -7,16 +7,16 @@ it, so that nothing else is ever replaced with it.
 import hashlib
 import json
 import math
-import re
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import quote
 
 from pipeline.charts import Chart, draw
+from pipeline.claims import Claim, decided
 from recorders.atomic import whole_folder
 from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
@@ -33,25 +33,8 @@ RESULT_FILE = "result.json"
 CSV_ROWS = 20_000
 # Raised when result.json changes in a way that its readers must know; one without it is of the first.
 FORMAT = 1
-Verdict = Literal["confirmed", "refuted", "not reproducible"]
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A statement of a paper: what it prints, what we measured, our verdict and its reason."""
-
-    claim: str
-    paper: str
-    ours: str
-    verdict: Verdict
-    why: str = ""
-
-
-def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
-    """A claim that a measured condition confirms or refutes."""
-    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
 
 
 @dataclass
@@ -59,7 +42,8 @@ class Outcome:
     """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
 
     `bounds` are where a metric lies with 95 % if all is well. A figure is a chart, or a picture of
-    another kind. `input_sha256` is a hash of the data that went in.
+    another kind. `input_sha256` is a hash of the data that went in, `parameters` are those of all
+    estimators, defaults included.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -67,6 +51,7 @@ class Outcome:
     tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
     figures: dict[str, "Chart | Figure"] = field(default_factory=dict)
     input_sha256: str = ""
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     bounds: dict[str, Bounds] = field(default_factory=dict)
 
 
@@ -269,7 +254,7 @@ def write_outcome(
             input_sha256=outcome.input_sha256,
             metrics=in_order(plain(outcome.metrics), settings.get("estimators", ())),
             bounds={key: bounds for key, bounds in outcome.bounds.items() if key in outcome.metrics},
-            claims=[_decided(claim) for claim in outcome.claims],
+            claims=[decided(claim) for claim in outcome.claims],
             files={
                 path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else _hash(path)
                 for path in written
@@ -294,14 +279,6 @@ def _show_names_as_they_are(figure: "Figure") -> None:
                 texts += axis.get_ticklabels()
     for text in texts:
         text.set_parse_math(False)
-
-
-def _decided(claim: Claim) -> Claim:
-    """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
-    if not re.search(r"\bnan\b", claim.ours):
-        return claim
-    why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
-    return replace(claim, verdict="not reproducible", why=why)
 
 
 def read_result(folder: Path) -> Result:

@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from pipeline.results import Bounds, Claim, Measured, MetricValue, metric_tables
+from pipeline.claims import Claim
+from pipeline.results import Bounds, Measured, MetricValue, metric_tables
 from recorders.errors import printable
 
 

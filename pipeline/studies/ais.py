@@ -9,9 +9,10 @@ import pandas as pd
 from pydantic import NonNegativeInt, PositiveFloat
 
 from pipeline.charts import Axis, Chart, Panel, curve, level, thinned
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summary_table
 from recorders.errors import BadInput

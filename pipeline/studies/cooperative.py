@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.claims import Claim, judged
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies import localization
 
 ALONE, NAIVE, CI, JOINT = "alone", "naive", "ci", "joint"

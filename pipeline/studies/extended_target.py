@@ -11,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from pipeline.charts import Axis, Chart, band
+from pipeline.claims import Claim, judged, named
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies.linearization import (
     REFERENCE,
     Ensemble,
@@ -22,7 +23,6 @@ from pipeline.studies.linearization import (
     ensembles,
     error_panel,
     falling,
-    listed,
     rmse,
 )
 from recorders.models.extended_target import area_m2
@@ -169,7 +169,7 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
         judged(
             "The RUKF estimates the target much too small (Fig. 10, step 75)",
             "far smaller than the target",
-            f"median area {listed(median, 'rukf-10', REFERENCE)} m2",
+            f"median area {named(median, 'rukf-10', REFERENCE)} m2",
             median["rukf-10"] < 0.8 * median[REFERENCE],
         ),
         judged(
@@ -181,20 +181,20 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
         judged(
             "The S2KF with 50 samples has the smallest position error of the paper's filters",
             "quickly to an error of nearly zero",
-            f"at step {last}: {listed(position[last], *PAPER)} m",
+            f"at step {last}: {named(position[last], *PAPER)} m",
             position[last]["s2kf-50"] == min(position[last][name] for name in PAPER),
         ),
         judged(
             "All filters quickly decrease their position error, the UKF to a higher level",
             "UKF a little higher",
-            f"step {first}: {listed(position[first], *PAPER)}; {last}: {listed(position[last], *PAPER)}",
+            f"step {first}: {named(position[first], *PAPER)}; {last}: {named(position[last], *PAPER)}",
             all(position[last][name] < position[first][name] for name in PAPER)
             and position[last]["ukf"] == max(position[last][name] for name in PAPER),
         ),
         judged(
             "The area converges to the analytic filter's with more samples, whatever the sample sets",
             "convergence evident from 25 to 50 samples",
-            f"step {last}, one set each: {listed(area[last], *SMART)} m2",
+            f"step {last}, one set each: {named(area[last], *SMART)} m2",
             falling([area[last][name] for name in SMART]),
             "a set is unique only up to a rotation, and in 8 dimensions the results depend on it",
         ),

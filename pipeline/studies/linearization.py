@@ -124,8 +124,3 @@ def averages(rows: pd.DataFrame, quantity: str) -> dict[str, float]:
     """The average over steps and seeds by estimator."""
     mean = rows.groupby("estimator", sort=False)[quantity].mean()
     return {str(name): float(value) for name, value in mean.items()}
-
-
-def listed(values: Mapping[str, float], *names: str) -> str:
-    """Names with their numbers, for a claim."""
-    return ", ".join(f"{name} {values[name]:.3g}" for name in names)

@@ -18,9 +18,9 @@ from replay.judging.judge import Judge
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    judge, input_sha256 = Runner(experiment, setting).judge()
-    outcome = summarise(judge)
-    outcome.input_sha256 = input_sha256
+    done, input_sha256 = Runner(experiment, setting).judge()
+    outcome = summarise(done.judge)
+    outcome.input_sha256, outcome.parameters = input_sha256, done.parameters
     return outcome
 
 

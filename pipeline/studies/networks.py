@@ -14,9 +14,10 @@ import pandas as pd
 from pydantic import NonNegativeFloat
 
 from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summarise
 from recorders.errors import BadInput

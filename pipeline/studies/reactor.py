@@ -11,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from pipeline.charts import Chart
+from pipeline.claims import Claim, judged, named
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Record, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies.linearization import (
     REFERENCE,
     Ensemble,
@@ -22,7 +23,6 @@ from pipeline.studies.linearization import (
     ensembles,
     error_panel,
     falling,
-    listed,
     rmse,
 )
 from recorders.errors import BadInput
@@ -129,43 +129,43 @@ def claims(steps: pd.DataFrame, case: str) -> list[Claim]:
         judged(
             "The S2KF converges to the analytic moments with more samples",
             "errors fall with L",
-            f"mean {listed(mean, *SMART)}; covariance {listed(covariance, *SMART)}",
+            f"mean {named(mean, *SMART)}; covariance {named(covariance, *SMART)}",
             falling([mean[name] for name in SMART]) and falling([covariance[name] for name in SMART]),
         ),
         judged(
             "With 50 samples or more the S2KF has the best means of all",
             "best of all investigated LRKFs",
-            listed(mean, *OTHERS, *SMART[2:]),
+            named(mean, *OTHERS, *SMART[2:]),
             max(mean[name] for name in SMART[2:]) < min(mean[name] for name in OTHERS),
         ),
         judged(
             "All S2KF have better means than GF and RUKF",
             "much better",
-            listed(mean, "gf-25", "rukf-12", *SMART),
+            named(mean, "gf-25", "rukf-12", *SMART),
             max(mean[name] for name in SMART) < min(mean["gf-25"], mean["rukf-12"]),
         ),
         judged(
             "The RUKF's means are constantly worse than the UKF's",
             "constantly at a higher level",
-            f"{listed(mean, 'ukf', 'rukf-12')}; worse in {above:.0%} of the steps",
+            f"{named(mean, 'ukf', 'rukf-12')}; worse in {above:.0%} of the steps",
             above > 0.95,
         ),
         judged(
             "The GF starts with a very high error of the mean, which falls",
             "very high RMSE at the beginning",
-            f"steps 1 to {EARLY}: {listed(early, *OTHERS)}; last {EARLY}: {listed(late, *OTHERS)}",
+            f"steps 1 to {EARLY}: {named(early, *OTHERS)}; last {EARLY}: {named(late, *OTHERS)}",
             early["gf-25"] > max(late["gf-25"], 1.5 * early["ukf"], 1.5 * early["rukf-12"]),
         ),
         judged(
             "The UKF's covariance is closer to the analytic one than those of GF and RUKF",
             "much closer",
-            listed(covariance, *OTHERS),
+            named(covariance, *OTHERS),
             covariance["ukf"] < min(covariance["gf-25"], covariance["rukf-12"]),
         ),
         judged(
             "The S2KF's covariances outperform the UKF's with 50 samples or more",
             "can outperform the UKF",
-            listed(covariance, "ukf", *SMART[2:]),
+            named(covariance, "ukf", *SMART[2:]),
             max(covariance[name] for name in SMART[2:]) < covariance["ukf"],
         ),
     ]

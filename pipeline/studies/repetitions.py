@@ -8,12 +8,11 @@ for its 100 runs can be tried as often.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pipeline.charts import Axis, Series, curve
 from pipeline.ensemble import Replayed
-from pipeline.results import Verdict
 from recorders.errors import BadInput
 from replay.judging.evaluation import Errors
 
@@ -68,16 +67,6 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
 def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
     """Whether a share of `independent` trials is, within two standard errors, at least as expected."""
     return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
-
-
-def verdict(holds: bool) -> Verdict:
-    """What a claim comes to where it can be tried."""
-    return "confirmed" if holds else "refuted"
-
-
-def listed(values: ArrayLike, digits: int = 2) -> str:
-    """Numbers for a sentence."""
-    return " ".join(f"{value:.{digits}f}" for value in np.ravel(values))
 
 
 def groups(

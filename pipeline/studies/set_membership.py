@@ -11,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from pipeline.charts import Axis, Chart, Panel, curve, path
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Record, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.runner import Runner
 from replay.judging.evaluation import split_topic
 from replay.judging.set_evaluation import JudgedSets, frames_of, judge_sets

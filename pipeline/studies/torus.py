@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from pipeline.charts import Axis, Chart, Panel, curve
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams, require_memory
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.repetitions import rmse_of_runs
 from recorders.errors import BadInput
@@ -158,13 +159,13 @@ def _propagation_claims(
         for ours, theirs in zip(own, rival, strict=True):
             wins.append(int((ours < np.atleast_2d(theirs).mean(axis=0)).sum()))
         claims.append(
-            Claim(
+            judged(
                 f"significantly outperforms {name}: {case}",
                 "smaller errors of mean and covariance at every correlation",
                 f"mean {own.mean.mean():.4f} against {rival.mean.mean():.4f} rad, wins {wins[0]} of "
                 f"{count}; covariance {own.covariance.mean():.4f} against "
                 f"{rival.covariance.mean():.4f} rad^2, wins {wins[1]} of {count}",
-                "confirmed" if min(wins) == count else "refuted",
+                min(wins) == count,
             )
         )
     return claims
@@ -255,11 +256,11 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
 def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Claim]:
     own = rmse[estimator]
     claims = [
-        Claim(
+        judged(
             f"at least as good as {name}: {case}",
             "announced as future work, without numbers",
             f"{own:.4f} against {rival:.4f} rad per angle",
-            "confirmed" if own <= 1.005 * rival else "refuted",
+            own <= 1.005 * rival,
         )
         for name, rival in rmse.items()
         if name not in (estimator, "grid")
@@ -267,11 +268,11 @@ def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Cl
     excess = own / rmse["grid"] - 1.0
     return [
         *claims,
-        Claim(
+        judged(
             f"nearly optimal, within 2 % of Bayes' rule on a grid: {case}",
             "(not in the paper)",
             f"{own:.4f} against {rmse['grid']:.4f} rad per angle, {100 * excess:.1f} % more",
-            "confirmed" if excess < 0.02 else "refuted",
+            excess < 0.02,
         ),
     ]
 

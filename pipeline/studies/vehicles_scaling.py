@@ -14,9 +14,10 @@ import pandas as pd
 from pydantic import PositiveFloat, PositiveInt
 
 from pipeline.charts import Axis, Chart, Panel, curve
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import hash_streams, judge, replay_in_memory
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.vehicles_cases import scores_of
 from recorders.errors import BadInput

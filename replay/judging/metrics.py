@@ -304,10 +304,10 @@ def innovation(sums: Sums) -> dict[str, float]:
     """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
     if not sums.get("messages"):
         return {}
-    return {
-        "nis_per_component": sums["squared"] / sums["degrees"],
-        "gated_share": 1 - sums["accepted"] / sums["messages"],
-    }
+    gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
+    if not sums["degrees"]:  # all said nothing of their states
+        return gated
+    return {"nis_per_component": sums["squared"] / sums["degrees"], **gated}
 
 
 def _log_likelihoods(innovations: Innovations) -> Sums:

@@ -27,9 +27,10 @@ from pipeline.charts import (
     interval,
     level,
 )
+from pipeline.claims import Claim
 from pipeline.report import write_report
 from pipeline.report.verdict import verdict
-from pipeline.results import Claim, Outcome, Result, result_folder, write_outcome
+from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput
 
 Fuselog = Callable[..., Any]
