@@ -276,13 +276,14 @@ def run(
 @fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
-def report(results: tuple[Path, ...], out: Path) -> None:
+@click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
+def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
     from pipeline.outputs import REPORT, check_files
     from pipeline.report import write_report
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
-    write_report(list(results), out)
+    write_report(list(results), out, viewer=viewer)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 

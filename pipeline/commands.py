@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.ensemble import Part, hash_files, judge_logs, parts_of, replay_parts
 from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import ErrorTables, plain, result_folder, write_outcome
+from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
 from pipeline.starting import Origin, from_estimates, from_truth
 from pipeline.studies.localization import summarise
 from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
@@ -21,6 +21,7 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
 from recorders.parameters import parse_settings
+from recorders.parsing import parse_json
 from replay.engine.estimator import configure, find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
@@ -76,7 +77,7 @@ def replay_logs(
         progress=progress,
     )
     _state_losses(source.log for source in sources)
-    _print_outcome(done.judge, as_json=as_json, written=paths, seconds=done.seconds)
+    _print_outcome(done.judge, names, as_json=as_json, written=paths, seconds=done.seconds)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -222,6 +223,7 @@ def evaluate_logs(
     for each, source in zip(opened, sources, strict=True):
         _check_same_run(each, source.log)
     wanted = find_metrics(metrics)
+    estimators = _stated_estimators(opened[0])
     with result_folder(out) if out is not None else nullcontext() as folder:
         with ErrorTables(folder) if folder and errors else nullcontext() as kept:
             judge = judge_logs(
@@ -238,6 +240,7 @@ def evaluate_logs(
                 "title": f"estimates of {sources[0].name}",
                 "estimates": [str(path) for path in estimates],
                 "logs": [source.name for source in sources],
+                "estimators": estimators,
                 "gap_limit_s": gap_limit_s,
                 "metrics": list(metrics),
             }
@@ -245,7 +248,7 @@ def evaluate_logs(
             outcome.input_sha256 = hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
     _state_losses([*opened, *(source.log for source in sources)])
-    _print_outcome(judge, as_json=as_json, written=[out] if out else [])
+    _print_outcome(judge, estimators, as_json=as_json, written=[out] if out else [])
 
 
 def _source_path(estimates: Log) -> Path:
@@ -257,6 +260,16 @@ def _source_path(estimates: Log) -> Path:
     if not path.exists():
         raise BadInput(f"{estimates.path}: its log {path} is not there; give it with --log")
     return path
+
+
+def _stated_estimators(estimates: Log) -> dict[str, Any]:
+    """Parameters by label, in the order of the replay; none where the log does not say."""
+    notes = estimates.run.notes if estimates.run else {}
+    try:
+        stated = parse_json(notes.get("estimators", "{}"))
+    except ValueError:
+        return {}
+    return stated if isinstance(stated, dict) else {}
 
 
 def _check_same_run(estimates: Log, log: Log) -> None:
@@ -271,12 +284,13 @@ def _check_same_run(estimates: Log, log: Log) -> None:
 
 def _print_outcome(
     judge: Judge,
+    estimators: Iterable[str],
     *,
     as_json: bool,
     written: Sequence[Path],
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    values = plain(judge.metrics)
+    values = in_order(plain(judge.metrics), estimators)
     failures = judge.failures
     for sentence in [*judge.unjudged, *failures[:5]]:
         warn(sentence)
@@ -285,13 +299,14 @@ def _print_outcome(
     if as_json:
         outcome = {
             "metrics": values,
+            "bounds": judge.bounds,
             "failures": failures,
             "losses": judge.losses,
             "written": [str(path) for path in written],
         }
         print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
         return
-    print_metrics(values)
+    print_metrics(values, judge.bounds)
     for sentence in judge.losses:
         say(sentence)
     if seconds:
@@ -383,6 +398,6 @@ def run_named(
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
-    print_metrics(result.metrics)
+    print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")
