@@ -62,6 +62,9 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+parameters_option = click.option(
+    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+)
 recover_option = click.option(
     "--recover", is_flag=True, help="Read what is whole of a log that was cut off or damaged."
 )
@@ -195,6 +198,7 @@ def _say_written(path: Path, messages: int) -> None:
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
 @recover_option
 @gap_option
+@parameters_option
 @json_option
 @set_option
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
@@ -251,6 +255,7 @@ def view(path: Path, **options: Any) -> None:
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@parameters_option
 @json_option
 @set_option
 def run(

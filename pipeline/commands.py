@@ -16,7 +16,16 @@ from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_fo
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
 from pipeline.starting import Origin, from_estimates, from_truth
 from pipeline.studies.localization import summarise
-from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
+from pipeline.terminal import (
+    print_claims,
+    print_json,
+    print_metrics,
+    print_parameters,
+    print_table,
+    progress,
+    say,
+    warn,
+)
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log, read_span
@@ -47,6 +56,7 @@ def replay_logs(
     connect: str | None,
     recover: bool,
     gap_limit_s: float,
+    tells_parameters: bool,
     as_json: bool,
     settings: Sequence[str],
 ) -> None:
@@ -77,7 +87,10 @@ def replay_logs(
         progress=progress,
     )
     _state_losses(source.log for source in sources)
-    _print_outcome(done.judge, names, as_json=as_json, written=paths, seconds=done.seconds)
+    if tells_parameters and not as_json:
+        print_parameters(done.parameters)
+    told = {"seconds": dict(done.seconds), "parameters": done.parameters}
+    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -288,7 +301,7 @@ def _print_outcome(
     *,
     as_json: bool,
     written: Sequence[Path],
-    seconds: Mapping[str, float] | None = None,
+    told: Mapping[str, Any] | None = None,
 ) -> None:
     values = in_order(plain(judge.metrics), estimators)
     failures = judge.failures
@@ -304,13 +317,13 @@ def _print_outcome(
             "losses": judge.losses,
             "written": [str(path) for path in written],
         }
-        print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
+        print_json(outcome | dict(told or {}))
         return
     print_metrics(values, judge.bounds)
     for sentence in judge.losses:
         say(sentence)
-    if seconds:
-        print_table(("estimator", "time (s)"), list(seconds.items()))
+    if told:
+        print_table(("estimator", "time (s)"), list(told["seconds"].items()))
     for path in written:
         say(str(path))
 
@@ -374,6 +387,7 @@ def run_named(
     errors: bool,
     data: Path | None,
     out: Path | None,
+    tells_parameters: bool,
     as_json: bool,
     settings: Sequence[str],
 ) -> None:
@@ -398,6 +412,8 @@ def run_named(
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
+    if tells_parameters:
+        print_parameters(result.settings["parameters"])
     print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")

@@ -105,6 +105,13 @@ def _with_bounds(measured: Measured) -> object:
     return f"{format_value(measured.value)} ({low} to {high})"
 
 
+def print_parameters(parameters: Mapping[str, Mapping[str, object]]) -> None:
+    """The parameters of estimators by label: a row each, a column per estimator."""
+    names = dict.fromkeys(name for values in parameters.values() for name in values)
+    rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
+    print_table(["parameter", *parameters], rows)
+
+
 def print_claims(claims: Sequence[Claim]) -> None:
     """Claims, each with what the paper says and what we found."""
     for claim in claims:
