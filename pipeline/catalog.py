@@ -18,8 +18,8 @@ from recorders.registry import available, load
 from replay.engine.estimator import Estimator
 from replay.inference.binding import needs_of
 from replay.inference.estimators import registered_models
-from replay.inference.methods import METHODS
 from replay.inference.model import Model
+from replay.inference.registered import METHODS
 from replay.judging.metrics import Metric
 
 

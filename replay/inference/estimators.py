@@ -43,7 +43,7 @@ from replay.inference.happenings import (
     times_alone,
     with_ticks,
 )
-from replay.inference.methods import METHODS, Method
+from replay.inference.methods import FILTERS, Method
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import (
     Carried,
@@ -71,8 +71,8 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 
 def modelled(model: Model, method: str) -> Estimator[Any]:
-    """The estimator that estimates the state of one model by one method."""
-    chosen = METHODS[method]
+    """The estimator that estimates the state of one model by one filter."""
+    chosen = FILTERS[method]
     lacking = chosen.lacks(model)
     if lacking:
         raise BadInput(f"method {method} needs {lacking}")
@@ -85,15 +85,14 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
     )
 
 
-def of_any_model(method: str) -> Estimator[Any]:
+def of_any_model(method: Method) -> Estimator[Any]:
     """The estimator that estimates, by one method, the state of the registered model that fits a log."""
-    chosen = METHODS[method]
     return Estimator(
-        f"{chosen.summary}, of any model (`fuselog models` lists them)",
+        f"{method.summary}, of any model (`fuselog models` lists them)",
         " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items()),
-        _any_parameters(chosen),
-        partial(_bind_fitting, method=chosen),
-        variant=chosen.variant,
+        _any_parameters(method),
+        partial(_bind_fitting, method=method),
+        variant=method.variant,
     )
 
 
@@ -156,7 +155,7 @@ def _bind_fitting(
             f"the log has {', '.join(topics) or 'no topics'}"
         )
     (name,) = fitting
-    lacking = method.lacks(models[name])
+    lacking = _made_for(label, method, values).lacks(models[name])
     if lacking:
         raise BadInput(f"estimator {label}: model {name} lacks {lacking}, which this method needs")
     parameters = build(combined(models[name], method), given, f"estimator {label}, model {name}")
@@ -167,6 +166,7 @@ def bind_model(
     label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
 ) -> list[Bound]:
     """A filter for everything in the log that is of this model."""
+    method = _made_for(label, method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     for found in topics_of(model, topics):
@@ -174,7 +174,8 @@ def bind_model(
         numbers = settings_of(label, stage, found, parameters)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)
-        filtering = Filter(name, found, stage, method, parameters, numbers, samplers)
+        made_of = (name, found, stage, method, parameters, numbers, samplers)
+        filtering = (method.filtering or Filter)(*made_of)
         maps = {sensor.about.topic: sensor.about for sensor in stage.sensors if sensor.about}
         control = [found.control.name] if found.control else []
         streams = (*control, *(topic.name for _, topic in found.sensors))
@@ -184,6 +185,14 @@ def bind_model(
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
         bound.append(made)
     return bound
+
+
+def _made_for(label: str, method: Method, parameters: Any) -> Method:
+    """The method that the parameters choose; BadInput, which names the estimator, where they do not."""
+    try:
+        return method.made_for(parameters) if method.made_for else method
+    except BadInput as error:
+        raise BadInput(f"estimator {label}: {error}") from error
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
@@ -210,6 +219,7 @@ class State(NamedTuple):
         points: of every map, by its topic.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
+        kept: what a smoother keeps for its way back.
         tick: (runs,) the number of the next extra estimate.
     """
 
@@ -218,6 +228,7 @@ class State(NamedTuple):
     generators: tuple[Any, ...]
     waiting: Happenings | None
     tick: Integers
+    kept: Any = None
 
 
 @lru_cache(maxsize=64)
@@ -309,9 +320,13 @@ class Filter:
 
     def finish(self, state: State) -> list[Ragged]:
         """What still waits for a control that does not come any more."""
+        return self.ended(state)[1]
+
+    def ended(self, state: State) -> tuple[State, list[Ragged]]:
+        """The state after what waits for a control that does not come any more, and its outputs."""
         if state.waiting is None:
-            return []
-        return self.follow(state, held(state.waiting, self.initial))[1]
+            return state, []
+        return self.follow(state, held(state.waiting, self.initial))
 
     @property
     def initial(self) -> tuple[float, ...]:
@@ -321,14 +336,21 @@ class Filter:
 
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
-        model, sensors = self.stage.model, self.stage.sensors
+        after, estimated, made = self.filtered(state, happenings)
+        return after, [self.states(*estimated), *made]
+
+    def filtered(
+        self, state: State, happenings: Happenings
+    ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
+        """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
+        sensors = self.stage.sensors
         loop, steps = _compiled(self.stage, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(happenings.is_due, happenings.offsets)
         noted = ragged_rows(happenings.source >= 0, happenings.offsets)
         slots = len(slots_of(sensors))
-        estimates, innovations = no_results(due, noted, model, slots)
+        estimates, innovations = self.no_results(due, noted, slots)
         if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
         settings = np.repeat(self.settings[None], runs, axis=0)
@@ -346,11 +368,16 @@ class Filter:
                 innovations._replace(end=innovations.end[part]),
                 scratch=partial(steps.memory, sets),
             )
-        made = self.outputs(filled(estimates, due), filled(innovations, noted))
+        made = [self.innovations(*filled(innovations, noted))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
-        return state._replace(carried=carried, generators=generators), made
+        after = state._replace(carried=carried, generators=generators)
+        return after, filled(estimates, due), made
+
+    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+        """Estimates and innovations to be filled in, see `recursion.no_results`."""
+        return no_results(due, noted, self.stage.model, slots)
 
     @cached_property
     def gates(self) -> Floats:
@@ -359,32 +386,32 @@ class Filter:
         bounds = _nis_bounds(self.parameters.gate_probability, largest)
         return np.repeat(bounds[None], max(len(self.stage.sensors), 1), axis=0)
 
-    def outputs(
-        self, estimated: tuple[Estimates, Integers], noted: tuple[Innovations, Integers]
-    ) -> list[Ragged]:
-        """The streams of what the recursion filled in, and their offsets."""
-        model, sensors = self.stage.model, self.stage.sensors
-        prefix = self.found.prefix
-        truth = model.truth if model.truth.startswith("/") else f"{prefix}/{model.truth}"
-        topic = f"/estimates/{self.name}"
-        estimates, offsets = estimated
-        state = state_stream(
-            f"{topic}/{model.output}",
+    @property
+    def truth(self) -> str:
+        """The topic that the estimates are compared with."""
+        truth = self.stage.model.truth
+        return truth if truth.startswith("/") else f"{self.found.prefix}/{truth}"
+
+    def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
+        """The stream of estimates; run r owns offsets[r]:offsets[r + 1]."""
+        model = self.stage.model
+        stream = state_stream(
+            f"/estimates/{self.name}/{model.output}",
             estimates.time_ns,
             model.state,
-            truth,
+            self.truth,
             estimates.mean,
             estimates.covariance,
         )
-        made = [Ragged(state, offsets)]
-        if not sensors:
-            return made
-        innovations, offsets = noted
-        innovation = innovation_stream(
-            f"{topic}/innovation",
+        return Ragged(stream, offsets)
+
+    def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
+        """The stream of innovations, which needs a sensor; see `states`."""
+        stream = innovation_stream(
+            f"/estimates/{self.name}/innovation",
             innovations.time_ns,
-            slots_of(sensors),
-            truth,
+            slots_of(self.stage.sensors),
+            self.truth,
             target_id=innovations.target_id,
             accepted=innovations.numbers[:, 2].astype(np.uint32),
             innovation=innovations.difference,
@@ -392,7 +419,7 @@ class Filter:
             squared=innovations.numbers[:, 0],
             log_likelihood=innovations.numbers[:, 1],
         )
-        return [*made, Ragged(innovation, offsets)]
+        return Ragged(stream, offsets)
 
 
 @lru_cache(maxsize=64)

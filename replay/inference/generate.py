@@ -150,12 +150,29 @@ def differencing(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def resetting(kinds: tuple[str, ...]) -> Function:
+def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
     """`reset(d, rows)`: multiplies the rows (t, m) of every rotation by its right Jacobian at d (t,).
 
     Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
     Jr(d) = I - (1 - cos t)/t^2 [d]x + (t - sin t)/t^3 [d]x^2, t = |d|. Markley 2003; Mueller 2017.
+    With `back` it multiplies by the inverse instead, I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2, which
+    carries a covariance the other way; Sola, (144).
     """
+    jacobian = [
+        "    half = np.sinc(0.5 * angle / np.pi)",
+        "    first = 0.5 * half * half",
+        "    if angle < 0.05:",
+        "        second = (1.0 - squared / 20.0 * (1.0 - squared / 42.0)) / 6.0",
+        "    else:",
+        "        second = (angle - np.sin(angle)) / (squared * angle)",
+    ]
+    inverse = [
+        "    first = -0.5",
+        "    if angle < 0.05:",
+        "        second = (1.0 + squared / 60.0 * (1.0 + squared / 42.0)) / 12.0",
+        "    else:",
+        "        second = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / squared",
+    ]
     lines = ["def reset(d, rows):"]
     for kind, _, t, _ in things(kinds):
         if kind != "quaternion":
@@ -165,12 +182,7 @@ def resetting(kinds: tuple[str, ...]) -> Function:
             f"    x, y, z = {x}, {y}, {z}",
             "    squared = x * x + y * y + z * z",
             "    angle = np.sqrt(squared)",
-            "    half = np.sinc(0.5 * angle / np.pi)",
-            "    first = 0.5 * half * half",
-            "    if angle < 0.05:",
-            "        second = (1.0 - squared / 20.0 * (1.0 - squared / 42.0)) / 6.0",
-            "    else:",
-            "        second = (angle - np.sin(angle)) / (squared * angle)",
+            *(inverse if back else jacobian),
             "    for column in range(rows.shape[1]):",
             f"        a, b, c = rows[{t}, column], rows[{t + 1}, column], rows[{t + 2}, column]",
             "        u, v, w = y * c - z * b, z * a - x * c, x * b - y * a",

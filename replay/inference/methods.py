@@ -1,7 +1,7 @@
-"""Methods: how the state of any model is estimated. Each makes the steps of a filter for one model.
+"""Methods: how the state of any model is estimated, and the filters among them.
 
-`ekf` and `iekf` need nothing but the model's functions; `ukf` and `lrkf:SAMPLING` sample them;
-`analytic` takes the exact moments where the model knows them.
+Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing but the model's functions;
+`ukf` and `lrkf:SAMPLING` sample them; `analytic` takes the exact moments where the model knows them.
 """
 
 from collections.abc import Callable, Mapping
@@ -82,6 +82,9 @@ class Method:
         sampling: where the samples come from, for methods that take some.
         lacks: what a model lacks for it, in words; empty where it will do.
         variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+        made_for: what the method is with these parameters, where they choose among several; raises
+            BadInput where they name none.
+        filtering: what goes through a log, where that is no `replay.inference.estimators.Filter`.
     """
 
     summary: str
@@ -90,6 +93,8 @@ class Method:
     sampling: Callable[[Any], Sampling] | None = None
     lacks: Callable[[Model], str] = lambda _: ""
     variant: str | None = None
+    made_for: Callable[[Any], "Method"] | None = None
+    filtering: Callable[..., Any] | None = None
 
 
 def _extended(stage: Stage) -> Steps:
@@ -298,7 +303,7 @@ def _lacks_moments(model: Model) -> str:
     return f"exact moments of its sensor {missing[0]}" if missing else ""
 
 
-METHODS: Mapping[str, Method] = {
+FILTERS: Mapping[str, Method] = {
     "ekf": Method("extended Kalman filter", MethodParameters, _extended, lacks=_lacks_slopes),
     "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated, lacks=_lacks_slopes),
     "ukf": Method(

@@ -91,7 +91,7 @@ class Innovations(NamedTuple):
     numbers: Floats
 
 
-ResultsType = TypeVar("ResultsType", Estimates, Innovations)
+ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 
 
 def no_results(
@@ -121,11 +121,12 @@ def no_results(
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
     """What was filled in of results that began at these offsets, laid end to end, and its offsets."""
-    rows, kept = filled_rows(offsets, results.end)
+    end, *columns = results
+    rows, kept = filled_rows(offsets, end)
     if isinstance(rows, slice):
         return results, kept
-    columns: Any = (column[rows] for column in results[1:])
-    return type(results)(kept[1:], *columns), kept
+    made: Any = type(results)
+    return made(kept[1:], *(column[rows] for column in columns)), kept
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
@@ -220,9 +221,8 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 and happenings.time_ns[event] >= start_ns
             ):
                 row = estimates.end[run]
-                mean, covariance = estimates.mean[row], estimates.covariance[row]
-                estimate(run, carried.belief, mean, covariance)
-                failure = fault_of(mean, covariance)
+                estimate(run, carried.belief, estimates, row)
+                failure = fault_of(estimates.mean[row], estimates.covariance[row])
                 if failure == ALL_WELL:
                     estimates.time_ns[row] = happenings.time_ns[event]
                     estimates.end[run] = row + 1

@@ -1,9 +1,16 @@
-"""The methods as estimators of any model: what `-e ekf` means."""
+"""All methods, and as estimators of any model: what `-e ekf` means."""
+
+from collections.abc import Mapping
 
 from replay.inference.estimators import of_any_model
+from replay.inference.methods import FILTERS, Method
+from replay.inference.smoothers import SMOOTHING
 
-EKF = of_any_model("ekf")
-IEKF = of_any_model("iekf")
-UKF = of_any_model("ukf")
-LRKF = of_any_model("lrkf")
-ANALYTIC = of_any_model("analytic")
+METHODS: Mapping[str, Method] = {**FILTERS, "smoother": SMOOTHING}
+
+EKF = of_any_model(METHODS["ekf"])
+IEKF = of_any_model(METHODS["iekf"])
+UKF = of_any_model(METHODS["ukf"])
+LRKF = of_any_model(METHODS["lrkf"])
+ANALYTIC = of_any_model(METHODS["analytic"])
+SMOOTHER = of_any_model(METHODS["smoother"])

@@ -51,7 +51,6 @@ class SampleMemory(NamedTuple):
         point, noise: (n,), one sample, and (noises,), the variances.
         values: (L, v), the function's values as tangent vectors from a centre.
         centre, shift: (n of the values,), (v,), their mean, and what the values are away from it.
-        cross: (t, v), for a covariance that is not needed.
     """
 
     points: Floats
@@ -65,7 +64,6 @@ class SampleMemory(NamedTuple):
     values: Floats
     centre: Floats
     shift: Floats
-    cross: Floats
 
 
 def sample_memory(
@@ -83,7 +81,6 @@ def sample_memory(
         values=np.empty((count, values)),
         centre=np.empty(len(outputs)),
         shift=np.empty(values),
-        cross=np.empty((dimension - noises, values)),
     )
 
 
@@ -95,7 +92,8 @@ def regression(
     Returns `regress(mean, covariance, arguments, variances, spread, cross, use, memory)`. It takes the
     samples of use number `use`, fills `memory.centre` with the intrinsic mean of the values, `spread`
     (v, v) with their covariance and `cross` (t, v) with that with the state; False where the state's
-    covariance is not positive definite. `variances` is a tuple of those of the noise.
+    covariance is not positive definite. `variances` is a tuple of those of the noise; `spread` may be
+    the state's covariance itself.
     """
     t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
     size = t + noises
@@ -194,12 +192,9 @@ def sampled_motion(stage: Stage, number: int) -> Function:
         memory, state, driven = work.samples[number], read_state(mean), read_control(control)
         arguments = (driven, duration_s, parameters)
         variances = variances_of(state, duration_s, parameters)
-        spread, cross = work.product, memory.cross
-        if not regress(mean, covariance, arguments, variances, spread, cross, use, memory):
+        cross = work.product.T
+        if not regress(mean, covariance, arguments, variances, covariance, cross, use, memory):
             return False
-        for row in range(len(covariance)):
-            for column in range(len(covariance)):
-                covariance[row, column] = spread[row, column]
         linearise(state, driven, duration_s, parameters, work)
         add_noise(state, covariance, duration_s, parameters, work)
         fill(mean, memory.centre)

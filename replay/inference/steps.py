@@ -70,7 +70,8 @@ class Steps(NamedTuple):
             moves the belief in place. `use` numbers the sets of randomised samples.
         updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
             ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
-        estimate: (run, belief, mean, covariance) fills the estimate.
+        estimate: (run, belief, estimates, row) fills a row of the results: its mean, its covariance, and
+            what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
     """
 
@@ -99,7 +100,8 @@ class Workspace(NamedTuple):
 
     Attributes:
         state: (n,), the moved state.
-        transition, product: (t, t).
+        transition: (t, t).
+        product: (t, t), after a prediction the covariance of the moved state with the one before.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
@@ -165,7 +167,8 @@ def gaussian_filter(
         mean, covariance = belief.mean[run], belief.covariance[run]
         return predict(mean, covariance, control, duration_s, parameters, use, work)
 
-    def estimate(run: int, belief: Gaussian, mean: Floats, covariance: Floats) -> None:
+    def estimate(run: int, belief: Gaussian, estimates: Any, row: int) -> None:
+        mean, covariance = estimates.mean[row], estimates.covariance[row]
         copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
 
     return Steps(

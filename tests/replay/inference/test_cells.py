@@ -13,7 +13,7 @@ import pytest
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from replay.engine.sources import MemorySource
 from replay.inference.estimators import registered_models
-from replay.inference.methods import METHODS
+from replay.inference.registered import METHODS
 from tests.replay.inference.wheel import make_wheel
 
 RUNS = 30
@@ -80,3 +80,17 @@ def test_a_sensor_whose_linearisation_is_singular_has_no_extended_filter() -> No
         assert METHODS[method].lacks(model) == "a regular linearisation of its sensor surface_point"
     assert ("extended-target", "ukf") in CELLS
     assert METHODS["ekf"].lacks(make_wheel()) == ""
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("model", NEAR_LINEAR)
+@pytest.mark.parametrize("method", ["ekf", "ukf"])
+def test_smoothers_err_less_than_their_filters(model: str, method: str) -> None:
+    """Thirty runs each: the RMSE of the whole state, of all stamps together."""
+    smoother = f"smoother:{method}"
+    settings = {name: {"model": model} for name in (method, smoother)}
+    replayed = replay_ensemble(sources(model), settings, gap_limit_s=0.2)
+    assert not any(replayed.metrics(["failures"]).values())
+    errors = {each.estimator: each.error for each in replayed.errors}
+    rmse = {name: np.sqrt(np.mean(np.square(error))) for name, error in errors.items()}
+    assert rmse[smoother] < rmse[method]

@@ -17,8 +17,8 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference import estimators
-from replay.inference.methods import METHODS
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.registered import METHODS
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -171,7 +171,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Model]]:
 
 
 def fit(source: MemorySource, method: str = "ekf", **settings: Any) -> list[Any]:
-    estimator = estimators.of_any_model(method)
+    estimator = estimators.of_any_model(METHODS[method])
     return estimator.bind("e", source.topics, build(estimator.parameters, settings, "estimator e"))
 
 
