@@ -63,7 +63,12 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 
 def modelled(model: Model, method: str) -> Estimator[Any]:
-    """The estimator that estimates the state of one model by one method."""
+    """The estimator that estimates the state of one model by one method.
+
+    Raises BadInput where there is no such method, or the model lacks what it needs.
+    """
+    if method not in METHODS:
+        raise BadInput(f"no method '{method}'; {choices(method, METHODS)}")
     chosen = METHODS[method]
     lacking = chosen.lacks(model)
     if lacking:
