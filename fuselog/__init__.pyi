@@ -1,5 +1,12 @@
 """The public names, and where each comes from; `__init__.py` reads this list."""
 
+from pipeline.charts import Axis as Axis
+from pipeline.charts import Chart as Chart
+from pipeline.charts import Panel as Panel
+from pipeline.charts import band as band
+from pipeline.charts import curve as curve
+from pipeline.claims import Claim as Claim
+from pipeline.claims import judged as judged
 from pipeline.door import ResultFolder as ResultFolder
 from pipeline.door import estimators as estimators
 from pipeline.door import experiments as experiments
@@ -16,9 +23,7 @@ from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
-from pipeline.results import Claim as Claim
 from pipeline.results import Outcome as Outcome
-from pipeline.results import judged as judged
 from pipeline.runner import Runner as Runner
 from recorders.errors import BadInput as BadInput
 from recorders.errors import UnknownName as UnknownName

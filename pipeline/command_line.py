@@ -62,6 +62,9 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+parameters_option = click.option(
+    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+)
 recover_option = click.option(
     "--recover", is_flag=True, help="Read what is whole of a log that was cut off or damaged."
 )
@@ -195,6 +198,7 @@ def _say_written(path: Path, messages: int) -> None:
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
 @recover_option
 @gap_option
+@parameters_option
 @json_option
 @set_option
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
@@ -241,7 +245,8 @@ def view(path: Path, **options: Any) -> None:
 
 
 @fuselog.command(short_help="Run an experiment: record, replay, evaluate, draw.")
-@click.argument("experiment")
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
 @click.option(
@@ -250,10 +255,19 @@ def view(path: Path, **options: Any) -> None:
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@parameters_option
 @json_option
 @set_option
-def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> None:
+def run(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    **options: Any,
+) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
+
+    Or replay logs as an experiment: fuselog run LOG.mcap ... -e ekf -e ukf --out DIR
 
     --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
     --set gap_limit_s=1 an entry of the experiment.
@@ -261,19 +275,20 @@ def run(experiment: str, runs: int | None, seed: int | None, **options: Any) -> 
     from pipeline.commands import run_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
-    run_named(experiment, over, **options)
+    run_named(experiment, labels, over, **options)
 
 
 @fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
-def report(results: tuple[Path, ...], out: Path) -> None:
+@click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
+def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
     from pipeline.outputs import REPORT, check_files
     from pipeline.report import write_report
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
-    write_report(list(results), out)
+    write_report(list(results), out, viewer=viewer)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -3,24 +3,33 @@
 Rerun and matplotlib take long to import: only what draws imports them.
 """
 
-import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from pipeline.ensemble import cut_in_parts, judge_logs, replay_parts
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
+from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import ErrorTables, plain, result_folder, write_outcome
+from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
 from pipeline.starting import check_same_run, origins_of, span_of
 from pipeline.studies.localization import summarise
-from pipeline.terminal import print_claims, print_json, print_metrics, print_table, progress, say, warn
+from pipeline.terminal import (
+    print_claims,
+    print_json,
+    print_metrics,
+    print_parameters,
+    print_table,
+    progress,
+    say,
+    warn,
+)
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
+from recorders.parsing import parse_json
 from replay.engine.estimator import configure, find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
@@ -46,6 +55,7 @@ def replay_logs(
     connect: str | None,
     recover: bool,
     gap_limit_s: float,
+    tells_parameters: bool,
     as_json: bool,
     settings: Sequence[str],
 ) -> None:
@@ -72,7 +82,10 @@ def replay_logs(
         progress=progress,
     )
     _state_losses(source.log for source in sources)
-    _print_outcome(done.judge, as_json=as_json, written=paths, seconds=done.seconds)
+    if tells_parameters and not as_json:
+        print_parameters(done.parameters)
+    told = {"seconds": dict(done.seconds), "parameters": done.parameters}
+    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -172,6 +185,7 @@ def evaluate_logs(
     for each, source in zip(opened, sources, strict=True):
         check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
+    estimators = _stated_estimators(opened[0])
     with result_folder(out) if out is not None else nullcontext() as folder:
         with ErrorTables(folder) if folder and errors else nullcontext() as kept:
             judge = judge_logs(
@@ -188,14 +202,15 @@ def evaluate_logs(
                 "title": f"estimates of {sources[0].name}",
                 "estimates": [str(path) for path in estimates],
                 "logs": [source.name for source in sources],
+                "estimators": estimators,
                 "gap_limit_s": gap_limit_s,
                 "metrics": list(metrics),
             }
             outcome = summarise(judge)
-            outcome.input_sha256 = _hash_files([*estimates, *places])
+            outcome.input_sha256 = hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
     _state_losses([*opened, *(source.log for source in sources)])
-    _print_outcome(judge, as_json=as_json, written=[out] if out else [])
+    _print_outcome(judge, estimators, as_json=as_json, written=[out] if out else [])
 
 
 def _source_path(estimates: Log) -> Path:
@@ -209,22 +224,25 @@ def _source_path(estimates: Log) -> Path:
     return path
 
 
-def _hash_files(paths: Sequence[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
+def _stated_estimators(estimates: Log) -> dict[str, Any]:
+    """Parameters by label, in the order of the replay; none where the log does not say."""
+    notes = estimates.run.notes if estimates.run else {}
+    try:
+        stated = parse_json(notes.get("estimators", "{}"))
+    except ValueError:
+        return {}
+    return stated if isinstance(stated, dict) else {}
 
 
 def _print_outcome(
     judge: Judge,
+    estimators: Iterable[str],
     *,
     as_json: bool,
     written: Sequence[Path],
-    seconds: Mapping[str, float] | None = None,
+    told: Mapping[str, Any] | None = None,
 ) -> None:
-    values = plain(judge.metrics)
+    values = in_order(plain(judge.metrics), estimators)
     failures = judge.failures
     for sentence in [*judge.unjudged, *failures[:5]]:
         warn(sentence)
@@ -233,17 +251,18 @@ def _print_outcome(
     if as_json:
         outcome = {
             "metrics": values,
+            "bounds": judge.bounds,
             "failures": failures,
             "losses": judge.losses,
             "written": [str(path) for path in written],
         }
-        print_json(outcome if seconds is None else outcome | {"seconds": dict(seconds)})
+        print_json(outcome | dict(told or {}))
         return
-    print_metrics(values)
+    print_metrics(values, judge.bounds)
     for sentence in judge.losses:
         say(sentence)
-    if seconds:
-        print_table(("estimator", "time (s)"), list(seconds.items()))
+    if told:
+        print_table(("estimator", "time (s)"), list(told["seconds"].items()))
     for path in written:
         say(str(path))
 
@@ -299,20 +318,32 @@ def _draw_log(
 
 
 def run_named(
-    name: str,
+    named: Sequence[str],
+    labels: Sequence[str],
     over: Mapping[str, Any],
     *,
     logs: int,
     errors: bool,
     data: Path | None,
     out: Path | None,
+    tells_parameters: bool,
     as_json: bool,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment and print its metrics and claims."""
-    label, experiment = load_experiment(name, parse_settings(settings), over)
+    """Run an experiment, or replay logs as one, and print its metrics and claims."""
+    values = parse_settings(settings)
+    files = [Path(each) for each in named if each.endswith(".mcap")]
+    if files:
+        if len(files) < len(named) or over or data is not None:
+            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        experiment = experiment_of_logs(files, labels, values)
+        label = experiment.title
+    else:
+        if len(named) > 1 or labels:
+            raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+        label, experiment = load_experiment(named[0], values, over)
     folder = out or Path("out") / label
-    inputs = [Path(name)] if name.endswith(".toml") else []
+    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
     result = run_experiment(
         label, experiment, folder, data=data, logs=logs, errors=errors, progress=progress
@@ -320,6 +351,8 @@ def run_named(
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
-    print_metrics(result.metrics)
+    if tells_parameters:
+        print_parameters(result.settings["parameters"])
+    print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")

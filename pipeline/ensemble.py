@@ -26,8 +26,8 @@ from recorders.log import Clock, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound, bind
-from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, ensemble_blocks, replay
-from replay.engine.sources import MemorySource, Source, memory_source
+from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
+from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
 from replay.judging.judge import TIME_BINS, Judge
 from replay.judging.metrics import Metric, Output, find_metrics, measure
@@ -89,9 +89,16 @@ def cut_in_parts(
 
 @dataclass
 class Pass:
-    """What a streamed pass leaves: the judge of all runs, and the seconds that each estimator took."""
+    """What a streamed pass leaves.
+
+    Attributes:
+        judge: of all runs.
+        parameters: of every estimator, defaults included, by label.
+        seconds: that each estimator took, by label.
+    """
 
     judge: Judge
+    parameters: dict[str, dict[str, Any]]
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
@@ -170,7 +177,7 @@ def replay_parts(
         if passes:
             passes[0].judge.merge(judge)
         else:
-            passes.append(Pass(judge))
+            passes.append(Pass(judge, parameters_of(bound)))
         for label, time_s in report.seconds.items():
             passes[0].seconds[label] += time_s
 
@@ -188,6 +195,15 @@ def bind_from(
     """Bind estimators to runs, each begun from its origin where there are any."""
     bound = [each for label in estimators for each in bind(label, sources, estimators[label])]
     return [start_from(each, sources, origins, order) for each in bound] if origins else bound
+
+
+def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
+    """The parameters of estimators by label, as JSON has them; those that are None are not used."""
+    return {
+        each.name.partition("/")[0]: each.parameters.model_dump(mode="json", exclude_none=True)
+        for each in bound
+        if each.parameters is not None
+    }
 
 
 def replay_blocks(
@@ -247,8 +263,8 @@ def judge_logs(
         judge = Judge(
             sources[now], metrics, gap_limit_s=gap_limit_s, first_run=now.start, on_errors=on_errors
         )
-        blocks = ensemble_blocks(estimates[now], held[0], "publish_time", BLOCK_MESSAGES) if held else ()
-        for block in blocks:
+        runs = ensemble_of(estimates[now])
+        for block in runs.blocks(held[0], "publish_time", BLOCK_MESSAGES) if held else ():
             judged = judge.add(block)
             if drawing is not None and now.start == 0:
                 drawing.add(*of_run(block, judged.errors, 0))
@@ -293,7 +309,7 @@ def record_ensemble(
     executor: Executor | None = None,
     first_run: int = 0,
     all_runs: int = 0,
-) -> list[MemorySource]:
+) -> Ensemble[MemorySource]:
     """Record so many runs of a scenario, each from its own random stream of `seed`.
 
     Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
@@ -309,7 +325,7 @@ def record_ensemble(
     require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
     numbers = range(first_run + 1, first_run + runs)
     others = executor.map(record, numbers) if executor else map(record, numbers)
-    return list(progress(chain([first], others), f"recording {scenario}", runs))
+    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
 
 
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
@@ -394,3 +410,12 @@ def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
     for stream in source.streams.values():
         for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
             digest.update(np.ascontiguousarray(array).data)
+
+
+def hash_files(paths: Sequence[Path]) -> str:
+    """SHA-256 over the bytes of files."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()

@@ -1,7 +1,8 @@
-"""Experiments: scenario (or real data) x estimators x metrics, one TOML file each."""
+"""Experiments: scenario (or real data, or logs) x estimators x metrics, one TOML file each."""
 
+import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -36,11 +37,21 @@ class Import(Parameters):
     parameters: dict[str, Any] = {}
 
 
+class Logs(Parameters):
+    """Logs to replay, one run each: files or patterns such as `drive-*.mcap`.
+
+    They count from the folder of the experiment's file; estimates that lie beside the logs are left out.
+    """
+
+    files: list[str] = []
+
+
 class Experiment(Parameters):
     """One experiment as its TOML file says it.
 
-    `estimators` maps a label to parameters; a parameter `kind` names the estimator where the label is
-    not its name. `metrics` are all registered ones where none is named. `options` are the study's own.
+    The runs are recorded from a scenario, imported, or logs that are there. `estimators` maps a label to
+    parameters; a parameter `kind` names the estimator where the label is not its name. `metrics` are all
+    registered ones where none is named. `options` are the study's own.
     """
 
     title: str
@@ -49,6 +60,7 @@ class Experiment(Parameters):
     runs: PositiveInt = 1
     record: Record | None = None
     import_: Import | None = Field(None, alias="import")
+    logs: Logs | None = None
     estimators: dict[str, dict[str, Any]] = {}
     metrics: list[str] = []
     gap_limit_s: NonNegativeFloat = 0.2
@@ -56,11 +68,16 @@ class Experiment(Parameters):
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
-        if self.import_ and self.record:
-            raise ValueError("give either [record] or [import], not both")
-        if self.import_ and (self.runs, self.seed) != (1, 0):
-            raise ValueError("imported data are one run without a seed; leave out runs and seed")
+        if sum(each is not None for each in (self.import_, self.record, self.logs)) > 1:
+            raise ValueError("give one of [record], [import] and [logs]")
+        if (self.import_ or self.logs) and (self.runs, self.seed) != (1, 0):
+            raise ValueError("recorded data have no seed, and as many runs as there are; leave out both")
         return self
+
+    @property
+    def files(self) -> list[Path]:
+        """The logs that are replayed."""
+        return [Path(file) for file in self.logs.files] if self.logs else []
 
 
 @dataclass(frozen=True)
@@ -69,6 +86,7 @@ class Setting:
 
     Attributes:
         folder: what is written goes there.
+        place: where the folder will be when it is whole.
         data: what is imported.
         logs: of how many runs the logs are kept.
         errors: whether every single error is kept too.
@@ -77,6 +95,7 @@ class Setting:
     """
 
     folder: Path
+    place: Path
     data: Path | None = None
     logs: int = 20
     errors: bool = False
@@ -114,10 +133,54 @@ def load_experiment(
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
     path = known.get(name, Path(name))
-    values = read_toml(path)
+    return path.stem, _with_settings(name, read_toml(path), settings, over, path.parent)
+
+
+def experiment_of_logs(
+    logs: Sequence[Path], labels: Sequence[str], settings: Mapping[str, Any]
+) -> Experiment:
+    """The experiment that replays logs through estimators, as they are but for settings.
+
+    Raises BadInput where no estimator is named, or a setting belongs nowhere.
+    """
+    if not labels:
+        raise BadInput(f"{logs[0]}: say what to replay it with, such as -e ekf")
+    values = {
+        "title": logs[0].stem if len(logs) == 1 else f"{len(logs)} logs",
+        "logs": {"files": [str(log) for log in logs]},
+        "estimators": {label: {} for label in labels},
+    }
+    return _with_settings(str(logs[0]), values, settings, {}, Path())
+
+
+def _with_settings(
+    name: str,
+    values: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    over: Mapping[str, Any],
+    folder: Path,
+) -> Experiment:
     where = f"experiment {name}"
     own = _settings_of_experiment(build(Experiment, values, where), settings)
-    return path.stem, build(Experiment, {**merge(values, own), **over}, where)
+    experiment = build(Experiment, {**merge(values, own), **over}, where)
+    if experiment.logs is None:
+        return experiment
+    files = _found(experiment.logs.files, folder, where)
+    return experiment.model_copy(update={"logs": Logs(files=files)})
+
+
+def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
+    """The files that patterns stand for, each once; raises BadInput where one stands for none."""
+    files: dict[str, None] = {}
+    for pattern in patterns:
+        place = Path(os.path.normpath(folder / pattern))
+        root = Path(place.anchor)
+        found = [place] if place.is_file() else sorted(root.glob(str(place.relative_to(root))))
+        logs = [str(each) for each in found if len(found) == 1 or not each.match("*.estimates.mcap")]
+        if not logs:
+            raise BadInput(f"{where}: no log is called {place}; give files, or patterns such as *.mcap")
+        files |= dict.fromkeys(logs)
+    return list(files)
 
 
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,12 +249,19 @@ def run_experiment(
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
     if experiment.import_ and data is None:
         raise BadInput(f"experiment {name} needs real data: give its folder with --data")
-    if data is not None and not experiment.import_:
+    if data is not None and experiment.record:
         raise BadInput(f"experiment {name} imports nothing; leave out --data")
+    if experiment.logs is not None:
+        if data is not None:
+            place = str(data / "*.mcap") if data.is_dir() else str(data)
+            files = _found([place], Path(), f"experiment {name}, --data {data}")
+            experiment = experiment.model_copy(update={"logs": Logs(files=files)})
+        if not experiment.files:
+            raise BadInput(f"experiment {name} replays logs: name them in [logs], or with --data")
+        experiment = experiment.model_copy(update={"runs": len(experiment.files)})
     study: Study = load("studies", experiment.study, Study)
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
-    for label, values in experiment.estimators.items():
-        configure(label, values)
+    configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
         result_folder(folder) as part,
@@ -200,8 +270,12 @@ def run_experiment(
     ):
         # of runs that all failed there is no mean: a null in the results, not a warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
-        outcome = study.run(experiment, Setting(part, data, logs, errors, options, progress))
+        outcome = study.run(experiment, Setting(part, folder, data, logs, errors, options, progress))
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)
+        settings["parameters"] = outcome.parameters or {
+            label: parameters.model_dump(mode="json", exclude_none=True)
+            for label, (_, parameters) in configured.items()
+        }
         return write_outcome(part, name, settings, outcome)

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline import door
+from pipeline.charts import draw
 from pipeline.door import ResultFolder
-from pipeline.ensemble import Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
+from pipeline.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
 from pipeline.outputs import TIMELINE, check_files, check_folder
-from pipeline.results import result_folder, write_outcome
+from pipeline.results import in_order, result_folder, write_outcome
 from pipeline.starting import origins_of, span_of
-from pipeline.studies.localization import error_figures, summarise, summary_table
+from pipeline.studies.localization import error_charts, summarise, summary_table
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Clock, RunMetadata, open_log, schemas
@@ -99,7 +100,7 @@ def replay(
             order=order,
         )
         estimates = [LogSource(open_log(path)) for path, _ in places]
-        made = Replay(sources, estimates, settings, done.judge, dict(done.seconds), gap_limit_s)
+        made = Replay(sources, estimates, settings, done, gap_limit_s)
         weakref.finalize(made, stack.pop_all().close)
     return made
 
@@ -111,18 +112,21 @@ class Replay:
     Attributes:
         logs: the runs.
         estimates: for each of them a log of what was estimated, by topic.
-        settings: the estimators by label.
-        judge: what they are worth.
-        seconds: how long each estimator worked; compiling is part of a first use.
+        settings: the estimators by label, as they were given.
+        done: the pass: its judge, all parameters, and how long each estimator worked.
         gap_limit_s: the truth is not interpolated over longer gaps.
     """
 
     logs: Sequence[LogSource | MemorySource]
     estimates: Sequence[LogSource]
     settings: Settings
-    judge: Judge
-    seconds: Mapping[str, float]
+    done: Pass
     gap_limit_s: float
+
+    @property
+    def judge(self) -> Judge:
+        """What the estimators are worth."""
+        return self.done.judge
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
@@ -131,8 +135,8 @@ class Replay:
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric: estimator, quantity, case, value."""
-        return summary_table(self.judge.metrics)
+        """A row per metric, in the order of the estimators: estimator, quantity, case, value."""
+        return summary_table(in_order(self.judge.metrics, self.settings))
 
     @property
     def runs(self) -> pd.DataFrame:
@@ -187,13 +191,13 @@ class Replay:
 
         Raises BadInput where there is no such case, or nothing was judged.
         """
-        figures = error_figures(self.judge)
-        if not figures:
+        charts = error_charts(self.judge)
+        if not charts:
             raise BadInput("nothing to draw: no estimates with truth")
-        case = next(iter(figures)) if case is None else case
-        if case not in figures:
-            raise BadInput(f"nothing called '{case}' was judged; {choices(case, figures)}")
-        return figures[case]
+        case = next(iter(charts)) if case is None else case
+        if case not in charts:
+            raise BadInput(f"nothing called '{case}' was judged; {choices(case, charts)}")
+        return draw(charts[case])
 
     def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:
         """Show the timeline of a run: in the notebook, else in the viewer; or write it to an .rrd file.
@@ -238,6 +242,7 @@ class Replay:
             "title": f"replay of {self.logs[0].name}",
             "logs": [log.name for log in self.logs],
             "estimators": json.loads(json.dumps(self.settings, default=str)),
+            "parameters": self.done.parameters,
             "gap_limit_s": self.gap_limit_s,
         }
         with result_folder(place) as part:

@@ -7,15 +7,16 @@ it, so that nothing else is ever replaced with it.
 import hashlib
 import json
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from urllib.parse import quote
 
+from pipeline.charts import Chart, draw
+from pipeline.claims import Claim, decided
 from recorders.atomic import whole_folder
 from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
@@ -32,45 +33,34 @@ RESULT_FILE = "result.json"
 CSV_ROWS = 20_000
 # Raised when result.json changes in a way that its readers must know; one without it is of the first.
 FORMAT = 1
-Verdict = Literal["confirmed", "refuted", "not reproducible"]
+Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A statement of a paper: what it prints, what we measured, our verdict and its reason."""
-
-    claim: str
-    paper: str
-    ours: str
-    verdict: Verdict
-    why: str = ""
-
-
-def judged(claim: str, paper: str, ours: str, holds: bool, why: str = "") -> Claim:
-    """A claim that a measured condition confirms or refutes."""
-    return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
 
 
 @dataclass
 class Outcome:
     """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
 
-    `input_sha256` is a hash of the data that went in.
+    `bounds` are where a metric lies with 95 % if all is well. A figure is a chart, or a picture of
+    another kind. `input_sha256` is a hash of the data that went in, `parameters` are those of all
+    estimators, defaults included.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
     claims: list[Claim] = field(default_factory=list)
     tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
-    figures: dict[str, "Figure"] = field(default_factory=dict)
+    figures: dict[str, "Chart | Figure"] = field(default_factory=dict)
     input_sha256: str = ""
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
+    bounds: dict[str, Bounds] = field(default_factory=dict)
 
 
 class Result(Parameters):
     """What result.json says.
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
-    without it. A timeline has none: Rerun numbers its rows by the clock.
+    without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
+    lies with 95 % if all is well.
     """
 
     format: int = FORMAT
@@ -81,6 +71,7 @@ class Result(Parameters):
     metrics: dict[str, MetricValue]
     claims: list[Claim]
     files: dict[str, str | None] = {}
+    bounds: dict[str, Bounds] = {}
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
@@ -90,33 +81,38 @@ def split_metric(key: str) -> tuple[str, str, str]:
     return estimator, quantity, case
 
 
+def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
+    """The metrics of these estimators first and in their order, those of others as they were."""
+    place = {label: index for index, label in enumerate(estimators)}
+    keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
+    return {key: metrics[key] for key in keys}
+
+
+class Measured(NamedTuple):
+    """A metric's value, and where it lies with 95 % if all is well."""
+
+    value: MetricValue = None
+    bounds: Bounds | None = None
+
+
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one case: a row per quantity, a column per estimator."""
+    """The metrics of one case, by quantity and then by estimator; all estimators in one order."""
 
     case: str
     estimators: list[str]
-    rows: list[tuple[str, list[MetricValue]]]
+    quantities: dict[str, dict[str, Measured]]
 
 
-def metric_tables(metrics: Mapping[str, MetricValue]) -> list[MetricTable]:
+def metric_tables(metrics: Mapping[str, MetricValue], bounds: Mapping[str, Bounds]) -> list[MetricTable]:
     """The metrics by case."""
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
-    cases: dict[str, dict[str, dict[str, MetricValue]]] = {}
+    cases: dict[str, dict[str, dict[str, Measured]]] = {}
     for key, value in metrics.items():
         estimator, quantity, case = split_metric(key)
-        cases.setdefault(case, {}).setdefault(quantity, {})[estimator] = value
-    return [
-        MetricTable(
-            case,
-            estimators,
-            [
-                (quantity, [values.get(estimator) for estimator in estimators])
-                for quantity, values in quantities.items()
-            ],
-        )
-        for case, quantities in sorted(cases.items())
-    ]
+        measured = Measured(value, bounds.get(key))
+        cases.setdefault(case, {}).setdefault(quantity, {})[estimator] = measured
+    return [MetricTable(case, estimators, quantities) for case, quantities in sorted(cases.items())]
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
@@ -214,7 +210,10 @@ class ErrorTables:
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
-    """Write tables (Parquet, short ones CSV too), figures (SVG), result.json; returns what that says."""
+    """Write tables (Parquet, short ones CSV too), figures (SVG; charts as JSON too) and result.json.
+
+    Returns what result.json says.
+    """
     # here, since lists and --help need none of it
     import matplotlib as mpl
     import pyarrow
@@ -232,6 +231,9 @@ def write_outcome(
     for name, figure in outcome.figures.items():
         (folder / "figures").mkdir(exist_ok=True)
         path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes
+        if isinstance(figure, Chart):
+            path.with_suffix(".json").write_text(figure.model_dump_json() + "\n", encoding="utf-8")
+            figure = draw(figure)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
             _show_names_as_they_are(figure)
             figure.savefig(path, metadata={"Date": None})
@@ -242,8 +244,9 @@ def write_outcome(
             fuselog=version("fuselog"),
             settings=dict(settings),
             input_sha256=outcome.input_sha256,
-            metrics=plain(outcome.metrics),
-            claims=[_decided(claim) for claim in outcome.claims],
+            metrics=in_order(plain(outcome.metrics), settings.get("estimators", ())),
+            bounds={key: bounds for key, bounds in outcome.bounds.items() if key in outcome.metrics},
+            claims=[decided(claim) for claim in outcome.claims],
             files={
                 path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else _hash(path)
                 for path in written
@@ -268,14 +271,6 @@ def _show_names_as_they_are(figure: "Figure") -> None:
                 texts += axis.get_ticklabels()
     for text in texts:
         text.set_parse_math(False)
-
-
-def _decided(claim: Claim) -> Claim:
-    """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
-    if not re.search(r"\bnan\b", claim.ours):
-        return claim
-    why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
-    return replace(claim, verdict="not reproducible", why=why)
 
 
 def read_result(folder: Path) -> Result:

@@ -4,6 +4,7 @@ A study keeps what is its own: cases, claims, tables, figures.
 """
 
 import hashlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -12,10 +13,12 @@ from typing import Any
 
 from pipeline.ensemble import (
     Part,
+    Pass,
     Replayed,
     Settings,
     add_to_hash,
     estimates_metadata,
+    hash_files,
     parts_of,
     record_ensemble,
     replay_ensemble,
@@ -24,11 +27,11 @@ from pipeline.ensemble import (
 from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.results import ErrorTables
 from recorders.errors import BadInput
-from recorders.log import LogWriter
+from recorders.log import LogWriter, RunMetadata, open_log
 from recorders.parameters import merge
 from recorders.recording import import_run
 from replay.engine.blocks import Ragged, gather
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.sources import LogSource, MemorySource, Source, is_sensed, memory_source
 from replay.judging.judge import Judge
 
 
@@ -47,7 +50,7 @@ class Runner:
         first_run: int = 0,
         runs: int | None = None,
     ) -> list[MemorySource]:
-        """Runs in memory: simulated, or the one that is imported.
+        """Runs in memory: simulated, imported, or those of the logs.
 
         Args:
             parameters: what differs in those of the scenario.
@@ -61,8 +64,13 @@ class Runner:
         if experiment.import_ and setting.data:
             source = experiment.import_
             return [memory_source(*import_run(source.source, setting.data, source.parameters))]
+        if experiment.logs:
+            files = experiment.files[first_run:][:runs]
+            return [_in_memory(LogSource(open_log(file))) for file in files]
         if not experiment.record:
-            raise BadInput(f"experiment '{experiment.title}': give what to [record] or to [import]")
+            raise BadInput(
+                f"experiment '{experiment.title}': give what to [record], to [import], or [logs]"
+            )
         recorder, values, _ = load_scenario(experiment.record.scenario)
         return record_ensemble(
             recorder,
@@ -133,8 +141,8 @@ class Runner:
             self.keep(replayed.sources, replayed.outputs, name, drawn=name if number else "")
             yield name, replayed
 
-    def judge(self) -> tuple[Judge, str]:
-        """All of it in one streamed pass: the judge of all runs, and a hash of the data that went in.
+    def judge(self) -> tuple[Pass, str]:
+        """All of it in one streamed pass: what it leaves, and a hash of the data that went in.
 
         Memory holds a part of the runs at a time.
         """
@@ -143,13 +151,23 @@ class Runner:
 
         def parts() -> Iterator[Part]:
             for now in parts_of(experiment.runs):
-                sources = self.obtain(first_run=now.start, runs=now.stop - now.start)
                 places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
-                for source, (log, _) in zip(sources, places, strict=False):
-                    _write_log(source, log)
-                for source in sources:
-                    add_to_hash(digest, source)
-                estimates = [(path, log) for log, path in places]
+                sources: Sequence[Source]
+                if experiment.logs:
+                    files = experiment.files[now]
+                    sources = [LogSource(open_log(file)) for file in files]
+                    digest.update(hash_files(files).encode())
+                    estimates = [
+                        (path, self._as_seen_from(path, file))
+                        for (_, path), file in zip(places, files, strict=False)
+                    ]
+                else:
+                    recorded = self.obtain(first_run=now.start, runs=now.stop - now.start)
+                    for source, (log, _) in zip(recorded, places, strict=False):
+                        _write_log(source, log)
+                    for source in recorded:
+                        add_to_hash(digest, source)
+                    sources, estimates = recorded, [(path, log) for log, path in places]
                 yield Part(sources, now.start, len(sources) == experiment.runs, estimates)
 
         with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
@@ -162,12 +180,24 @@ class Runner:
                 on_errors=errors.add if errors else None,
                 progress=setting.progress,
             )
-        return done.judge, digest.hexdigest()
+        return done, digest.hexdigest()
+
+    def _as_seen_from(self, path: Path, log: Path) -> Path:
+        """Where a log seems to be from a file of the folder, so that it is there when that has moved."""
+        there = self.setting.place / path.relative_to(self.setting.folder)
+        return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
 
     def _places(self, folder: str, run: int) -> tuple[Path, Path]:
         """Where a run's log and its estimates go."""
         name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
         return place / "logs" / name, place / "estimates" / name
+
+
+def _in_memory(source: LogSource) -> MemorySource:
+    """A log's streams, but for estimates and what is no columns."""
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    topics = [topic for topic in source.topics if is_sensed(source, topic)]
+    return MemorySource(source.read(topics), run, source.name)
 
 
 def _write_log(source: MemorySource, path: Path) -> None:

@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from pipeline.results import Claim, MetricValue, metric_tables
+from pipeline.claims import Claim
+from pipeline.results import Bounds, Measured, MetricValue, metric_tables
 from recorders.errors import printable
 
 
@@ -84,11 +85,31 @@ def format_value(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def print_metrics(metrics: Mapping[str, MetricValue]) -> None:
-    """Metrics as tables: one per case, a row per quantity, a column per estimator."""
-    for table in metric_tables(metrics):
-        rows = [[quantity, *values] for quantity, values in table.rows]
+def print_metrics(metrics: Mapping[str, MetricValue], bounds: Mapping[str, Bounds]) -> None:
+    """Metrics as tables: one per case, a row per quantity, a column per estimator.
+
+    A value that has bounds stands before them: 95 % of all values lie there if all is well.
+    """
+    for table in metric_tables(metrics, bounds):
+        rows = []
+        for quantity, values in table.quantities.items():
+            cells = [values.get(estimator, Measured()) for estimator in table.estimators]
+            rows.append([quantity, *map(_with_bounds, cells)])
         print_table(["", *table.estimators], rows, table.case)
+
+
+def _with_bounds(measured: Measured) -> object:
+    if measured.bounds is None or measured.value is None:
+        return measured.value
+    low, high = map(format_value, measured.bounds)
+    return f"{format_value(measured.value)} ({low} to {high})"
+
+
+def print_parameters(parameters: Mapping[str, Mapping[str, object]]) -> None:
+    """The parameters of estimators by label: a row each, a column per estimator."""
+    names = dict.fromkeys(name for values in parameters.values() for name in values)
+    rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
+    print_table(["parameter", *parameters], rows)
 
 
 def print_claims(claims: Sequence[Claim]) -> None:

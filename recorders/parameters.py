@@ -1,6 +1,7 @@
 """Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from textwrap import shorten
 from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -41,7 +42,8 @@ def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> 
         raise BadInput(f"{where}: parameter '{name}' is {given}; {message}") from None
 
 
-def _nested_defaults(kind: type[Parameters]) -> dict[str, Any]:
+@cache
+def _nested_defaults(kind: type[Parameters]) -> Mapping[str, Any]:
     """Defaults that are tables of their own, so that a setting of one entry keeps the others."""
     defaults = {name: entry.default for name, entry in kind.model_fields.items()}
     return {

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.stats import skew
 
-from pipeline.results import Claim
+from pipeline.claims import Claim, judged, listed
 from pipeline.studies.acoustic_cases import (
     BEARINGS,
     CROSS,
@@ -18,7 +18,6 @@ from pipeline.studies.acoustic_cases import (
     range_errors_m,
     truth_of,
 )
-from pipeline.studies.repetitions import listed, verdict
 from replay.estimators import acoustic
 from replay.judging.consistency import ellipse_area
 from replay.judging.evaluation import chi_square_interval
@@ -62,22 +61,22 @@ def _hearing(nominal: list[Case]) -> Iterator[Claim]:
     for case, paper in zip(nominal, HEARING, strict=True):
         true = acoustic.noise_free(case.parameters.medium, *truth_of(case.parameters))
         hearing = {int(s) + 1 for s in np.flatnonzero(np.isfinite(true.shockwave_rad[0]))}
-        yield Claim(
+        yield judged(
             f"scenario {case.number}: who hears the shockwave",
             f"sensors {listed(sorted(paper), 0)}",
             f"sensors {listed(sorted(hearing), 0)}",
-            verdict(hearing == paper),
+            hearing == paper,
         )
 
 
 def _range_errors(case: Case) -> Iterator[Claim]:
     errors = [error for error, _ in range_errors_m(case).values()]
     skews = np.array([skew(error) for error in errors])
-    yield Claim(
+    yield judged(
         f"range errors have a heavier left tail than a Gaussian (scenario {case.number}, r_hat - r)",
         "left",
         f"skew {listed(skews, 1)}, mean {listed([error.mean() for error in errors], 1)} m",
-        verdict(bool((skews < 0.0).all())),
+        bool((skews < 0.0).all()),
         "the tail is to the right: ranges come out too long",
     )
 
@@ -88,12 +87,12 @@ def _efficiency(by_scenario: list[list[Case]], multipliers: list[float]) -> Iter
             low, high = chi_square_interval(2, cases[0].modes[label].nees.shape[1])
             nees = np.array([case.modes[label].mean_nees for case in cases])
             inside = (nees >= low) & (nees <= high)
-            yield Claim(
+            yield judged(
                 f"{label}, scenario {cases[0].number}: NEES in [{low:.2f}, {high:.2f}] at all noises",
                 paper,
                 f"{inside.sum()} of {len(nees)} noises; {nees.min():.2f} to {nees.max():.2f}"
                 f"{_medians(cases, label) if nees.max() > STRAY else ''}",
-                verdict(_as_said(paper, inside)),
+                _as_said(paper, inside),
                 "" if inside.all() else f"outside at {_noises(multipliers, ~inside)}",
             )
 
@@ -127,11 +126,11 @@ def _ellipses(nominal: list[Case]) -> Iterator[Claim]:
         expected = {label: abs(value - 1.0) < MATCH for label, value in ratio.items()}
         scenario_3 = case.number == 3
         holds = not expected[BEARINGS] and expected[NATIVE] if scenario_3 else all(expected.values())
-        yield Claim(
+        yield judged(
             f"scenario {case.number}: the estimates' covariances match the CRLBs",
             "not for bearings only" if scenario_3 else "closely, in all modes",
             "areas by CRLB's: " + ", ".join(f"{label} {value:.2f}" for label, value in ratio.items()),
-            verdict(holds),
+            holds,
         )
 
 
@@ -151,12 +150,12 @@ def _gains(nominal: list[Case]) -> Iterator[Claim]:
         by_ranges[2] > 1.0 + CLOSE and by_native[2] > 2.0 * by_ranges[2],
     )
     for index, case in enumerate(nominal):
-        yield Claim(
+        yield judged(
             f"scenario {case.number}: what other measurements add to bearings",
             said[index],
             f"areas {listed(list(areas[index].values()))} m2: {by_ranges[index]:.2f} times smaller with "
             f"ranges, {by_native[index]:.2f} times with native measurements",
-            verdict(holds[index]),
+            holds[index],
         )
 
 
@@ -171,27 +170,27 @@ def _bounds(by_scenario: list[list[Case]], nominal: list[Case]) -> Iterator[Clai
                 lower.append(f"{where}: {nm.bound_m:.3f} against {le.bound_m:.3f} m")
             if nm.rmse_m > le.rmse_m:
                 worse.append(f"{where}: {nm.rmse_m:.2f} against {le.rmse_m:.2f} m")
-    yield Claim(
+    yield judged(
         "CRLB of native measurements is lower than that of local estimates",
         "in every case",
         "; ".join(lower) or "in every case",
-        verdict(not lower),
+        not lower,
         "the trace term counts the range's noise as information",
     )
-    yield Claim(
+    yield judged(
         "native measurements localize better than local estimates",
         "always",
         "not in " + "; ".join(worse) if worse else "always (RMSE)",
-        verdict(not worse),
+        not worse,
     )
     better = [case for case in by_scenario[2] if case.modes[LOCAL].rmse_m < case.modes[LOCAL].bound_m]
     at = by_scenario[2][[case.multiplier for case in by_scenario[2]].index(1.0)].modes[LOCAL]
-    yield Claim(
+    yield judged(
         "scenario 3: local estimates appear to beat their CRLB (figure 20)",
         "yes; the bound is approximate",
         f"at {len(better)} of {len(by_scenario[2])} noises; RMSE {at.rmse_m:.2f} against "
         f"{at.bound_m:.2f} m at the paper's",
-        verdict(len(better) > 0.5 * len(by_scenario[2])),
+        len(better) > 0.5 * len(by_scenario[2]),
     )
     gain, where = max(
         (1.0 - sigma / case.parameters.sigma_position_m, f"scenario {case.number}, {name}")
@@ -201,26 +200,26 @@ def _bounds(by_scenario: list[list[Case]], nominal: list[Case]) -> Iterator[Clai
         )
         if name.startswith("sensor_")
     )
-    yield Claim(
+    yield judged(
         "estimating the sensors along improves them negligibly",
         "negligible",
         f"up to {100 * gain:.0f} % ({where})",
-        verdict(gain < NEGLIGIBLE),
+        gain < NEGLIGIBLE,
     )
     ratio = [case.modes[FIXED].rmse_m / case.modes[NATIVE].rmse_m for case in nominal]
-    yield Claim(
+    yield judged(
         "so it may be left out, if the sensors' errors are counted in",
         "reasonably",
         f"position RMSE {listed(ratio, 3)} times that with sensors estimated",
-        verdict(max(ratio) < 1.0 + NEGLIGIBLE),
+        max(ratio) < 1.0 + NEGLIGIBLE,
     )
     impossible = nominal[0].modes
-    yield Claim(
+    yield judged(
         "eq (48) with the covariances of eqs (17), (18) bounds local estimates",
         "eq (48)",
         f"area {impossible[CROSS].area_m2:.1f} m2, below {impossible[NATIVE].area_m2:.1f} of the native "
         "measurements that they are made of",
-        verdict(impossible[CROSS].area_m2 >= impossible[NATIVE].area_m2),
+        impossible[CROSS].area_m2 >= impossible[NATIVE].area_m2,
         "so the paper's own figures leave them out",
     )
 
@@ -232,19 +231,19 @@ def _divergence(by_scenario: list[list[Case]]) -> Iterator[Claim]:
             for scenario in by_scenario
         ]
         far = {label: [case.modes[label].far_per_1000 for case in cases] for label in (CROSS, LOCAL)}
-        yield Claim(
+        yield judged(
             f"cross-covariances in the search make it stray, at the {when} noise",
             "occasionally; never without them",
             f"missing or over 50 m off, per 1000: {listed(far[CROSS], 0)} with, "
             f"{listed(far[LOCAL], 0)} without",
-            verdict(sum(far[CROSS]) > 5.0 * sum(far[LOCAL])),
+            sum(far[CROSS]) > 5.0 * sum(far[LOCAL]),
         )
     lost = 1.0 - min(case.modes[LOCAL].converged for cases in by_scenario for case in cases)
-    yield Claim(
+    yield judged(
         "without cross-covariances the search never diverges",
         "no divergence in any run",
         f"at most {100 * lost:.2f} % of the searches of a scenario and noise do not converge",
-        verdict(lost == 0.0),
+        lost == 0.0,
     )
 
 

@@ -7,13 +7,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from pipeline.charts import Axis, Chart, Panel, curve, interval, path
 from pipeline.studies.acoustic_cases import AcousticOptions, Case, Mode, area_ratios, range_errors_m
-from pipeline.studies.repetitions import draw_interval
+from pipeline.studies.repetitions import EFFICIENT
 from replay.judging.evaluation import chi_square_interval
 from replay.timeline.plane import ellipses
 
 
-def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Figure]:
+def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Chart | Figure]:
     """All figures by name."""
     nominal = [case for case in cases if case.multiplier == 1.0]
     return {
@@ -25,22 +26,22 @@ def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[
     }
 
 
-def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Figure:
+def _ellipses(nominal: Sequence[Case], modes: Sequence[str]) -> Chart:
     """Figures 6-14: the CRLB's 95 % ellipses, and those of the estimates."""
-    figure = Figure(figsize=(11, 11), layout="constrained")
-    for row, case in zip(figure.subplots(len(nominal), len(modes)), nominal, strict=True):
+    panels = []
+    for case in nominal:
         shooter = np.array(case.parameters.shooter_position_m)
         sensors = np.array(case.parameters.sensor_position_m)
-        for axes, label in zip(row, modes, strict=True):
+        for label in modes:
             mode = case.modes[label]
-            for covariance, style in ((mode.bound[:2, :2], "-"), (mode.covariance, "--")):
+            panel = Panel(title=f"scenario {case.number}, {label}", plane=True)
+            for name, covariance in (("CRLB", mode.bound[:2, :2]), ("estimates", mode.covariance)):
                 [outline] = ellipses(shooter[None], covariance[None])
-                axes.plot(*outline.T, style, label="CRLB" if style == "-" else "estimates")
-            axes.plot(*sensors.T, "s", ms=4)
-            axes.plot(*shooter, "k*")
-            axes.set(title=f"scenario {case.number}, {label}", aspect="equal")
-    figure.axes[0].legend(fontsize=7)
-    return figure
+                panel.series.append(path(name, outline, "line" if name == "CRLB" else "dashed"))
+            panel.series.append(path("sensors", sensors, "markers"))
+            panel.series.append(path("shooter", shooter[None], "markers", reference=True))
+            panels.append(panel)
+    return Chart(columns=len(modes), panels=panels)
 
 
 def _range_errors(case: Case) -> Figure:
@@ -63,24 +64,25 @@ def _sweep(
     label: str,
     value: Callable[[Mode], float],
     interval_runs: int | None,
-) -> Figure:
+) -> Chart:
     """Figures 15-20: a value by noise; with an interval for NEES, else with the CRLB."""
     numbers = sorted({case.number for case in cases})
-    figure = Figure(figsize=(12, 3.5), layout="constrained")
-    for axes, number in zip(figure.subplots(1, len(numbers)), numbers, strict=True):
+    panels = []
+    for number in numbers:
         swept = [case for case in cases if case.number == number]
+        noise = [case.multiplier for case in swept]
+        x = Axis(label="multiple of the angular noise")
+        panel = Panel(title=f"scenario {number}", x=x, y=Axis(label=label))
         if interval_runs:
-            draw_interval(axes, *chi_square_interval(2, interval_runs))
-        for index, name in enumerate(modes):
-            noise = [case.multiplier for case in swept]
+            panel.bands.append(interval(EFFICIENT, noise, *chi_square_interval(2, interval_runs)))
+        for name in modes:
             found = [case.modes[name] for case in swept]
-            axes.plot(noise, [value(mode) for mode in found], "o-", ms=3, color=f"C{index}", label=name)
+            panel.series.append(curve(name, noise, [value(mode) for mode in found], "line+markers"))
             if not interval_runs:
-                axes.plot(noise, [mode.bound_m for mode in found], ":", color=f"C{index}")
-        axes.set(title=f"scenario {number}", xlabel="multiple of the angular noise")
-    figure.axes[0].set_ylabel(label if interval_runs else f"{label}; dotted: CRLB")
-    figure.axes[0].legend(fontsize=7)
-    return figure
+                bound_m = [mode.bound_m for mode in found]
+                panel.series.append(curve(f"CRLB of {name}", noise, bound_m, "dashed"))
+        panels.append(panel)
+    return Chart(columns=len(numbers), panels=panels)
 
 
 def _maps(options: AcousticOptions) -> Figure:

@@ -6,12 +6,13 @@ assigned when tracks and vessels are paired one to one: see `replay.judging.trac
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from pydantic import NonNegativeInt, PositiveFloat
 
+from pipeline.charts import Axis, Chart, Panel, curve, level, thinned
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summary_table
 from recorders.errors import BadInput
@@ -43,7 +44,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.tables["vessels"] = vessels
     notes = replayed.sources[0].run.notes.items()
     outcome.tables["notes"] = pd.DataFrame(notes, columns=["what", "count"])
-    outcome.figures["tracks"] = tracks_figure(replayed, vessels, options)
+    outcome.figures["tracks"] = tracks_chart(replayed, vessels, options)
     outcome.claims = _claims(vessels, options)
     return outcome
 
@@ -61,34 +62,36 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
     return pd.concat(tables).rename(columns={"thing": "mmsi"})
 
 
-def tracks_figure(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Figure:
+def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Chart:
     """The share of every vessel's reports in its own track, and live tracks and vessels over time."""
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    above, below = figure.subplots(2, 1)
     many = vessels[vessels["reports"] > options.more_reports_than]
-    for estimator, rows in many.groupby("estimator", sort=False):
-        above.plot(np.sort(rows["share"])[::-1], ".-", label=str(estimator))
-    above.axhline(KEPT_SHARE, color="0.7", lw=1, label=f"kept: {KEPT_SHARE:g}")
-    above.set(
-        xlabel=f"vessels with more than {options.more_reports_than} reports, best first",
-        ylabel="share of reports in the own track",
-        ylim=(0, 1.02),
+    shares = {
+        str(estimator): np.sort(rows["share"])[::-1]
+        for estimator, rows in many.groupby("estimator", sort=False)
+    }
+    series = [
+        curve(name, np.arange(len(share)), share, "line+markers") for name, share in shares.items()
+    ]
+    most = max(map(len, shares.values()), default=1)
+    above = Panel(
+        x=Axis(label=f"vessels with more than {options.more_reports_than} reports, best first"),
+        y=Axis(label="share of reports in the own track", limits=(0, 1.02)),
+        series=[*series, level(f"kept: {KEPT_SHARE:g}", np.arange(most), KEPT_SHARE)],
     )
-    above.legend(loc="lower left")
     [source] = replayed.sources
     identity = source.read(["/identity"])["/identity"]
-    curves = {"vessels": (identity.publish_time_ns, identity["thing_id"])}
+    seen = {"vessels": (identity.publish_time_ns, identity["thing_id"])}
     for each in replayed.judged:
         if isinstance(each, Output) and each.leaf == "track":
             stream = each.rows.stream
-            curves[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
-    for label, (time_ns, numbers) in curves.items():
+            seen[f"tracks of {each.estimator}"] = stream.publish_time_ns, stream["track_id"]
+    below = Panel(x=Axis(label="time (s)"), y=Axis(label=f"heard within {options.live_s:g} s"))
+    for label, (time_ns, numbers) in seen.items():
         at_ns, live = live_counts(time_ns, numbers, options.live_s)
-        colour = {"color": "0.4"} if label == "vessels" else {}
-        below.plot((at_ns - source.epoch_ns) * 1e-9, live, label=label, lw=1, **colour)
-    below.set(xlabel="time (s)", ylabel=f"heard within {options.live_s:g} s", ylim=(0, None))
-    below.legend(loc="lower right")
-    return figure
+        rows = thinned(len(at_ns))
+        elapsed_s = (at_ns[rows] - source.epoch_ns) * 1e-9
+        below.series.append(curve(label, elapsed_s, live[rows], reference=label == "vessels"))
+    return Chart(panels=[above, below])
 
 
 def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:

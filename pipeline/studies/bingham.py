@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveInt
 
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study, load_scenario
-from pipeline.results import Claim, Outcome
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.repetitions import require_spread, rmse_of_runs
 from recorders.errors import BadInput
@@ -141,11 +142,11 @@ def _claims(case: str, found: dict[str, Floats], options: BinghamOptions) -> lis
     if "grid" in found:
         excess = float(np.nanmean(own) / np.nanmean(found["grid"]) - 1.0)
         claims.append(
-            Claim(
+            judged(
                 f"nothing is left to gain: within 1 % of Bayes' rule on a grid, {noise}",
                 "(not in the paper)",
                 f"{np.nanmean(own):.3f} deg against {np.nanmean(found['grid']):.3f} deg",
-                "confirmed" if excess < 0.01 else "refuted",
+                excess < 0.01,
             )
         )
     return claims
@@ -156,12 +157,12 @@ def _beats(claim: str, own: Floats, rival: Floats) -> Claim:
     gain = (rival - own)[np.isfinite(rival - own)]
     error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
     is_better = gain.mean() > max(2.0 * error, 0.01 * np.nanmean(rival))
-    return Claim(
+    return judged(
         claim,
         "a smaller angular RMSE",
         f"mean {np.nanmean(own):.3f} against {np.nanmean(rival):.3f} deg, "
         f"median {np.nanmedian(own):.3f} against {np.nanmedian(rival):.3f} deg",
-        "confirmed" if is_better else "refuted",
+        is_better,
         "" if is_better else f"the gain is {gain.mean():.4f} deg, its standard error {error:.4f} deg",
     )
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from pydantic import PositiveInt
 from scipy.stats import norm
 
+from pipeline.charts import Axis, Chart, Panel, curve, thinned
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Outcome
@@ -42,7 +43,8 @@ from replay.judging.verification import (
 )
 
 RATE, SPREAD, COUNT = "verification_rate_percent", "verification_rate_sd_percent", "identified_percent"
-THINNED = 2000
+# False rates at the ticks of both axes of normal deviates.
+TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
 class BiometricsOptions(Parameters):
@@ -65,8 +67,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.tables["impact"] = impact_table(outcome.tables["factors"])
     outcome.tables["confidence"] = confidence_table(replayed, setting.options.replicates)
     outcome.figures["distributions"] = distribution_figure(sources[0])
-    outcome.figures["roc"] = curve_figure(replayed, deviates=False)
-    outcome.figures["det"] = curve_figure(replayed, deviates=True)
+    outcome.figures["roc"] = curve_chart(replayed, deviates=False)
+    outcome.figures["det"] = curve_chart(replayed, deviates=True)
     if experiment.import_:
         outcome.claims += claims_of_bssr1(values)
     else:
@@ -193,32 +195,29 @@ def distribution_figure(source: MemorySource) -> Figure:
     return figure
 
 
-def curve_figure(replayed: Replayed, *, deviates: bool) -> Figure:
+def curve_chart(replayed: Replayed, *, deviates: bool) -> Chart:
     """ROC, or with normal deviates on both axes the detection error trade-off."""
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    plot = figure.subplots()
-    ticks = np.array([1e-4, 1e-3, 0.01, 0.05, 0.2])
+    series = []
     for topic, fused in _complete(replayed).items():
-        curve = roc(fused.score, fused.genuine)
+        found = roc(fused.score, fused.genuine)
         label = " ".join(split_topic(topic))
-        accept, reject = curve.false_accept, 1 - curve.genuine_accept
+        accept, reject = found.false_accept, 1 - found.genuine_accept
         inside = np.flatnonzero((accept > 0) & (accept < 1))
-        rows = inside[:: max(1, len(inside) // THINNED)]
+        rows = inside[thinned(len(inside))]
         if deviates:
-            plot.plot(
-                norm.ppf(accept[rows]), norm.ppf(np.maximum(reject[rows], 1e-4)), label=label, lw=1
-            )
+            x, y = norm.ppf(accept[rows]), norm.ppf(np.maximum(reject[rows], 1e-4))
         else:
-            plot.plot(accept[rows], curve.genuine_accept[rows], label=label, lw=1)
+            x, y = accept[rows], found.genuine_accept[rows]
+        series.append(curve(label, x, y))
     if deviates:
-        for axis in (plot.xaxis, plot.yaxis):
-            axis.set_ticks(norm.ppf(ticks), [f"{100 * tick:g}" for tick in ticks])
-        bounds = norm.ppf([5e-5, 0.4])
-        plot.set(xlim=bounds, ylim=bounds, xlabel="FAR (%)", ylabel="FRR (%)", title="DET")
-    else:
-        plot.set(xscale="log", xlabel="FAR", ylabel="GAR", title="ROC", ylim=(0.65, 1.005))
-    plot.legend()
-    return figure
+        low, high = norm.ppf([5e-5, 0.4])
+        limits = float(low), float(high)
+        ticks = {float(norm.ppf(rate)): f"{100 * rate:g}" for rate in TICKS}
+        x, y = (Axis(label=f"{rate} (%)", limits=limits, ticks=ticks) for rate in ("FAR", "FRR"))
+        panel = Panel(x=x, y=y, series=series)
+        return Chart(title="DET", panels=[panel])
+    y = Axis(label="GAR", limits=(0.65, 1.005))
+    return Chart(title="ROC", panels=[Panel(x=Axis(label="FAR", log=True), y=y, series=series)])
 
 
 BIOMETRICS = Study(

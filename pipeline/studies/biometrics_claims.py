@@ -4,10 +4,11 @@ Their rates of R1 and R2 stand with the face rates swapped in Table 3a: R1 is fa
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from pipeline.results import Claim, Verdict
+from pipeline.claims import Claim, judged, listed
 from replay.judging.verification import relative_rate_increase
 
 Values = Mapping[str, float]
@@ -86,11 +87,11 @@ def claims_of_simulation(values: Values, counts: Counts) -> list[Claim]:
         if len(found) > 1:
             mean, spread = float(np.mean(found)), float(np.std(found, ddof=1))
             claims.append(
-                Claim(
+                judged(
                     f"{label} {case}: the real count of identified users is as a simulated run's",
                     str(real),
                     f"{mean:.1f} ± {spread:.1f} ({len(found)} runs)",
-                    _verdict(abs(real - mean) <= 3 * spread),
+                    abs(real - mean) <= 3 * spread,
                     "within 3 standard deviations of a run",
                 )
             )
@@ -103,18 +104,16 @@ def _rates(values: Values, label: str, quantity: str) -> dict[str, float]:
     return {case: values.get(f"{label}.{quantity}.{case}", np.nan) for case in CASES}
 
 
-def _verdict(holds: bool | np.bool_) -> Verdict:
-    return "confirmed" if holds else "refuted"
-
-
-def _listed(rates: Mapping[str, float]) -> str:
-    return ", ".join(f"{rate:.2f}" for rate in rates.values())
-
-
 def _exact(claim: str, paper: Mapping[str, float], ours: Mapping[str, float]) -> Claim:
     off = [key for key in paper if not abs(ours[key] - paper[key]) <= ROUNDING]
     why = f"differ: {', '.join(off)}" if off else "equal to the last printed digit"
-    return Claim(claim, _listed(paper), _listed(ours), _verdict(not off), why)
+    return judged(
+        claim,
+        listed([*paper.values()], between=", "),
+        listed([*ours.values()], between=", "),
+        not off,
+        why,
+    )
 
 
 def _within_spread(values: Values, label: str, name: str, case: str) -> Claim:
@@ -124,18 +123,18 @@ def _within_spread(values: Values, label: str, name: str, case: str) -> Claim:
     off = abs(ours - paper) / spread
     why = f"{off:.1f} standard deviations of a seed apart; the paper's seeds and folds are unknown"
     claim = f"Tables 2a, 3a: {name}, {case} (%)"
-    return Claim(claim, f"{paper:.2f}", f"{ours:.2f} ± {spread:.2f}", _verdict(off <= 3), why)
+    return judged(claim, f"{paper:.2f}", f"{ours:.2f} ± {spread:.2f}", off <= 3, why)
 
 
 def _swapped(singles: Mapping[str, float], case: str) -> Claim:
     paper, ours = PRINTED_MEAN_RATE[case], float(np.mean([singles[name] for name in MEMBERS[case]]))
     why = "the face rates of R1 and R2 are swapped in Table 3a"
     holds = abs(ours - paper) <= 2 * ROUNDING
-    return Claim(
+    return judged(
         f"Table 3b: mean rate of {case} (%)",
         f"{paper:.2f}",
         f"{ours:.2f}",
-        _verdict(holds),
+        holds,
         "" if holds else why,
     )
 
@@ -157,11 +156,11 @@ def _modality_dominates(increases: Mapping[str, Mapping[str, float]]) -> Claim:
     known = [of for of in increases.values() if np.isfinite(list(of.values())).all()]
     modalities = float(np.mean([of[case] for of in known for case in MODALITIES]))
     methods = float(np.mean([of[case] for of in known for case in METHODS]))
-    return Claim(
+    return judged(
         "Table 5: fusing modalities gains more than fusing matchers of one (mean RRI)",
         "0.8449 against 0.6563",
         f"{modalities:.4f} against {methods:.4f}",
-        _verdict(modalities > methods),
+        modalities > methods,
         f"over {len(known)} processes; the comparison, with the swapped rates put right",
     )
 
@@ -170,11 +169,11 @@ def _process_before_method(increases: Mapping[str, Mapping[str, float]]) -> Clai
     one = [increases["hmm"][case] - increases["qda"][case] for case in METHODS]
     two = [increases["hmm"][case] - increases["qda"][case] for case in MODALITIES]
     gain, rest = float(np.mean(one)), float(np.mean(two))
-    return Claim(
+    return judged(
         "4.2: the process matters more within one modality (RRI of HMM less LDA)",
         "0.1518 against 0.0848",
         f"{gain:.4f} against {rest:.4f}",
-        _verdict(gain > rest),
+        gain > rest,
     )
 
 
@@ -190,10 +189,11 @@ def _hmm_is_best(values: Values) -> list[Claim]:
         }
         rival = "knn" if rates["knn"] >= rates["qda"] else "qda"
         ahead, spread = rates["hmm"] - rates[rival], float(np.hypot(spreads["hmm"], spreads[rival]))
-        verdict = _verdict(ahead > 0) if abs(ahead) > spread else "not reproducible"
         ours = f"{rates['hmm']:.2f} against {rates[rival]:.2f} ({NAMES[rival]})"
         why = f"the seeds' spread of the difference is {spread:.2f}"
         paper = max(PAPER_FUSED["qda"][case], PAPER_FUSED["knn"][case])
         printed = f"{PAPER_FUSED['hmm'][case]:.2f} against {paper:.2f}"
-        claims.append(Claim(f"HMM is the best learnt process, {case} (%)", printed, ours, verdict, why))
+        claim = judged(f"HMM is the best learnt process, {case} (%)", printed, ours, ahead > 0, why)
+        is_told = abs(ahead) > spread
+        claims.append(claim if is_told else replace(claim, verdict="not reproducible"))
     return claims

@@ -6,10 +6,11 @@ Claims: Jin, Lee, Hashimoto, DIND networks, section 4.2, on real robots; the pap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.claims import Claim, judged
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies import localization
 
 ALONE, NAIVE, CI, JOINT = "alone", "naive", "ci", "joint"
@@ -19,7 +20,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     outcome = localization.study(experiment, setting)
     outcome.claims = claims(outcome.metrics)
-    outcome.figures["modes"] = mode_figure(outcome.metrics, list(experiment.estimators))
+    outcome.figures["modes"] = mode_chart(outcome.metrics, list(experiment.estimators))
     return outcome
 
 
@@ -30,20 +31,23 @@ def by_robot(metrics: Mapping[str, MetricValue], estimator: str, quantity: str) 
     return {key: float(value) for key, value in found.items() if isinstance(value, int | float)}
 
 
-def mode_figure(metrics: Mapping[str, MetricValue], estimators: Sequence[str]) -> Figure:
+def mode_chart(metrics: Mapping[str, MetricValue], estimators: Sequence[str]) -> Chart:
     """RMSE and NEES of every robot's position, estimator by estimator."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    panels = [("position_rmse_m", "RMSE of the position, m"), ("position_nees", "NEES of the position")]
-    for axes, (quantity, label) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        for index, estimator in enumerate(estimators):
-            values = by_robot(metrics, estimator, quantity)
-            axes.plot(values.keys(), values.values(), "osD^v"[index % 5], label=estimator)
-        axes.set(yscale="log", ylabel=label)
-    axes.axhline(2, color="0.5", lw=1, label="consistent")
-    figure.legend(
-        *axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(estimators) + 1
-    )
-    return figure
+    panels = []
+    for quantity, label in (
+        ("position_rmse_m", "RMSE of the position (m)"),
+        ("position_nees", "NEES of the position"),
+    ):
+        values = {estimator: by_robot(metrics, estimator, quantity) for estimator in estimators}
+        series = [
+            curve(estimator, list(own), list(own.values()), "markers")
+            for estimator, own in values.items()
+        ]
+        panels.append(Panel(y=Axis(label=label, log=True), series=series))
+    robots = list(dict.fromkeys(robot for own in values.values() for robot in own))
+    if robots:
+        panels[-1].series.append(level("consistent", robots, 2))
+    return Chart(columns=2, panels=panels)
 
 
 def claims(metrics: Mapping[str, MetricValue]) -> list[Claim]:

@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
+from pipeline.charts import Axis, Chart, band
+from pipeline.claims import Claim, judged, named
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies.linearization import (
     REFERENCE,
     Ensemble,
     Floats,
     Options,
-    draw_errors,
     ensembles,
+    error_panel,
     falling,
-    listed,
     rmse,
 )
 from recorders.models.extended_target import area_m2
@@ -42,7 +42,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         tables.append(step_errors(ensemble).assign(seed=experiment.seed + number))
         sources += ensemble.sources
     steps = pd.concat(tables)
-    outcome = Outcome(tables={"steps": steps}, figures={"errors": error_figure(steps)})
+    outcome = Outcome(tables={"steps": steps}, figures={"errors": error_chart(steps)})
     at_keys = by_key_step(steps)
     outcome.tables["summary"] = at_keys
     outcome.metrics |= metrics(at_keys)
@@ -169,7 +169,7 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
         judged(
             "The RUKF estimates the target much too small (Fig. 10, step 75)",
             "far smaller than the target",
-            f"median area {listed(median, 'rukf-10', REFERENCE)} m2",
+            f"median area {named(median, 'rukf-10', REFERENCE)} m2",
             median["rukf-10"] < 0.8 * median[REFERENCE],
         ),
         judged(
@@ -181,20 +181,20 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
         judged(
             "The S2KF with 50 samples has the smallest position error of the paper's filters",
             "quickly to an error of nearly zero",
-            f"at step {last}: {listed(position[last], *PAPER)} m",
+            f"at step {last}: {named(position[last], *PAPER)} m",
             position[last]["s2kf-50"] == min(position[last][name] for name in PAPER),
         ),
         judged(
             "All filters quickly decrease their position error, the UKF to a higher level",
             "UKF a little higher",
-            f"step {first}: {listed(position[first], *PAPER)}; {last}: {listed(position[last], *PAPER)}",
+            f"step {first}: {named(position[first], *PAPER)}; {last}: {named(position[last], *PAPER)}",
             all(position[last][name] < position[first][name] for name in PAPER)
             and position[last]["ukf"] == max(position[last][name] for name in PAPER),
         ),
         judged(
             "The area converges to the analytic filter's with more samples, whatever the sample sets",
             "convergence evident from 25 to 50 samples",
-            f"step {last}, one set each: {listed(area[last], *SMART)} m2",
+            f"step {last}, one set each: {named(area[last], *SMART)} m2",
             falling([area[last][name] for name in SMART]),
             "a set is unique only up to a rotation, and in 8 dimensions the results depend on it",
         ),
@@ -214,27 +214,21 @@ def claims(at_keys: pd.DataFrame, steps: pd.DataFrame) -> list[Claim]:
     return found
 
 
-def error_figure(steps: pd.DataFrame) -> Figure:
+def error_chart(steps: pd.DataFrame) -> Chart:
     """Fig. 9: RMSE of position and area against the exact moments, and the band of the rotations."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots(1, 2)
     is_turned = steps["estimator"].str.contains(TURNED)
     own = steps[~is_turned & (steps["estimator"] != REFERENCE)]
-    names = {"position_rmse_m": "RMSE of the position (m)", "area_rmse_m2": "RMSE of the area (m²)"}
-    for each, (quantity, label) in zip(axes, names.items(), strict=True):
-        draw_errors(each, own, quantity, label)
-        for name, colour in zip(SMART[:2], ("tab:green", "tab:red"), strict=True):
+    panels = []
+    for quantity, of in (("position_rmse_m", "position (m)"), ("area_rmse_m2", "area (m²)")):
+        panel = error_panel(own, quantity, f"RMSE of the {of}")
+        for name in SMART[:2]:
             rows = steps[steps["estimator"].str.startswith(name + TURNED)]
             if len(rows):
                 by_turn = rows.pivot_table(quantity, "estimator", "step")
                 label = f"{name}, {len(by_turn)} rotations"
-                each.fill_between(
-                    by_turn.columns, by_turn.min(), by_turn.max(), color=colour, alpha=0.15, label=label
-                )
-        each.set_yscale("log")
-    axes[1].legend(fontsize="small")
-    figure.suptitle("Extended target against the analytic moments")
-    return figure
+                panel.bands.append(band(label, by_turn.columns, by_turn.min(), by_turn.max()))
+        panels.append(panel.model_copy(update={"y": Axis(label=panel.y.label, log=True)}))
+    return Chart(title="Extended target against the analytic moments", columns=2, panels=panels)
 
 
 EXTENDED_TARGET = Study(

@@ -11,9 +11,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
@@ -90,21 +91,21 @@ def _claims(means: dict[str, float], options: InertialOptions, trials: int) -> l
     own = means[options.estimator]
     rivals = {name: value for name, value in means.items() if name != options.estimator}
     claims = [
-        Claim(
+        judged(
             f"mean total orientation RMSE over movement at most {options.target_deg:g} deg",
             f"{options.target_deg:g} deg (own target; no tuning per trial)",
             f"{own:.3f} deg over {trials} trials",
-            "confirmed" if own <= options.target_deg else "refuted",
+            own <= options.target_deg,
         )
     ]
     if rivals:
         best = min(rivals, key=rivals.__getitem__)
         claims.append(
-            Claim(
+            judged(
                 "better than gyro alone, gyro minus bias and TRIAD alone",
                 "smaller mean error than each of them",
                 f"{own:.3f} deg against {rivals[best]:.3f} deg of {best}, the best of them",
-                "confirmed" if own < rivals[best] else "refuted",
+                own < rivals[best],
             )
         )
     return claims

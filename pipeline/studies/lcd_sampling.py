@@ -16,8 +16,9 @@ from pydantic import Field, PositiveInt
 from scipy.spatial.distance import pdist
 from scipy.stats import chi2
 
+from pipeline.claims import Claim, judged
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from recorders.log import LogWriter, RunMetadata, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS

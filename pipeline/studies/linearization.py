@@ -5,15 +5,14 @@ between sample sets of one kind; each seed is an ensemble of its own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import cycle
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
+from pipeline.charts import Axis, Panel, curve
 from pipeline.ensemble import replay_in_memory
 from pipeline.experiment import Experiment, Setting
 from pipeline.runner import Runner
@@ -24,7 +23,6 @@ from replay.engine.sources import MemorySource
 
 Floats = NDArray[np.float64]
 REFERENCE = "analytic"
-MARKERS = "osD^v<>Pphd*"
 
 
 class Options(Parameters):
@@ -106,16 +104,15 @@ def rmse(difference: Floats) -> Floats:
     return np.sqrt(np.nanmean(squared, axis=0))
 
 
-def draw_errors(axes: Axes, steps: pd.DataFrame, quantity: str, label: str) -> None:
+def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
     """One line per estimator over the steps, averaged over the seeds."""
     mean = steps.groupby(["estimator", "step"], sort=False)[quantity].mean()
-    estimators = mean.index.get_level_values("estimator").unique()
-    for estimator, marker in zip(estimators, cycle(MARKERS), strict=False):
-        line = mean[estimator]
-        every = max(1, len(line) // 10)
-        axes.plot(line.index, line, marker=marker, markevery=every, ms=4, lw=1, label=estimator)
-    axes.set(xlabel="step", ylabel=label)
-    axes.grid(alpha=0.3)
+    lines = {str(name): mean[name] for name in mean.index.get_level_values("estimator").unique()}
+    return Panel(
+        x=Axis(label="step"),
+        y=Axis(label=label),
+        series=[curve(name, line.index, line) for name, line in lines.items()],
+    )
 
 
 def falling(values: Sequence[float]) -> bool:
@@ -127,8 +124,3 @@ def averages(rows: pd.DataFrame, quantity: str) -> dict[str, float]:
     """The average over steps and seeds by estimator."""
     mean = rows.groupby("estimator", sort=False)[quantity].mean()
     return {str(name): float(value) for name, value in mean.items()}
-
-
-def listed(values: Mapping[str, float], *names: str) -> str:
-    """Names with their numbers, for a claim."""
-    return ", ".join(f"{name} {values[name]:.3g}" for name in names)

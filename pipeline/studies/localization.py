@@ -5,26 +5,22 @@ add their own tables, figures and claims.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from pipeline.charts import Axis, Chart, Panel, band, curve, thinned
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome, split_metric
 from pipeline.runner import Runner
-from recorders.errors import printable
-from replay.judging.evaluation import Errors, chi_square_interval
+from replay.judging.evaluation import Errors
 from replay.judging.judge import Judge
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    judge, input_sha256 = Runner(experiment, setting).judge()
-    outcome = summarise(judge)
-    outcome.input_sha256 = input_sha256
+    done, input_sha256 = Runner(experiment, setting).judge()
+    outcome = summarise(done.judge)
+    outcome.input_sha256, outcome.parameters = input_sha256, done.parameters
     return outcome
 
 
@@ -32,25 +28,26 @@ def summarise(judge: Judge) -> Outcome:
     """Metrics, tables and figures of a judged replay."""
     outcome = Outcome()
     outcome.metrics.update(judge.metrics)
+    outcome.bounds.update(judge.bounds)
     outcome.tables["summary"] = summary_table(outcome.metrics)
     steps = [table for table in judge.steps.values() if len(table)]
     if steps:
         outcome.tables["steps"] = pd.concat(steps)
         outcome.tables["runs"] = judge.runs_table
         outcome.tables["times"] = judge.times
-        for case, figure in error_figures(judge).items():
-            outcome.figures[f"errors-{case}" if case else "errors"] = figure
+        for case, chart in error_charts(judge).items():
+            outcome.figures[f"errors-{case}" if case else "errors"] = chart
     return outcome
 
 
-def error_figures(judge: Judge) -> dict[str, "Figure"]:
+def error_charts(judge: Judge) -> dict[str, Chart]:
     """The errors of each case over time, where there are any."""
     steps = {topic: table for topic, table in judge.steps.items() if len(table)}
     judged = {topic: each for topic, each in judge.judged.items() if topic in steps}
     shown: dict[str, list[tuple[Errors, pd.DataFrame]]] = {}
     for topic, errors in judged.items():
         shown.setdefault(errors.case, []).append((errors, steps[topic]))
-    return {case: error_figure(each, case) for case, each in shown.items()}
+    return {case: error_chart(each, case) for case, each in shown.items()}
 
 
 def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
@@ -59,39 +56,26 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
 
-def error_figure(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> "Figure":
-    """RMSE, and NEES with its 95 % interval, over time; all runs together."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    first, steps = judged[0]
-    quantity, label = _main_quantity(first)
-    for errors, table in judged:
-        shown = _thinned(table)
-        above.plot(shown["elapsed_s"], shown[quantity], label=errors.estimator, lw=1)
-        below.plot(shown["elapsed_s"], shown["nees"], label=errors.estimator, lw=1)
-    runs = int(steps["runs"].max())
-    low, high = chi_square_interval(len(first.components), runs)
-    below.axhspan(low, high, color="0.85", zorder=0, label="95 % if consistent")
-    title = printable(case or "errors").replace("$", r"\$")  # which starts a formula
-    above.set(ylabel=label, title=f"{title}, {runs} {'run' if runs == 1 else 'runs'}")
-    below.set(ylabel="mean NEES", xlabel="time (s)", yscale="log")
-    above.legend(loc="upper left")
-    below.legend(loc="upper left")
-    return figure
-
-
-def _main_quantity(errors: Errors) -> tuple[str, str]:
-    """The column of the step table to draw, and what to call it: position, else the first component."""
-    if errors.position:
-        return "position_rmse_m", "position RMSE (m)"
-    return f"rmse_{errors.components[0]}", f"RMSE {errors.components[0]}"
-
-
-def _thinned(table: pd.DataFrame, points: int = 2000) -> pd.DataFrame:
-    """Every k-th row, so that a figure has no more points than a person sees."""
-    return table.iloc[:: max(1, len(table) // points)]
+def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
+    """RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent."""
+    first, table = judged[0]
+    named = {"position_rmse_m": "position RMSE (m)", "orientation_rmse_deg": "orientation RMSE (deg)"}
+    main = named.get(first.main.rmse, f"RMSE {first.components[0]}")
+    rmse = Panel(x=Axis(label="time (s)"), y=Axis(label=main, log=True))
+    nees = Panel(x=Axis(label="time (s)"), y=Axis(label="mean NEES", log=True))
+    for errors, of_all in judged:
+        steps = of_all.iloc[thinned(len(of_all))]
+        label, time_s, quantity = errors.estimator, steps["elapsed_s"], errors.main.rmse
+        rmse.bands.append(band(label, time_s, steps[f"{quantity}_low"], steps[f"{quantity}_high"]))
+        rmse.series.append(curve(label, time_s, steps[quantity]))
+        nees.series.append(curve(label, time_s, steps["nees"]))
+        consistent = f"95 % if consistent ({len(errors.components)} components)"
+        if consistent not in {each.label for each in nees.bands}:
+            interval = steps["nees_low"], steps["nees_high"]
+            nees.bands.append(band(consistent, time_s, *interval, reference=True))
+    runs = int(table["runs"].max())
+    what = f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}"
+    return Chart(title=f"{what}; bands: the RMSE's 95 % if consistent", panels=[rmse, nees])
 
 
 LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)

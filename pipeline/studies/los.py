@@ -39,7 +39,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for condition in options.conditions
         for number, name in enumerate(options.scenarios, start=1)
     ]
-    outcome = Outcome(claims=claims(cases, options), figures=figures(cases, experiment.runs))
+    outcome = Outcome(claims=claims(cases, options), figures={**figures(cases, experiment.runs)})
     outcome.tables = {
         "sensors": _table_of_sensors(cases, options.paper),
         "positions": _table_of_positions(cases, options.paper),

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.results import Claim
+from pipeline.claims import Claim, judged, listed
 from pipeline.studies.los_cases import (
     ALONE,
     BLIND,
@@ -15,14 +15,7 @@ from pipeline.studies.los_cases import (
     observabilities,
     one_bias_known,
 )
-from pipeline.studies.repetitions import (
-    Floats,
-    listed,
-    root_mean_square,
-    share_holds,
-    verdict,
-    worst_deviation,
-)
+from pipeline.studies.repetitions import Floats, root_mean_square, share_holds, worst_deviation
 from recorders.models.optical import ANGLES
 from replay.estimators import optical
 from replay.judging.evaluation import chi_square_interval
@@ -56,29 +49,29 @@ def _efficiency(cases: list[Case]) -> Iterator[Claim]:
     low, high = chi_square_interval(size, runs)
     nees = np.array([np.nanmean(case.nees) for case in cases])
     outside = [case for case, value in zip(cases, nees, strict=True) if not low <= value <= high]
-    yield Claim(
+    yield judged(
         f"the estimate is efficient: mean NEES of {size} parameters, scenarios 1-{len(cases)}",
         f"all in [{low:.2f}, {high:.2f}]",
         listed(nees),
-        verdict(not outside),
+        not outside,
         "; ".join(map(_why_not_efficient, outside)),
     )
     estimate = np.array([np.nanmean(case.nees_at_estimate) for case in cases])
     gap = float(np.abs(estimate / nees - 1.0).max())
-    yield Claim(
+    yield judged(
         "NEES is the same with the FIM at the estimate as at the truth",
         "practically identical",
         f"{listed(estimate)}: at most {100 * gap:.2f} % apart",
-        verdict(gap < 0.01),
+        gap < 0.01,
     )
     low, high = chi_square_interval(1, runs)
     components = np.concatenate([case.component_nees for case in cases])
     within = (components >= low) & (components <= high)
-    yield Claim(
+    yield judged(
         "each bias is efficient on its own: mean NEES of single components",
         f"all {len(components)} in [{low:.2f}, {high:.2f}]",
         f"{within.sum()} of {len(components)}; {components.min():.2f} to {components.max():.2f}",
-        verdict(bool(within.all())),
+        bool(within.all()),
     )
 
 
@@ -119,33 +112,33 @@ def _biases(cases: list[Case], paper: Printed) -> Iterator[Claim]:
     rule = f"RMSE of {error.shape[2]} runs is within {100 * allowed:.0f} % of sigma_CRLB"
     yield _rule(rule, np.abs(ratio - 1.0) < allowed, len(cases))
     own = np.abs(printed_rmse / printed_sigma - 1.0) < RULE
-    yield Claim(
+    yield judged(
         f"table {paper.table_of_biases} keeps the 15 % rule itself",
         "with 95 % probability",
         f"{own.sum()} of {own.size} printed pairs do",
-        verdict(share_holds(float(own.mean()), own.size)),
+        share_holds(float(own.mean()), own.size),
     )
     bound = 2.0 * sigma[:, None] / np.sqrt(error.shape[2])
     small = np.abs(np.nanmean(error, axis=2)) < bound
     yield _rule("the biases' mean errors are below 2 sigma_CRLB / sqrt(N)", small, len(cases))
     printed_bound = 2.0 * printed_sigma / np.sqrt(paper.runs)
     own = np.abs(np.array(paper.bias_mean_mrad)[rows]) < printed_bound
-    yield Claim(
+    yield judged(
         f"table {paper.table_of_means} shows |mean error| < 2 sigma_CRLB / sqrt(N)",
         "confirmed by all of the table",
         f"{own.sum()} of {own.size} printed pairs do",
-        verdict(bool(own.all())),
+        bool(own.all()),
     )
 
 
 def _rule(claim: str, kept: np.ndarray, scenarios: int) -> Claim:
     """A rule that holds with 95 %, by scenario, repetition and bias; biases of a run hang together."""
     share = float(kept.mean())
-    return Claim(
+    return judged(
         f"{claim} with 95 % probability",
         "yes, for all biases",
         f"{100 * share:.1f} % of {kept.size} ({kept.shape[1]} repetitions)",
-        verdict(share_holds(share, scenarios * kept.shape[1])),
+        share_holds(share, scenarios * kept.shape[1]),
     )
 
 
@@ -155,52 +148,52 @@ def _positions(cases: list[Case], paper: Printed) -> Iterator[Claim]:
         error = case.position_error_m(scheme).reshape(-1, case.targets)
         ours, values = case.position_rmse_m(scheme), np.array(printed)
         worst, allowed = worst_deviation(values, error**2, paper.runs)
-        yield Claim(
+        yield judged(
             f"table {paper.table_of_positions}, {scheme}: position RMSE in m, scenario {case.number}",
             listed(printed),
             listed(ours),
-            verdict(worst < allowed),
+            worst < allowed,
             f"worst {worst:.1f} standard errors, {allowed:.1f} allowed",
         )
     gain = np.array([case.position_rmse_m(BLIND) / case.position_rmse_m(JOINT) for case in cases])
     loss = np.array([case.position_rmse_m(JOINT) / case.position_rmse_m(ALONE) for case in cases])
-    yield Claim(
+    yield judged(
         "estimating the biases improves positions",
         "significantly",
         f"RMSE {gain.min():.1f} to {gain.max():.1f} times smaller than without; still "
         f"{loss.min():.1f} to {loss.max():.1f} times that without bias",
-        verdict(float(gain.min()) > 1.0),
+        float(gain.min()) > 1.0,
     )
 
 
 def _convergence(cases: list[Case]) -> Iterator[Claim]:
     share = min(case.converged[JOINT] for case in cases)
     most = max(case.iterations[JOINT] for case in cases)
-    yield Claim(
+    yield judged(
         "ILS finds the estimate in all runs (from the rays' intersection)",
         "yes",
         f"{100 * share:.1f} % converge, at most {most} iterations",
-        verdict(share == 1.0),
+        share == 1.0,
     )
     if len(cases[0].scene.position_m) > 2:
         started = [_share_from_print(case) for case in cases]
-        yield Claim(
+        yield judged(
             "eqs (21)-(23), their results rightly named, start the search",
             "yes",
             f"{100 * min(started):.0f} to {100 * max(started):.0f} % of the runs reach the estimate",
-            verdict(min(started) > 0.95),
+            min(started) > 0.95,
             "sensors and targets lie nearly in one upright plane; use the rays' intersection",
         )
         return
     error = np.concatenate([case.position_rmse_m(BLIND) for case in cases])
     share = min(case.converged[BLIND] for case in cases)
     most = max(case.iterations[BLIND] for case in cases)
-    yield Claim(
+    yield judged(
         "scheme 2, biases there but not estimated, does not converge",
         "does not converge",
         f"{100 * share:.1f} % converge, at most {most} iterations, RMSE {error.min():.0f} to "
         f"{error.max():.0f} m",
-        verdict(share < 1.0),
+        share < 1.0,
     )
 
 
@@ -226,39 +219,39 @@ def _observability(cases: list[Case]) -> Iterator[Claim]:
         return ", ".join(pairs)
 
     if len(cases[0].scene.position_m) > 2:
-        yield Claim(
+        yield judged(
             "three sensors: all biases are observable",
             "full rank",
             f"rank {ranks('all biases wanted')}",
-            verdict(not any(gaps("all biases wanted"))),
+            not any(gaps("all biases wanted")),
         )
-        yield Claim(
+        yield judged(
             "but not where the sensors stand in a line",
             "footnote 3",
             f"rank {ranks('sensors in a line')}",
-            verdict(all(gaps("sensors in a line"))),
+            all(gaps("sensors in a line")),
             varied[0]["sensors in a line"].sentence,
         )
         return
-    yield Claim(
+    yield judged(
         "two sensors: the rank is one short, for all may turn about the line between them",
         "rank 23 of 24",
         f"rank {ranks('all biases wanted')}",
-        verdict(all(gap == 1 for gap in gaps("all biases wanted"))),
+        all(gap == 1 for gap in gaps("all biases wanted")),
         varied[0]["all biases wanted"].sentence,
     )
     more = [f"{count} targets" for count in (5, 10, 40)]
-    yield Claim(
+    yield judged(
         "more targets do not help",
         "always one short",
         "; ".join(f"{what}: {ranks(what)}" for what in more),
-        verdict(all(gap == 1 for what in more for gap in gaps(what))),
+        all(gap == 1 for what in more for gap in gaps(what)),
     )
-    yield Claim(
+    yield judged(
         "with the second roll known all else is observable",
         "full rank",
         f"rank {ranks('scheme 3')}",
-        verdict(not any(gaps("scheme 3"))),
+        not any(gaps("scheme 3")),
     )
     yield _any_one_bias(cases)
 
@@ -268,12 +261,12 @@ def _any_one_bias(cases: list[Case]) -> Claim:
     names = [f"{angle}{sensor}" for sensor in (1, 2) for angle in ANGLES]
     worst = np.array([one_bias_known(case).max(axis=1) for case in cases])
     scenario, known = np.unravel_index(worst.argmax(), worst.shape)
-    return Claim(
+    return judged(
         "any five of the six biases can be estimated",
         "one is limited to five",
         "worst sigma over scenarios by the known one, mrad: "
         + ", ".join(f"{name} {value:.1f}" for name, value in zip(names, worst.max(axis=0), strict=True)),
-        verdict(float(worst.max()) < 10.0 * float(worst.min(axis=1).max())),
+        float(worst.max()) < 10.0 * float(worst.min(axis=1).max()),
         f"scenario {scenario + 1} with {names[known]} known leaves {worst.max():.0f} mrad: know one "
         "that takes part in the turn about the line",
     )
@@ -285,20 +278,20 @@ def _geometry(cases: list[Case], paper: Printed) -> Iterator[Claim]:
     swapped = len(cases[0].scene.position_m) > 2
     order = [0, 2, 1] if swapped else [0, 1, 2]
     same = bool(np.array_equal(printed[..., order], ours))
-    yield Claim(
+    yield judged(
         f"table {paper.table_of_sensors} gives the sensors as x, y, z",
         "x, y (up), z as eq (3) has it",
         "x, horizontal, altitude: the last two are swapped" if swapped else "so it is",
-        verdict(same and not swapped),
+        same and not swapped,
         "eqs (29)-(44) swap the targets' too",
     )
     if paper.field_of_view_deg is not None:
         spans = np.array([_widest_span_deg(case) for case in cases])
-        yield Claim(
+        yield judged(
             f"every sensor has all targets in {paper.field_of_view_deg:g} deg",
             f"{paper.field_of_view_deg:g} deg",
             f"widest span by scenario: {listed(spans, 1)} deg",
-            verdict(bool((spans <= paper.field_of_view_deg).all())),
+            bool((spans <= paper.field_of_view_deg).all()),
         )
 
 

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from pydantic import NonNegativeFloat
 
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
@@ -59,7 +60,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     for row in by_loss.to_dict("records"):
         outcome.metrics[f"{row['estimator']}.nees.loss-{row['loss']}"] = row["nees"]
     outcome.tables |= {"network": table, "loss": by_loss}
-    outcome.figures["loss"] = _loss_figure(by_loss)
+    outcome.figures["loss"] = _loss_chart(by_loss)
     outcome.claims = _claims(table, by_loss, options.settle_s)
     outcome.input_sha256 = hash_streams(replayed.sources)
     return outcome
@@ -138,15 +139,17 @@ def _by_loss(runner: Runner, options: NetworkOptions, settled: Replayed) -> pd.D
     return table[table["estimator"].isin(labels)]
 
 
-def _loss_figure(table: pd.DataFrame) -> Figure:
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for estimator, part in table.groupby("estimator"):
-        axes.plot(part["loss"], part["nees"], marker="o", label=estimator)
-    axes.axhline(4, color="0.5", lw=1, label="consistent")
-    axes.set(yscale="log", xlabel="share of messages lost", ylabel="mean NEES (4 states)")
-    axes.legend()
-    return figure
+def _loss_chart(table: pd.DataFrame) -> Chart:
+    series = [
+        curve(str(estimator), part["loss"], part["nees"], "line+markers")
+        for estimator, part in table.groupby("estimator")
+    ]
+    panel = Panel(
+        x=Axis(label="share of messages lost"),
+        y=Axis(label="mean NEES (4 states)", log=True),
+        series=[*series, level("consistent", np.sort(table["loss"]), 4)],
+    )
+    return Chart(panels=[panel])
 
 
 def _claims(table: pd.DataFrame, by_loss: pd.DataFrame, settle_s: float) -> list[Claim]:

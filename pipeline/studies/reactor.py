@@ -9,20 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
+from pipeline.charts import Chart
+from pipeline.claims import Claim, judged, named
 from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Record, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.studies.linearization import (
     REFERENCE,
     Ensemble,
     Options,
     averages,
-    draw_errors,
     ensembles,
+    error_panel,
     falling,
-    listed,
     rmse,
 )
 from recorders.errors import BadInput
@@ -48,7 +48,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             sources += ensemble.sources
         steps = pd.concat(tables).assign(case=case)
         outcome.tables[f"steps-{case}"] = steps
-        outcome.figures[f"errors-{case}"] = error_figure(steps, CASES[case])
+        outcome.figures[f"errors-{case}"] = error_chart(steps, CASES[case])
         outcome.metrics |= metrics(steps, case)
         outcome.claims += claims(steps, CASES[case])
     outcome.input_sha256 = hash_streams(sources)
@@ -129,43 +129,43 @@ def claims(steps: pd.DataFrame, case: str) -> list[Claim]:
         judged(
             "The S2KF converges to the analytic moments with more samples",
             "errors fall with L",
-            f"mean {listed(mean, *SMART)}; covariance {listed(covariance, *SMART)}",
+            f"mean {named(mean, *SMART)}; covariance {named(covariance, *SMART)}",
             falling([mean[name] for name in SMART]) and falling([covariance[name] for name in SMART]),
         ),
         judged(
             "With 50 samples or more the S2KF has the best means of all",
             "best of all investigated LRKFs",
-            listed(mean, *OTHERS, *SMART[2:]),
+            named(mean, *OTHERS, *SMART[2:]),
             max(mean[name] for name in SMART[2:]) < min(mean[name] for name in OTHERS),
         ),
         judged(
             "All S2KF have better means than GF and RUKF",
             "much better",
-            listed(mean, "gf-25", "rukf-12", *SMART),
+            named(mean, "gf-25", "rukf-12", *SMART),
             max(mean[name] for name in SMART) < min(mean["gf-25"], mean["rukf-12"]),
         ),
         judged(
             "The RUKF's means are constantly worse than the UKF's",
             "constantly at a higher level",
-            f"{listed(mean, 'ukf', 'rukf-12')}; worse in {above:.0%} of the steps",
+            f"{named(mean, 'ukf', 'rukf-12')}; worse in {above:.0%} of the steps",
             above > 0.95,
         ),
         judged(
             "The GF starts with a very high error of the mean, which falls",
             "very high RMSE at the beginning",
-            f"steps 1 to {EARLY}: {listed(early, *OTHERS)}; last {EARLY}: {listed(late, *OTHERS)}",
+            f"steps 1 to {EARLY}: {named(early, *OTHERS)}; last {EARLY}: {named(late, *OTHERS)}",
             early["gf-25"] > max(late["gf-25"], 1.5 * early["ukf"], 1.5 * early["rukf-12"]),
         ),
         judged(
             "The UKF's covariance is closer to the analytic one than those of GF and RUKF",
             "much closer",
-            listed(covariance, *OTHERS),
+            named(covariance, *OTHERS),
             covariance["ukf"] < min(covariance["gf-25"], covariance["rukf-12"]),
         ),
         judged(
             "The S2KF's covariances outperform the UKF's with 50 samples or more",
             "can outperform the UKF",
-            listed(covariance, "ukf", *SMART[2:]),
+            named(covariance, "ukf", *SMART[2:]),
             max(covariance[name] for name in SMART[2:]) < covariance["ukf"],
         ),
     ]
@@ -181,16 +181,17 @@ def claims(steps: pd.DataFrame, case: str) -> list[Claim]:
     return [replace(each, claim=f"{each.claim} ({case})") for each in found]
 
 
-def error_figure(steps: pd.DataFrame, case: str) -> Figure:
+def error_chart(steps: pd.DataFrame, case: str) -> Chart:
     """Fig. 7: RMSE of mean and covariance against the exact moments, over the steps."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
     approximate = steps[steps["estimator"] != REFERENCE]
-    draw_errors(left, approximate, "mean_rmse", "RMSE of the mean")
-    draw_errors(right, approximate, "covariance_rmse", "RMSE of the covariance")
-    left.legend(fontsize="small")
-    figure.suptitle(f"Batch reactor against the analytic moments, {case}")
-    return figure
+    return Chart(
+        title=f"Batch reactor against the analytic moments, {case}",
+        columns=2,
+        panels=[
+            error_panel(approximate, "mean_rmse", "RMSE of the mean"),
+            error_panel(approximate, "covariance_rmse", "RMSE of the covariance"),
+        ],
+    )
 
 
 REACTOR = Study(

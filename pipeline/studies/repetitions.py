@@ -8,16 +8,17 @@ for its 100 runs can be tried as often.
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.stats import norm
 
+from pipeline.charts import Axis, Series, curve
 from pipeline.ensemble import Replayed
-from pipeline.results import Verdict
 from recorders.errors import BadInput
 from replay.judging.evaluation import Errors
 
 Floats = NDArray[np.float64]
+# Where a mean NEES lies with 95 %.
+EFFICIENT = "95 % if efficient"
 
 
 def require_spread(solutions: int) -> None:
@@ -68,26 +69,13 @@ def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
     return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
 
 
-def verdict(holds: bool) -> Verdict:
-    """What a claim comes to where it can be tried."""
-    return "confirmed" if holds else "refuted"
-
-
-def listed(values: ArrayLike, digits: int = 2) -> str:
-    """Numbers for a sentence."""
-    return " ".join(f"{value:.{digits}f}" for value in np.ravel(values))
-
-
-def draw_interval(axes: Axes, low: float, high: float) -> None:
-    """Where a mean NEES lies with 95 % if all is well."""
-    axes.axhspan(low, high, color="0.88", zorder=0, label="95 % if efficient")
-
-
-def draw_groups(
-    axes: Axes, groups: Sequence[Sequence[float]], labels: Sequence[str], marker: str
-) -> None:
-    """Values side by side in groups: a marker each, a colour per place in the group."""
-    size = max(len(group) for group in groups)
+def groups(
+    values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
+) -> tuple[Axis, list[Series]]:
+    """Values side by side in named groups: an axis of groups, and a series per place in the group."""
+    size = max(len(group) for group in values)
+    series = []
     for place in range(size):
-        x = np.arange(len(groups)) + (place - 0.5 * (size - 1)) * 0.8 / size
-        axes.plot(x, [group[place] for group in groups], marker, ms=4, label=labels[place])
+        x = np.arange(len(values)) + (place - 0.5 * (size - 1)) * 0.8 / size
+        series.append(curve(labels[place], x, [group[place] for group in values], "markers"))
+    return Axis(label=axis, ticks={float(place): name for place, name in enumerate(names)}), series

@@ -9,11 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
+from pipeline.charts import Axis, Chart, Panel, curve, path
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams
 from pipeline.experiment import Experiment, Record, Setting, Study
-from pipeline.results import Claim, MetricValue, Outcome, judged
+from pipeline.results import MetricValue, Outcome
 from pipeline.runner import Runner
 from replay.judging.evaluation import split_topic
 from replay.judging.set_evaluation import JudgedSets, frames_of, judge_sets
@@ -38,7 +39,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         runner.draw(shown.sources, shown.outputs)
         outcome.claims = _claims(outcome.metrics)
     else:
-        outcome.figures["bounds"] = _bounds_figure(outcome.metrics)
+        outcome.figures["bounds"] = _bounds_chart(outcome.metrics)
         outcome.claims = [_guarantee(outcome.metrics)]
         runner.keep(replayed.sources, replayed.outputs)
     outcome.input_sha256 = hash_streams(replayed.sources)
@@ -124,39 +125,37 @@ def _section_v(runner: Runner, outcome: Outcome) -> Replayed:
         replayed = runner.replay(runner.obtain(parameters, runs=1), settings)
         for each in judge_sets(replayed.outputs, replayed.sources, experiment.gap_limit_s):
             outcome.metrics[f"{each.estimator}.area_m2.{case}"] = float(each.area_m2[0])
-        outcome.figures[case] = _set_figure(replayed, case)
+        outcome.figures[case] = _set_chart(replayed, case)
     return replayed
 
 
-def _set_figure(replayed: Replayed, title: str) -> Figure:
-    figure = Figure(figsize=(6, 6), layout="constrained")
-    axes = figure.subplots()
-    colours = iter(f"C{index}" for index in range(10))
+def _set_chart(replayed: Replayed, title: str) -> Chart:
+    """The first sets of the first run, and where the robot is."""
+    series = []
     for topic, sets in replayed.outputs.items():
         if topic.endswith("/set"):
-            colour, label = next(colours), split_topic(topic)[0]
             sizes = replayed.outputs[f"{topic.removesuffix('set')}size"]
             for ring in frames_of(sizes.stream, sets.stream)[0]:
-                axes.plot(*np.append(ring, ring[:1], axis=0).T, color=colour, lw=1, label=label)
-                label = "_"
+                series.append(path(split_topic(topic)[0], np.append(ring, ring[:1], axis=0)))
     source = replayed.sources[0]
-    robot = source.read(["/robot1/truth"])["/robot1/truth"]["state"][0]
-    axes.plot(*robot[:2], "k+", label="truth")
-    axes.set(xlabel="x (m)", ylabel="y (m)", title=title, aspect="equal")
-    figure.legend(loc="outside lower center", ncols=5)
-    return figure
+    robot = source.read(["/robot1/truth"])["/robot1/truth"]["state"][:1]
+    series.append(path("truth", robot, "markers", reference=True))
+    panel = Panel(x=Axis(label="x (m)"), y=Axis(label="y (m)"), series=series, plane=True)
+    return Chart(title=title, panels=[panel])
 
 
-def _bounds_figure(metrics: Mapping[str, MetricValue]) -> Figure:
+def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
     """Containment and area, estimator by estimator."""
-    figure = Figure(figsize=(6, 5), layout="constrained")
-    share, area = figure.subplots(2, 1, sharex=True)
     names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
-    share.plot(names, [_value(metrics, f"{name}.containment_share") for name in names], "o-")
-    area.plot(names, [_value(metrics, f"{name}.area_median_m2") for name in names], "o-")
-    share.set(ylabel="share of sets that hold the truth")
-    area.set(ylabel="median area, m²", ylim=(0, None))
-    return figure
+    labels = {
+        "containment_share": "share of sets that hold the truth",
+        "area_median_m2": "median area (m²)",
+    }
+    panels = []
+    for quantity, label in labels.items():
+        values = [_value(metrics, f"{name}.{quantity}") for name in names]
+        panels.append(Panel(y=Axis(label=label), series=[curve(label, names, values, "line+markers")]))
+    return Chart(columns=2, panels=panels)
 
 
 def _claims(metrics: Mapping[str, MetricValue]) -> list[Claim]:

@@ -14,9 +14,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
+from pipeline.charts import Axis, Chart, Panel, curve
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import Replayed, hash_streams, require_memory
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.repetitions import rmse_of_runs
 from recorders.errors import BadInput
@@ -128,7 +130,7 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
         own = found[f"five-w{100 * options.central_weights[0]:g}"]
         outcome.claims += _propagation_claims(case, own, found["ukf"], found["random"])
     outcome.tables["errors"] = pd.concat(tables)
-    outcome.figures["errors"] = propagation_figure(outcome.tables["errors"], options)
+    outcome.figures["errors"] = propagation_chart(outcome.tables["errors"], options)
     return outcome
 
 
@@ -157,35 +159,41 @@ def _propagation_claims(
         for ours, theirs in zip(own, rival, strict=True):
             wins.append(int((ours < np.atleast_2d(theirs).mean(axis=0)).sum()))
         claims.append(
-            Claim(
+            judged(
                 f"significantly outperforms {name}: {case}",
                 "smaller errors of mean and covariance at every correlation",
                 f"mean {own.mean.mean():.4f} against {rival.mean.mean():.4f} rad, wins {wins[0]} of "
                 f"{count}; covariance {own.covariance.mean():.4f} against "
                 f"{rival.covariance.mean():.4f} rad^2, wins {wins[1]} of {count}",
-                "confirmed" if min(wins) == count else "refuted",
+                min(wins) == count,
             )
         )
     return claims
 
 
-def propagation_figure(table: pd.DataFrame, options: PropagationOptions) -> Figure:
+def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
     """Errors over the correlation: a column per coupling, mean above and covariance below."""
-    columns = len(options.couplings_rad)
-    figure = Figure(figsize=(2.6 * columns + 1, 5), layout="constrained")
-    axes = np.reshape(figure.subplots(2, columns, sharex=True), (2, columns))
-    for column, coupling_rad in enumerate(options.couplings_rad):
-        of_coupling = table[table["coupling_rad"] == coupling_rad]
-        for name, rows in of_coupling.groupby("samples", sort=False):
-            for row, quantity in enumerate(("mean_error_rad", "covariance_error_rad2")):
-                axes[row, column].plot(rows["correlation"], rows[quantity], label=name, lw=1)
-                axes[row, column].set_yscale("log")
-        axes[0, column].set_title(f"c = {coupling_rad:g} rad")
-        axes[1, column].set_xlabel("correlation")
-    axes[0, 0].set_ylabel("error of the mean (rad)")
-    axes[1, 0].set_ylabel("error of the covariance (rad²)")
-    axes[0, 0].legend(fontsize=7)
-    return figure
+    quantities = {
+        "mean_error_rad": "error of the mean (rad)",
+        "covariance_error_rad2": "error of the covariance (rad²)",
+    }
+    panels = []
+    for quantity, label in quantities.items():
+        for coupling_rad in options.couplings_rad:
+            of_coupling = table[table["coupling_rad"] == coupling_rad]
+            series = [
+                curve(str(name), rows["correlation"], rows[quantity])
+                for name, rows in of_coupling.groupby("samples", sort=False)
+            ]
+            panels.append(
+                Panel(
+                    title=f"c = {coupling_rad:g} rad",
+                    x=Axis(label="correlation"),
+                    y=Axis(label=label, log=True),
+                    series=series,
+                )
+            )
+    return Chart(columns=len(options.couplings_rad), panels=panels)
 
 
 class FilterOptions(Parameters):
@@ -248,11 +256,11 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
 def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Claim]:
     own = rmse[estimator]
     claims = [
-        Claim(
+        judged(
             f"at least as good as {name}: {case}",
             "announced as future work, without numbers",
             f"{own:.4f} against {rival:.4f} rad per angle",
-            "confirmed" if own <= 1.005 * rival else "refuted",
+            own <= 1.005 * rival,
         )
         for name, rival in rmse.items()
         if name not in (estimator, "grid")
@@ -260,11 +268,11 @@ def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Cl
     excess = own / rmse["grid"] - 1.0
     return [
         *claims,
-        Claim(
+        judged(
             f"nearly optimal, within 2 % of Bayes' rule on a grid: {case}",
             "(not in the paper)",
             f"{own:.4f} against {rmse['grid']:.4f} rad per angle, {100 * excess:.1f} % more",
-            "confirmed" if excess < 0.02 else "refuted",
+            excess < 0.02,
         ),
     ]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
+from pipeline.charts import Axis, Chart, Panel, curve
 from pipeline.ensemble import hash_streams, replay_in_memory
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome
@@ -53,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             f"{label}.sent_bytes_per_step.{case.name}": value
             for label, value in case.bytes_per_step.items()
         }
-        outcome.figures[f"errors-{case.name}"] = _figure(case)
+        outcome.figures[f"errors-{case.name}"] = _chart(case)
     shown = {label: few[label] for label in (options.reference, *options.few) if label in few}
     outcome.metrics |= _metrics(f"{cases[0].name}-first-{options.few_runs}-runs", shown)
     outcome.input_sha256 = hash_streams(source for case in cases for source in case.sources)
@@ -165,17 +165,14 @@ def _steps(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def _figure(case: Case) -> Figure:
+def _chart(case: Case) -> Chart:
     """The median over the runs of all vehicles' error by step, best labels (the paper's Fig. 3)."""
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
+    series = []
     for label, scores in case.scores.items():
         median = np.sqrt(np.nanmedian(scores.assigned_by_step, axis=0))
-        axes.plot(np.arange(1, len(median) + 1), median, lw=1, label=label)
-    axes.set(xlabel="step", ylabel="error of all vehicles, median (m)", title=case.name, ylim=(0, 4))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, ncols=2)
-    return figure
+        series.append(curve(label, np.arange(1, len(median) + 1), median))
+    y = Axis(label="error of all vehicles, median (m)", limits=(0, 4))
+    return Chart(title=case.name, panels=[Panel(x=Axis(label="step"), y=y, series=series)])
 
 
 VEHICLES = Study(

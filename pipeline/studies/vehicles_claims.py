@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.results import Claim, judged
+from pipeline.claims import Claim, judged
 from pipeline.studies.vehicles_cases import NUMBER_BYTES, Case, Scores
 
 Table = Mapping[str, Scores]

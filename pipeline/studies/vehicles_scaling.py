@@ -11,13 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from pydantic import PositiveFloat, PositiveInt
 
+from pipeline.charts import Axis, Chart, Panel, curve
+from pipeline.claims import Claim, judged
 from pipeline.ensemble import hash_streams, judge, replay_in_memory
 from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Claim, Outcome, judged
+from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.vehicles_cases import scores_of
 from recorders.errors import BadInput
@@ -84,7 +84,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.metrics[f"{name}.growth_power"] = growth[name].power
         outcome.metrics[f"{name}.growth_factor_per_vehicle"] = growth[name].factor
     outcome.claims += _claims(table, growth, options)
-    outcome.figures["scaling"] = _figure(table)
+    outcome.figures["scaling"] = _chart(table)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
 
@@ -176,22 +176,22 @@ def _claims(table: pd.DataFrame, growth: Mapping[Any, Growth], options: ScalingO
     return found
 
 
-def _figure(table: pd.DataFrame) -> Figure:
+def _chart(table: pd.DataFrame) -> Chart:
     """Time of a step and error of a vehicle over the number of vehicles."""
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for label, own in table.groupby("estimator", sort=False):
-        left.loglog(own["vehicles"], own["step_ms"], marker=".", lw=1, label=label)
-        right.semilogx(own["vehicles"], own["position_rmse_m"], marker=".", lw=1)
-    left.set(xlabel="vehicles", ylabel="CPU time of a step (ms)")
-    right.set(xlabel="vehicles", ylabel="error of a vehicle (m)", ylim=(0, 3))
-    left.legend(fontsize=7)
-    counts = [count for count in TICKS if count <= table["vehicles"].max()]
-    for axes in (left, right):
-        axes.grid(alpha=0.3, which="both")
-        axes.set_xticks(counts, map(str, counts))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    return figure
+    ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
+    x = Axis(label="vehicles", log=True, ticks=ticks)
+    axes = {
+        "step_ms": Axis(label="CPU time of a step (ms)", log=True),
+        "position_rmse_m": Axis(label="error of a vehicle (m)", limits=(0, 3)),
+    }
+    panels = []
+    for quantity, y in axes.items():
+        series = [
+            curve(str(label), own["vehicles"], own[quantity], "line+markers")
+            for label, own in table.groupby("estimator", sort=False)
+        ]
+        panels.append(Panel(x=x, y=y, series=series))
+    return Chart(columns=2, panels=panels)
 
 
 VEHICLES_SCALING = Study(

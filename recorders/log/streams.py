@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.log.schemas import NUMPY_TYPES, Schema
+from recorders.log.schemas import NUMPY_TYPES, Kind, Schema
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,35 +137,49 @@ def make_stream(
     Traceback (most recent call last):
     recorders.errors.BadInput: topic /gyro: field range_m has 1 values for 2 messages
     """
-    label, time = f"topic {topic}:", NUMPY_TYPES["time_ns"]
-    published = _as_column(f"{label} publish_time_ns", publish_time_ns, time)
-    logged = published if log_time_ns is None else _as_column(f"{label} log_time_ns", log_time_ns, time)
-    clock = published if sensor_time_ns is None else sensor_time_ns
-    given: dict[str, ArrayLike] = {"sensor_time_ns": clock, **columns}
+    clock = publish_time_ns if sensor_time_ns is None else sensor_time_ns
+    given = {"sensor_time_ns": clock, **columns}
+    return stream_of(topic, schema, publish_time_ns, given, log_time_ns=log_time_ns, metadata=metadata)
+
+
+def stream_of(
+    topic: str,
+    schema: Schema,
+    publish_time_ns: ArrayLike,
+    given: Mapping[str, ArrayLike],
+    *,
+    log_time_ns: ArrayLike | None = None,
+    metadata: Mapping[str, str] | None = None,
+    allow_nan: bool = False,
+) -> Stream:
+    """As `make_stream`, of all columns by name; with `allow_nan`, NaN may stand in any of them."""
+    published = _as_column(topic, "publish_time_ns", publish_time_ns)
+    logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
     names = [entry.name for entry in schema]
-    if set(given) != set(names):
+    if given.keys() != set(names):
         raise BadInput(
-            f"{label} {schema.full_name} has the fields {', '.join(names)}; got {', '.join(given)}"
+            f"topic {topic}: {schema.full_name} has the fields {', '.join(names)}; "
+            f"got {', '.join(given)}"
         )
     found = {
-        entry.name: _as_column(
-            f"{label} field {entry.name}", given[entry.name], entry.dtype, 1 + (entry.kind == "vector")
-        )
+        entry.name: _as_column(topic, f"field {entry.name}", given[entry.name], entry.kind)
         for entry in schema
     }
     position = np.arange(len(published), dtype=np.int64)
     stream = Stream(topic, schema, published, logged, found, position, dict(metadata or {}))
-    check_stream(stream)
+    check_stream(stream, allow_nan=allow_nan)
     return stream
 
 
-def _as_column(what: str, values: ArrayLike, dtype: np.dtype, axes: int = 1) -> NDArray:
+def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:
     """The values as an array of this type, which must be able to keep every one of them."""
+    what, dtype, axes = f"topic {topic}: {name}", NUMPY_TYPES[kind], 1 + (kind == "vector")
     try:
-        given = np.asarray(values)
-        with np.errstate(invalid="ignore"):
-            column = given.astype(dtype, copy=False)
-        is_kept = dtype.kind == "f" or np.array_equal(column, given)
+        column = given = np.asarray(values)
+        if given.dtype != dtype:
+            with np.errstate(invalid="ignore"):
+                column = given.astype(dtype)
+        is_kept = column is given or dtype.kind == "f" or np.array_equal(column, given)
     except (TypeError, ValueError, OverflowError) as error:
         raise BadInput(f"{what} is not numeric ({error})") from error
     if column.ndim != axes:
@@ -180,7 +194,7 @@ def _as_column(what: str, values: ArrayLike, dtype: np.dtype, axes: int = 1) -> 
     return column
 
 
-def check_stream(stream: Stream, where: str = "") -> None:
+def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) -> None:
     """Raise BadInput where lengths differ, a time is out of range, or NaN stands where none may.
 
     So it does where the topic's name cannot be printed: it ends up in figures, file names and terminals.
@@ -190,7 +204,9 @@ def check_stream(stream: Stream, where: str = "") -> None:
             f"{where}topic {stream.topic!r}: its name holds what cannot be printed; give it another"
         )
     label = f"{where}topic {stream.topic}"
-    for name, times in (("publish_time", stream.publish_time_ns), ("log_time", stream.log_time_ns)):
+    published, logged = stream.publish_time_ns, stream.log_time_ns
+    clocks = {"publish_time": published} | ({} if logged is published else {"log_time": logged})
+    for name, times in clocks.items():
         if len(times) != len(stream):
             raise BadInput(f"{label}: {name} has {len(times)} values for {len(stream)} messages")
         if len(times) and times.min() < 0:
@@ -203,8 +219,9 @@ def check_stream(stream: Stream, where: str = "") -> None:
             raise BadInput(
                 f"{label}: field {entry.name} has {len(column)} values for {len(stream)} messages"
             )
-        # The least of numbers with NaN among them is NaN: one quick pass.
-        if column.dtype.kind == "f" and not entry.may_be_nan and column.size and np.isnan(column.min()):
+        if allow_nan or entry.may_be_nan or column.dtype.kind != "f" or not column.size:
+            continue
+        if np.isnan(column.min()):  # the least of numbers with NaN among them is NaN: one quick pass
             bad = np.isnan(column).reshape(len(column), -1).any(axis=1)
             raise BadInput(
                 f"{label}: field {entry.name} is NaN in message {int(np.argmax(bad))} "

@@ -44,13 +44,6 @@ def conjugate(x: ArrayLike) -> NDArray[np.float64]:
     return x * np.where(np.arange(x.shape[-1]) == 0, 1.0, -1.0)
 
 
-def from_rotation_vector(rotation_rad: ArrayLike) -> NDArray[np.float64]:
-    """The quaternions (..., 4) of rotations about the vectors (..., 3) by their length, (32)."""
-    half = 0.5 * np.asarray(rotation_rad, float)
-    angle = np.linalg.norm(half, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(angle), half * np.sinc(angle / np.pi)], axis=-1)
-
-
 def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
     """The vectors (..., 3) turned by the orientations (..., 4), (33)."""
     vector = np.asarray(vector, float)

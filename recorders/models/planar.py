@@ -41,42 +41,8 @@ def drive(
     )
 
 
-def drive_jacobians(pose: Components, velocity: Components, duration_s: float) -> tuple[Any, Any, Any]:
-    """How the arc's end (x, y) changes with the heading, the forward velocity and the turn rate.
-
-    The other derivatives of `drive` are 0, 1, and d heading / d turn rate = duration. Scalars only.
-    """
-    half_turn = 0.5 * velocity[1] * duration_s
-    ratio = np.sinc(half_turn / np.pi)
-    chord = velocity[0] * duration_s * ratio
-    direction = pose[2] + half_turn
-    cosine, sine = np.cos(direction), np.sin(direction)
-    # d sin(u)/u / du, by its series where the quotient loses digits
-    small = abs(half_turn) < 1e-4
-    slope = -half_turn / 3.0 if small else (np.cos(half_turn) - ratio) / half_turn
-    stretch = velocity[0] * duration_s * slope
-    half_s = 0.5 * duration_s
-    return (
-        (-chord * sine, chord * cosine),
-        (duration_s * ratio * cosine, duration_s * ratio * sine),
-        (half_s * (stretch * cosine - chord * sine), half_s * (stretch * sine + chord * cosine)),
-    )
-
-
 def range_bearing(pose: Components, target: Components) -> tuple[Component, Component]:
     """Distance (m) and bearing (rad, not wrapped) from a pose to a point."""
     dx = target[0] - pose[0]
     dy = target[1] - pose[1]
     return np.sqrt(dx * dx + dy * dy), np.arctan2(dy, dx) - pose[2]
-
-
-def range_bearing_jacobian(pose: Components, target: Components) -> tuple[Any, Any]:
-    """The Jacobian of `range_bearing` by the pose: one row (x, y, heading) each."""
-    dx = target[0] - pose[0]
-    dy = target[1] - pose[1]
-    squared = dx * dx + dy * dy
-    distance = np.sqrt(squared)
-    return (
-        (-dx / distance, -dy / distance, 0.0),
-        (dy / squared, -dx / squared, -1.0),
-    )

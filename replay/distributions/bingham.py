@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.models.directional_noise import saddlepoint, sample_bingham
+from recorders.models.directional_noise import sample_bingham
 from recorders.models.orientation import conjugate, left_matrix, require_unit, right_matrix
 from replay.distributions import bingham_kernels as kernels
 from replay.distributions.batches import flatten
@@ -203,38 +203,6 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
     shrunk = along * shrink
     moment = np.diag(weights @ (variance * shrink)) + (weights[:, None] * shrunk).T @ shrunk
     return fit(axes @ moment @ axes.T)
-
-
-def saddlepoint_log_normaliser(concentrations: ArrayLike, order: int = 2) -> NDArray[np.float64]:
-    """The paper's log F (...) for concentrations (..., d): Kume and Wood's saddlepoint approximation.
-
-    Here for comparison: `log_normaliser` is exact, and faster. At order 1, F is off by up to 16.6 %,
-    where all concentrations but one are large. Order 2 has the factor exp(T) and is off by up to 6.4 %,
-    at z = (-4.1, -4.1, -4.1, 0).
-    """
-    if order not in (1, 2):
-        raise BadInput(f"saddlepoint order {order}: give 1, or 2 for the correction by exp(T)")
-    z = np.asarray(concentrations, float)
-    top = z.max(axis=-1, keepdims=True)
-    t = saddlepoint(z - top)
-    factors = 1.0 / (t[..., None] - (z - top))
-    second, third, fourth = (scale * (factors**n).sum(-1) for n, scale in ((2, 0.5), (3, 1.0), (4, 3.0)))
-    log_f = 0.5 * np.log(2.0 * np.pi ** (z.shape[-1] - 1) / second) + 0.5 * np.log(factors).sum(-1) + t
-    correction = fourth / (8.0 * second**2) - 5.0 * third**2 / (24.0 * second**3)
-    return log_f + top[..., 0] + (correction if order == 2 else 0.0)
-
-
-def saddlepoint_square_moments(concentrations: ArrayLike, order: int = 2) -> NDArray[np.float64]:
-    """The paper's E(x_i^2) (..., d), scaled to sum 1: F with z_i taken thrice over 2 pi F.
-
-    Kume and Wood, Statistics & Probability Letters 77, 2007. Off by up to 10 % at order 1, 5.2 % at 2.
-    """
-    z = np.asarray(concentrations, float)
-    d = z.shape[-1]
-    thrice = np.take(z, [[*range(d), i, i] for i in range(d)], axis=-1)
-    log_moments = saddlepoint_log_normaliser(thrice, order)
-    moments = np.exp(log_moments - log_moments.max(axis=-1, keepdims=True))
-    return moments / moments.sum(-1, keepdims=True)
 
 
 def _on_contour(z: NDArray) -> tuple[NDArray, NDArray]:

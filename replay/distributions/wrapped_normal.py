@@ -80,12 +80,6 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
     return kernels.density_each(flatten(deviation, batch, 2), covariance).reshape(batch)
 
 
-def trigonometric_moments(distribution: WrappedNormal, order: int) -> NDArray[np.complex128]:
-    """E exp(i n x_k) = exp(i n mu_k - n^2 C_kk / 2), (..., 2), (2)."""
-    variance = np.diagonal(distribution.covariance, axis1=-2, axis2=-1)
-    return np.exp(1j * order * distribution.mean - 0.5 * order**2 * variance)
-
-
 def circular_moments(distribution: WrappedNormal) -> CircularMoments:
     """Circular moments in closed form; the mean is the distribution's and the variance its diagonal."""
     c = distribution.covariance
@@ -170,11 +164,6 @@ def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
         flatten(second.covariance, batch, 2, 2),
     )
     return _assemble(parameters.reshape(*batch, 5))
-
-
-def convolve(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
-    """The distribution of the sum of independent angles, modulo 2 pi; exact."""
-    return WrappedNormal(wrap_angle(first.mean + second.mean), first.covariance + second.covariance)
 
 
 def sample(

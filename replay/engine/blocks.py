@@ -69,6 +69,13 @@ class Block(NamedTuple):
         return np.concatenate(parts)[self.events.source]
 
 
+def copied(carried: CarriedType) -> CarriedType:
+    """A NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
+    columns: Any = carried
+    made: Any = type(carried)
+    return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
+
+
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
     """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
 
@@ -83,6 +90,8 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
     """The offsets that the chosen rows of ragged columns have, laid end to end."""
+    if chosen.all():
+        return offsets
     return np.concatenate([[0], np.cumsum(chosen)])[offsets]
 
 
@@ -118,23 +127,28 @@ def join(parts: Sequence[Ragged]) -> Ragged:
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
     everything = list(streams.values())
-    clock = "publish_time_ns" if order == "publish_time" else "log_time_ns"
-    times_ns = np.concatenate([getattr(ragged.stream, clock) for ragged in everything])
+    if len(everything) == 1:
+        return _in_order(everything[0], order)
+    times_ns = np.concatenate([ragged.stream.times(order) for ragged in everything])
     positions = np.concatenate([ragged.stream.position for ragged in everything])
     starts = np.cumsum([0, *(len(ragged) for ragged in everything[:-1])])
     bounds = np.stack([ragged.offsets for ragged in everything]) + starts[:, None]
     offsets = sum((ragged.offsets for ragged in everything), np.zeros(1, np.int64))
     count = len(times_ns)
-    if len(everything) == 1:  # in order already
-        is_last = np.ones(count, bool)
-        is_last[:-1] = times_ns[1:] != times_ns[:-1]
-        is_last[offsets[1:][np.diff(offsets) > 0] - 1] = True
-        return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)
     _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
     return events
+
+
+def _in_order(ragged: Ragged, order: Clock) -> Events:
+    """The messages of the only topic."""
+    times_ns, offsets, count = ragged.stream.times(order), ragged.offsets, len(ragged)
+    is_last = np.empty(count, bool)
+    np.not_equal(times_ns[1:], times_ns[:-1], out=is_last[:-1])
+    is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
+    return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
 
 
 @lru_cache(maxsize=1)

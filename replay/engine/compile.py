@@ -15,11 +15,12 @@ import pickle
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, lru_cache, partial, wraps
 from hashlib import sha256
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from threading import Timer
 from types import FunctionType, ModuleType
@@ -155,6 +156,12 @@ def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return loop
 
 
+@lru_cache(maxsize=1)
+def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    """The threads beside the calling one; a forked process has none of its parent's."""
+    return ThreadPoolExecutor(max(1, numba.config.NUMBA_NUM_THREADS - 1))  # type: ignore[attr-defined]
+
+
 def _over_runs(
     runs: int,
     *arguments: Any,
@@ -167,26 +174,32 @@ def _over_runs(
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
-    def work(first: int, end: int) -> None:
-        if own is None:
-            loop(first, end, *arguments, *([scratch()] if scratch else []))
-            return
-        mine = next((each for each in own if each is not None), None)
-        for run in range(first, end):
-            if own[run] is not None:
-                loop(run, run + 1, *arguments, own[run])
-        if first == end and mine is not None:
-            loop(first, end, *arguments, mine)
+    def work(pieces: Iterator[tuple[int, int]]) -> None:
+        memory = [scratch()] if scratch else []
+        for first, end in pieces:
+            if own is None:
+                loop(first, end, *arguments, *memory)
+                continue
+            for run in range(first, end):
+                if own[run] is not None:
+                    loop(run, run + 1, *arguments, own[run])
 
     cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)] if cores > 1 else [0, runs]
+    waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
     try:
-        if cores > 1:
-            work(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
-            cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
-            with ThreadPoolExecutor(cores) as pool:
-                list(pool.map(work, cuts[:-1], cuts[1:]))
-        else:
-            work(0, runs)
+        if cores > 1:  # compiles here: a thread would wait for ever for a module that is being imported
+            last = [scratch()] if scratch else [each for each in own or () if each is not None][:1]
+            if own is None or last:
+                loop(0, 0, *arguments, *last)
+        helpers = [_helpers(os.getpid()).submit(work, waiting) for _ in range(cores - 1)]
+        try:
+            work(waiting)
+        finally:  # none works on when this returns
+            begun = [helper for helper in helpers if not helper.cancel()]
+            wait(begun)
+        for helper in begun:
+            helper.result()
     except NumbaError as error:
         loop._cache.ended()  # type: ignore[attr-defined]
         said = str(error)

@@ -23,22 +23,11 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     [2.0, 0.25]
     """
     size = error.shape[-1]
-    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
-    both = finite[..., :, None] & finite[..., None, :]
-    covariance = np.where(both, covariance, np.eye(size))
-    error = np.where(finite, error, 0.0)
+    error = np.where(np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1)), 0.0, error)
     # |L^-1 e|^2 by the Cholesky factors L of all P at once
-    factor, whitened = np.empty_like(covariance), np.empty_like(error)
+    factor, whitened = _factors(covariance), np.empty_like(error)
     with np.errstate(invalid="ignore", divide="ignore"):
         for row in range(size):
-            for column in range(row + 1):
-                reached = np.sum(factor[..., row, :column] * factor[..., column, :column], axis=-1)
-                entry = covariance[..., row, column] - reached
-                if column < row:
-                    factor[..., row, column] = entry / factor[..., column, column]
-                else:
-                    is_sound = entry > ROUNDING * covariance[..., row, row]
-                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
             reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
             whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
     return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
@@ -46,4 +35,31 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
     """Whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
-    return np.isfinite(normalized_error_squared(np.zeros(covariance.shape[:-1]), covariance))
+    pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
+    return np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
+
+
+def _factors(covariance: Array) -> Array:
+    """The lower Cholesky factors (..., n, n); NaN from where there is none on.
+
+    A component of infinite variance is one that is independent of all others.
+    """
+    size = covariance.shape[-1]
+    finite = ~np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1))
+    if not finite.all():
+        both = finite[..., :, None] & finite[..., None, :]
+        covariance = np.where(both, covariance, np.eye(size))
+    factor = np.empty_like(covariance)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for row in range(size):
+            for column in range(row + 1):
+                entry = covariance[..., row, column]
+                if column:
+                    reached = factor[..., row, :column] * factor[..., column, :column]
+                    entry = entry - np.sum(reached, axis=-1)
+                if column < row:
+                    factor[..., row, column] = entry / factor[..., column, column]
+                else:
+                    is_sound = entry > ROUNDING * covariance[..., row, row]
+                    factor[..., row, row] = np.sqrt(np.where(is_sound, entry, np.nan))
+    return factor

@@ -7,8 +7,9 @@ the runs replayed one by one, bit for bit.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic
 
 from recorders.errors import BadInput
@@ -16,8 +17,9 @@ from recorders.log import Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import DoesNotCompile
 from replay.engine.components import Components
-from replay.engine.sources import Source
+from replay.engine.sources import Source, ensemble_of
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Recursive:
         given: whole topics that are not read from the runs, see `pipeline.starting`.
         finish: the state after the last block -> the outputs that waited for messages which did not
             come any more.
+        parameters: those that it was bound with, defaults included.
     """
 
     name: str
@@ -47,14 +50,14 @@ class Recursive:
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
     finish: Callable[[Any], list[Ragged]] | None = None
+    parameters: Parameters | None = None
 
 
 @dataclass(frozen=True)
 class Batch:
     """An estimator that needs everything at once: `solve` turns its topics into output streams.
 
-    `streams` are the measurements, within the span that is replayed; `whole` and `priors` as for
-    `Recursive`.
+    `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Batch:
     solve: Callable[[dict[str, Ragged]], list[Ragged]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
+    parameters: Parameters | None = None
 
 
 Bound = Recursive | Batch
@@ -118,6 +122,16 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
 
 
+@contextmanager
+def code_of(name: str) -> Iterator[None]:
+    """Around calls of an estimator's code: what it raises, and what does not compile, names it."""
+    try:
+        with foreign_code(f"estimator {name}"):
+            yield
+    except DoesNotCompile as error:
+        raise BadInput(f"estimator {name}: {error}") from error
+
+
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
@@ -127,7 +141,7 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
     estimator, parameters = configure(label, settings)
     first = sources[0]
     try:
-        with foreign_code(f"estimator {label}"):
+        with code_of(label):
             bound = estimator.bind(label, first.topics, parameters)
     except BadInput as error:
         raise BadInput(f"{first.name}: {error}") from error
@@ -136,17 +150,8 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
             f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
-    for source in sources[1:]:
-        for topic in {topic for each in bound for topic in (*each.whole, *each.streams)}:
-            here, there = first.topics[topic], source.topics.get(topic)
-            if there is None or _stated(there) != _stated(here):
-                raise BadInput(
-                    f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
-                    "ensemble hold the same topics, replay this one on its own"
-                )
-    return bound
-
-
-def _stated(topic: Topic) -> tuple[str, Mapping[str, str]]:
-    """What an estimator is told of a topic when it is bound."""
-    return topic.schema_name, topic.metadata
+    read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
+    ensemble_of(sources).require_alike(read)
+    return [
+        each if each.parameters is not None else replace(each, parameters=parameters) for each in bound
+    ]

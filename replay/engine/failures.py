@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.log.streams import concatenate
+from recorders.log.streams import concatenate, empty_stream
 
 REASONS = "reasons"
 UNSTATED = "no reason given"
@@ -38,6 +38,8 @@ def reason_of(error: Exception) -> str:
 
 def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
     """One message for each failure, on `topic`."""
+    if not failures:
+        return empty_stream(topic, schemas.FAILURE, {REASONS: "[]"})
     reasons = list(dict.fromkeys(failure.reason for failure in failures))
     return reason_stream(
         topic,

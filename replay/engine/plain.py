@@ -20,13 +20,14 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
 from recorders.parameters import Parameters, ParametersType
 from replay.engine.blocks import Block, Ragged, gather, ragged_rows
-from replay.engine.compile import DoesNotCompile, compile_over_runs, uncompiled_over_runs
+from replay.engine.channels import bindings, given_or_stated, resolved
+from replay.engine.compile import compile_over_runs, uncompiled_over_runs
 from replay.engine.components import Components
 from replay.engine.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.failures import Failure, reason_of, reason_stream
 from replay.engine.measurements import Vectors, numbers_of
 from replay.engine.priors import gaussians
-from replay.engine.results import failures_by_run, innovation_stream, state_stream
+from replay.engine.results import failures_by_run, innovation_stream, state_stream, states_in
 from replay.engine.tangent import tangent_components
 
 Floats = NDArray[np.float64]
@@ -54,13 +55,7 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
 
         Raises BadInput where neither does.
         """
-        value = getattr(self.parameters, name)
-        try:
-            return float(self.topics[topic].metadata[name] if value is None else value)
-        except (KeyError, ValueError):
-            raise BadInput(
-                f"topic {self.topics[topic].name} does not state {name}; give it with --set {name}=..."
-            ) from None
+        return given_or_stated(self.parameters, [self.topics[topic]], name)
 
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
         """The prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
@@ -316,7 +311,7 @@ def recursive(
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         made = _Outputs(
-            name, f"/estimates/{name}", _resolved(truth, prefix), components, measured or {}, outputs
+            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
         )
         wanted = {found[topic].name: each for topic, each in (vectors or {}).items() if topic in found}
         numbers = np.array([number for number, each in enumerate(streams) if each in found])
@@ -337,10 +332,7 @@ def recursive(
             messages = messages._replace(topic=numbers[messages.topic])
             results = made.blank(len(messages.time_ns))
             generators = _drawn_on(generators, messages, values) if draws else generators
-            try:
-                advance_all((settings, messages, state, results), generators)
-            except DoesNotCompile as error:
-                raise BadInput(f"estimator {name}: {error}") from error
+            advance_all((settings, messages, state, results), generators)
             is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
             failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
             told = told | failing
@@ -423,7 +415,7 @@ def batch(
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         made = _Outputs(
-            name, f"/estimates/{name}", _resolved(truth, prefix), components, measured or {}, outputs
+            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
         )
 
         def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
@@ -467,44 +459,6 @@ def each_run(
     return solve_all
 
 
-def _joined(parts: Sequence[Estimates]) -> Estimates:
-    solutions = [part.solution for part in parts if part.solution]
-    return Estimates(
-        np.concatenate([part.time_ns for part in parts]),
-        np.concatenate([part.mean for part in parts]),
-        np.concatenate([part.covariance for part in parts]),
-        Solution(*map(np.concatenate, zip(*solutions, strict=True))) if solutions else None,
-    )
-
-
-def bindings(
-    topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
-) -> Iterator[tuple[str, dict[str, Topic]]]:
-    """Where a log has all the topics asked for, with their schemas: prefix, and topics as asked for.
-
-    Those that are optional may be absent.
-
-    A name with a slash in front, such as `/landmarks`, is a topic for all; others, such as `odometry`,
-    are looked for under every prefix: `/robot1/odometry`, `/robot2/odometry`.
-    """
-    own = [name for name in asked if not name.startswith("/") and name not in optional]
-    end = f"/{own[0]}" if own else ""
-    prefixes = [name.removesuffix(end) for name in topics if name.endswith(end)] if own else [""]
-    for prefix in prefixes:
-        found = {
-            name: topics[full]
-            for name, schema in asked.items()
-            if (full := _resolved(name, prefix)) in topics
-            and topics[full].schema_name == schema.full_name
-        }
-        if set(asked) - set(optional) <= set(found):
-            yield prefix, found
-
-
-def _resolved(name: str, prefix: str) -> str:
-    return name if name.startswith("/") or not name else f"{prefix}/{name}"
-
-
 def _priors(
     found: Mapping[str, Topic], whole: Mapping[str, Schema], components: Components
 ) -> dict[str, Components]:
@@ -533,7 +487,7 @@ def _estimator(
         ]
 
     needs = [
-        f"{_resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
+        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
         for name, schema in asked.items()
     ]
     return Estimator(summary, ", ".join(needs), parameters, bind)
@@ -632,7 +586,8 @@ class _Outputs:
         # what is said of a covariance that is none is for the replay to find
         said = np.isfinite(np.einsum("nd->n", results.mean))
         rows = _last_of_stamps(messages, np.flatnonzero(said))
-        state = self._state(messages.time_ns[rows], results.mean[rows], results.covariance[rows])
+        columns = messages.time_ns, messages.offsets, self.components, self.truth
+        state = states_in(rows, f"{self.topic}/state", *columns, results.mean, results.covariance)
         failures = {}
         for run in failing.tolist():
             begin, end = messages.offsets[run : run + 2]
@@ -640,7 +595,7 @@ class _Outputs:
             end_ns = messages.time_ns[min(begin + last + 1, end - 1)]
             failures[run] = Failure(int(end_ns), DIVERGED)
         made = [
-            Ragged(state, np.searchsorted(rows, messages.offsets)),
+            state,
             failures_by_run(self.topic, failures, len(messages.offsets) - 1),
         ]
         if self.measured:
@@ -664,7 +619,8 @@ class _Outputs:
         time_ns, mean, covariance = self._checked(
             "", estimates[:3], ((), (len(self.components),), (self.tangent,) * 2)
         )
-        yield self._state(time_ns, mean, covariance)
+        topic, components = f"{self.topic}/state", self.components
+        yield state_stream(topic, time_ns, components, self.truth, mean, covariance)
         if estimates.solution is not None:
             yield make_stream(
                 f"{self.topic}/solution",
@@ -713,11 +669,6 @@ class _Outputs:
                     f"{wanted} is wanted"
                 )
         return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
-
-    def _state(self, time_ns: Integers, mean: Floats, covariance: Floats) -> Stream:
-        return state_stream(
-            f"{self.topic}/state", time_ns, self.components, self.truth, mean, covariance
-        )
 
     def of_skipped(self, skipped: _Skipped) -> list[Ragged]:
         """What was not used, for estimators of what may lack a covariance."""

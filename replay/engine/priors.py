@@ -1,7 +1,7 @@
 """The prior rule: components by name, and a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from functools import lru_cache
 from math import isqrt
 from typing import NamedTuple
 
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import is_positive_definite
-from replay.engine.tangent import tangent_components
+from replay.engine.results import gaussian_stream
+from replay.engine.tangent import Kind, tangent_components
 
 MISSING = "there is no prior message"
 NOT_FINITE = "the prior is not finite"
@@ -36,50 +36,63 @@ class Priors(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def read_priors(prior: Ragged, components: Components) -> Priors:
+def priors_of(prior: Ragged, components: Components) -> Priors:
     """The priors of all runs; see `Priors`.
 
-    Raises BadInput where the channel does not state the components (see `match_components`), the
-    vectors have other widths than it states, or no run has a prior that can be used.
+    Raises BadInput where the channel does not state the components (see `match_components`), or the
+    vectors have other widths than it states.
     """
-    priors = _priors_of(prior, components)
-    if all(priors.reasons):
-        raise BadInput(f"{priors.reasons[0]}; the filter cannot start")
-    return priors
-
-
-def _priors_of(prior: Ragged, components: Components) -> Priors:
-    """As `read_priors`, where no run may have one that can be used."""
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
-    columns = match_components(stream.metadata, components, where)
-    rows = match_tangent(stream.metadata, components, where)
-    stated = stated_components(stream.metadata, components, where)
-    size = len(match_tangent(stream.metadata, stated, where))
+    names, kinds = (stream.metadata.get(name, "") for name in ("components", "kinds"))
+    layout = _layout(names, kinds, tuple(components.items()), where)
+    size = layout.tangent
     present = np.flatnonzero(np.diff(prior.offsets))
     first = prior.offsets[present]
     time_ns, mean, covariance, _ = no_priors(runs, components, MISSING)
-    reasons = np.full(runs, MISSING, object)
+    reasons = [""] * runs
     if len(present):
         widths = stream["mean"].shape[1], stream["covariance"].shape[1]
-        if widths != (len(stated), size**2):
+        if widths != (layout.stated, size**2):
             raise BadInput(
-                f"{where}: {len(stated)} components are stated, mean and covariance have {widths[0]} "
-                f"and {widths[1]} numbers; {len(stated)} and {size**2} are needed"
+                f"{where}: {layout.stated} components are stated, mean and covariance have {widths[0]} "
+                f"and {widths[1]} numbers; {layout.stated} and {size**2} are needed"
             )
         time_ns[present] = stream.publish_time_ns[first]
-        mean[present] = stream["mean"][first][:, columns]
+        mean[present] = stream["mean"][first][:, layout.columns]
         whole = stream["covariance"][first].reshape(-1, size, size)
-        covariance[present] = whole[:, rows][:, :, rows]
-        finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
-        definite = is_positive_definite(covariance)
-        reasons[present] = np.where(definite, "", NOT_POSITIVE_DEFINITE)[present]
-        reasons[present[~finite[present]]] = NOT_FINITE
-    unusable = reasons != ""
-    mean[unusable], covariance[unusable] = np.nan, np.nan
-    wanted = f"{where}: no prior of {len(components)} components ({', '.join(components)}) can be used"
-    told = tuple(f"{wanted}: {reason}" if reason else "" for reason in reasons.tolist())
-    return Priors(time_ns, mean, covariance, told)
+        covariance[present] = whole[:, layout.rows][:, :, layout.rows]
+    finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
+    usable = finite & is_positive_definite(covariance)
+    if not usable.all():
+        mean[~usable], covariance[~usable] = np.nan, np.nan
+        wanted = f"no prior of {len(components)} components ({', '.join(components)}) can be used"
+        for run in np.flatnonzero(~usable).tolist():
+            reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
+            reasons[run] = f"{where}: {wanted}: {reason if run in present else MISSING}"
+    return Priors(time_ns, mean, covariance, tuple(reasons))
+
+
+class _Layout(NamedTuple):
+    """How many components a channel states, of the tangent space too, and where the wanted stand."""
+
+    stated: int
+    tangent: int
+    columns: list[int]
+    rows: list[int]
+
+
+@lru_cache(maxsize=256)
+def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
+    """The layout of a channel that states these names and kinds; raises BadInput as `read_priors`."""
+    metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
+    stated = stated_components(metadata, components, where)
+    return _Layout(
+        len(stated),
+        len(match_tangent(metadata, stated, where)),
+        match_components(metadata, components, where),
+        match_tangent(metadata, components, where),
+    )
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
@@ -104,15 +117,16 @@ def start_of_runs(
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
     order, NaN where the run cannot start; and the reasons by run, which may be all of them.
-    Raises BadInput where a topic is no such prior, see `read_priors`.
+    Raises BadInput where a topic is no such prior, see `priors_of`.
     """
     found, failed = dict(whole), dict[int, str]()
     for topic, components in priors.items():
-        read = _priors_of(whole[topic], components)
+        read = priors_of(whole[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)
-        found[topic] = _one_each(topic, read)
+        stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
+        found[topic] = Ragged(stream, np.arange(len(read.reasons) + 1))
     return found, failed
 
 
@@ -126,17 +140,3 @@ def gaussians(
     size = isqrt(prior["covariance"].shape[1])
     covariance = prior["covariance"].reshape(-1, size, size)
     return prior.stream.publish_time_ns.copy(), prior["mean"].copy(), covariance.copy()
-
-
-def _one_each(topic: str, priors: Priors) -> Ragged:
-    runs = len(priors.mean)
-    blank = make_stream(
-        topic,
-        schemas.GAUSSIAN_ESTIMATE,
-        priors.time_ns,
-        mean=np.zeros_like(priors.mean),
-        covariance=np.zeros((runs, priors.covariance.shape[1] ** 2)),
-    )
-    covariance = priors.covariance.reshape(blank["covariance"].shape)
-    columns = {**blank.columns, "mean": priors.mean, "covariance": covariance}
-    return Ragged(replace(blank, columns=columns), np.arange(runs + 1))

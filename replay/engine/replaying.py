@@ -5,16 +5,15 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, zip_longest
+from itertools import chain
 from typing import Any
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Stream
-from recorders.registry import foreign_code
-from replay.engine.blocks import Block, Ragged, gather, join, merge_events
-from replay.engine.estimator import Batch, Bound, Recursive
+from recorders.log import Clock
+from replay.engine.blocks import Block, Ragged, join, merge_events
+from replay.engine.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.priors import start_of_runs
-from replay.engine.sources import Source
+from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
@@ -62,10 +61,11 @@ def replay(
     Raises BadInput where an estimator can follow no run, no run has a message for it, or a run's span
     begins after the prior of an estimator (see `pipeline.starting`).
     """
-    read = _read_whole(sources, sorted({topic for bound in estimators for topic in bound.whole}))
+    ensemble = ensemble_of(sources)
+    read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
     wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
     for bound, whole in zip(estimators, wholes, strict=True):
-        _refuse_old_priors(bound, sources, whole, order)
+        _refuse_old_priors(bound, ensemble, whole, order)
     watches = [
         Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
@@ -75,10 +75,10 @@ def replay(
         raise next(iter(refused.values()))
     for bound, watch, given in zip(estimators, watches, states, strict=True):
         if isinstance(bound, Batch):
-            for block in _required(sources, bound.streams, order, sys.maxsize):
+            for block in _required(ensemble, bound.streams, order, sys.maxsize):
                 yield watch.receive(watch.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
-    for block in _required(sources, sorted(streamed), order, block_messages):
+    for block in _required(ensemble, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
         for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
             if isinstance(bound, Recursive):
@@ -115,7 +115,7 @@ def _start(
         try:
             given, unable = start_of_runs(whole, bound.priors)
             watch.exclude(unable)
-            with foreign_code(f"estimator {bound.name}"):
+            with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
             starts = len(unable) < watch.runs
             told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
@@ -132,7 +132,7 @@ def _start(
 def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
     if given is _REFUSED:
         return []
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return bound.solve(given | streams)
 
 
@@ -142,7 +142,7 @@ def _advance(
     if state is _REFUSED:
         return state, []
     events = merge_events(streams, order)
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return bound.run(state, Block(streams, events))
 
 
@@ -152,57 +152,34 @@ def _finish(
     state: Any,
     _: dict[str, Ragged],
 ) -> list[Ragged]:
-    with foreign_code(f"estimator {bound.name}"):
+    with code_of(bound.name):
         return finish(state)
 
 
 def _refuse_old_priors(
-    bound: Bound, sources: Sequence[Source], whole: Mapping[str, Ragged], order: Clock
+    bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
     for topic in bound.priors.keys() - bound.given.keys():
-        for run, source in enumerate(sources):
-            if source.start_ns is None:
-                continue
+        for run, start_ns in ensemble.starts_ns.items():
             times_ns = whole[topic].of_run(run).times(order)[:1]
-            if len(times_ns) and times_ns[0] < source.start_ns:
+            if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(
-                    f"{source.name}: the replay would start {bound.name} from {topic}, which is "
-                    f"{(source.start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
+                    f"{ensemble[run].name}: the replay would start {bound.name} from {topic}, which is "
+                    f"{(start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
                     "to start from with --start-from truth or --start-from ESTIMATES"
                 )
 
 
-def _read_whole(sources: Sequence[Source], topics: Sequence[str]) -> dict[str, Ragged]:
-    runs = [source.read(topics) for source in sources]
-    return {topic: gather([run[topic] for run in runs]) for topic in topics}
-
-
 def _required(
-    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
+    ensemble: Ensemble[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
-    """As `ensemble_blocks`; raises BadInput where no run has a message of the topics."""
-    blocks = ensemble_blocks(sources, topics, order, block_messages)
+    """The blocks of the ensemble; raises BadInput where no run has a message of the topics."""
+    blocks = ensemble.blocks(topics, order, block_messages)
     first = next(blocks, None)
     if first is None and topics:
-        raise BadInput(f"{sources[0].name}: no messages on {', '.join(topics)} to replay")
+        raise BadInput(f"{ensemble[0].name}: no messages on {', '.join(topics)} to replay")
     yield from chain([first] if first is not None else [], blocks)
-
-
-def ensemble_blocks(
-    sources: Sequence[Source], topics: Sequence[str], order: Clock, block_messages: int
-) -> Iterator[dict[str, Ragged]]:
-    """The next block of every run, until all runs are at their end.
-
-    The runs need not be at the same time: each has its own state.
-    """
-    if not topics:
-        return
-    empty = {topic: sources[0].empty(topic) for topic in topics}
-    ended: dict[str, Stream] = {}
-    runs = [source.blocks(topics, order, block_messages) for source in sources]
-    for blocks in zip_longest(*runs, fillvalue=ended):
-        yield {topic: gather([block.get(topic, empty[topic]) for block in blocks]) for topic in topics}
 
 
 def collect(outputs: Iterable[list[Ragged]]) -> dict[str, Ragged]:

@@ -1,13 +1,13 @@
 """What estimators say, as streams: states, innovations, what was passed over, and who failed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, make_stream, schemas
+from recorders.log.streams import stream_of
 from recorders.models.planar import wrap_angle
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components
@@ -41,16 +41,32 @@ def state_stream(
         mean = mean.copy()
         angles = mean[:, angular]  # those in range stay as they are, to the last bit
         mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
-    columns = {"mean": mean, "covariance": _flat(covariance)}
-    blank = make_stream(
-        topic,
-        schemas.GAUSSIAN_ESTIMATE,
-        time_ns,
-        metadata=named(components) if truth is None else {**named(components), "truth": truth},
-        **{name: np.broadcast_to(0.0, column.shape) for name, column in columns.items()},
-    )
-    # numbers that are none are for the replay to find: they end their run alone
-    return replace(blank, columns={**blank.columns, **columns})
+    metadata = named(components) if truth is None else {**named(components), "truth": truth}
+    return gaussian_stream(topic, time_ns, mean, covariance, metadata)
+
+
+def gaussian_stream(
+    topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
+) -> Stream:
+    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `supervision`."""
+    columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
+    schema = schemas.GAUSSIAN_ESTIMATE
+    return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
+
+
+def states_in(
+    rows: Integers,
+    topic: str,
+    time_ns: Integers,
+    offsets: Integers,
+    components: Components,
+    truth: str | None,
+    mean: Floats,
+    covariance: Floats,
+) -> Ragged:
+    """The states in some rows, in order, of columns in which run r owns offsets[r]:offsets[r + 1]."""
+    stream = state_stream(topic, time_ns[rows], components, truth, mean[rows], covariance[rows])
+    return Ragged(stream, np.searchsorted(rows, offsets))
 
 
 def innovation_stream(
@@ -67,7 +83,8 @@ def innovation_stream(
     log_likelihood: Floats | None = None,
 ) -> Stream:
     """Innovations (n, m) with their covariances (n, m, m), NIS (n,) and, where known, log-likelihood."""
-    unknown = np.full(len(time_ns), np.nan)
+    if log_likelihood is None:
+        log_likelihood = np.full(len(time_ns), np.nan)
     return make_stream(
         topic,
         schemas.INNOVATION,
@@ -78,7 +95,7 @@ def innovation_stream(
         innovation=innovation,
         covariance=_flat(covariance),
         normalised_innovation_squared=squared,
-        log_likelihood=unknown if log_likelihood is None else log_likelihood,
+        log_likelihood=log_likelihood,
     )
 
 

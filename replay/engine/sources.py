@@ -1,9 +1,10 @@
-"""Where a replay reads from: a log file, or a recording that is still in memory."""
+"""Where a replay reads from: log files, or recordings that are still in memory; one run or many."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from itertools import zip_longest
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from recorders.log import (
     read_streams,
 )
 from recorders.recording import Recording
+from replay.engine.blocks import Ragged, gather
 
 
 class Source(Protocol):
@@ -58,6 +60,17 @@ class Source(Protocol):
 
     def whole(self) -> "Source":
         """The run without a span."""
+
+
+def is_sensed(source: Source, topic: str) -> bool:
+    """Whether a topic is the run's own, and columns: no estimates, no images."""
+    if topic.startswith("/estimates/"):
+        return False
+    try:
+        source.empty(topic)
+    except BadInput:
+        return False
+    return True
 
 
 class _Readable(Mapping[str, Stream]):
@@ -192,12 +205,7 @@ class MemorySource(_Readable):
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
         """Whole topics, in publish-time order."""
-        missing = [topic for topic in topics if topic not in self.streams]
-        if missing:
-            raise BadInput(
-                f"{self.name}: no topic {missing[0]}; it has {', '.join(sorted(self.streams))}"
-            )
-        return {topic: self._in_order(topic, "publish_time") for topic in topics}
+        return {topic: self.in_order(topic, "publish_time") for topic in topics}
 
     def empty(self, topic: str) -> Stream:
         """The topic without its messages."""
@@ -210,7 +218,7 @@ class MemorySource(_Readable):
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
         """The source's span in one block, unless there is nothing: everything is in memory already."""
-        spans = {topic: self._within(self._in_order(topic, order), order) for topic in topics}
+        spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
             yield block
@@ -219,29 +227,26 @@ class MemorySource(_Readable):
         """The whole recording."""
         return replace(self, start_ns=None, end_ns=None)
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether there is no span."""
+        return self.start_ns is None and self.end_ns is None
+
     def _within(self, stream: Stream, order: Clock) -> Stream:
         """The messages of the source's span, of a stream in order."""
-        if self.start_ns is None and self.end_ns is None:
+        if self.is_whole:
             return stream
         times_ns = stream.times(order)
         start = 0 if self.start_ns is None else np.searchsorted(times_ns, self.start_ns)
         end = len(stream) if self.end_ns is None else np.searchsorted(times_ns, self.end_ns)
         return stream.take(slice(int(start), int(end)))
 
-    def _in_order(self, topic: str, order: Clock) -> Stream:
-        if (topic, order) not in self._ordered:
-            self._ordered[topic, order] = self._sorted(topic, order)
-        return self._ordered[topic, order]
-
-    @cached_property
-    def _ordered(self) -> dict[tuple[str, Clock], Stream]:
-        """What was sorted once; an ensemble is replayed several times."""
-        return {}
-
-    def _sorted(self, topic: str, order: Clock) -> Stream:
+    def in_order(self, topic: str, order: Clock) -> Stream:
+        """A topic by one of the clocks; equal stamps as in the file."""
+        if topic not in self.streams:
+            raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
         stream = self.streams[topic]
-        clock = stream.publish_time_ns if order == "publish_time" else stream.log_time_ns
-        position = stream.position
+        clock, position = stream.times(order), stream.position
         if np.all(clock[1:] >= clock[:-1]) and np.all(position[1:] > position[:-1]):
             return stream
         return stream.take(np.lexsort((position, clock)))
@@ -261,3 +266,91 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     return MemorySource(
         {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
     )
+
+
+SourceType = TypeVar("SourceType", bound=Source)
+
+
+class Ensemble(list[SourceType]):
+    """Runs that are replayed together: they hold the same topics.
+
+    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept;
+    no run may be added to it or taken from it.
+    """
+
+    def __init__(self, sources: Iterable[SourceType]) -> None:
+        super().__init__(sources)
+        self._kept: dict[tuple[str, Clock], Ragged] = {}
+        self._alike: set[str] = set()
+
+    @cached_property
+    def starts_ns(self) -> dict[int, int]:
+        """Where the replayed spans begin, by run; of those that do not begin with their run."""
+        starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
+        return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
+
+    def require_alike(self, topics: Iterable[str]) -> None:
+        """Raise BadInput where a run does not hold these topics as the first one does."""
+        first = self[0]
+        for topic in topics:
+            if topic in self._alike:
+                continue
+            here = first.topics[topic]
+            stated = here.schema_name, here.metadata
+            for source in self:
+                there = source.topics.get(topic)
+                if there is None or (there.schema_name, there.metadata) != stated:
+                    raise BadInput(
+                        f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
+                        "ensemble hold the same topics, replay this one on its own"
+                    )
+            self._alike.add(topic)
+
+    def read(self, topics: Sequence[str]) -> dict[str, Ragged]:
+        """Whole topics, in publish-time order."""
+        if self._recordings:
+            return self._laid_out(topics, "publish_time")
+        runs = [source.read(topics) for source in self]
+        return {topic: gather([run[topic] for run in runs]) for topic in topics}
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Ragged]]:
+        """The next block of every run, until all runs are at their end.
+
+        The runs need not be at the same time: each has its own state. Recordings are one block.
+        """
+        if not topics:
+            return
+        if self._recordings and all(run.is_whole for run in self._recordings):
+            block = self._laid_out(topics, order)
+            if any(len(ragged) for ragged in block.values()):
+                yield block
+            return
+        empty = {topic: self[0].empty(topic) for topic in topics}
+        ended: dict[str, Stream] = {}
+        runs = [source.blocks(topics, order, block_messages) for source in self]
+        for blocks in zip_longest(*runs, fillvalue=ended):
+            yield {
+                topic: gather([block.get(topic, nothing) for block in blocks])
+                for topic, nothing in empty.items()
+            }
+
+    @cached_property
+    def _recordings(self) -> list[MemorySource]:
+        """The runs, where all are in memory."""
+        found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
+        return found if len(found) == len(self) else []
+
+    def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
+        """Topics of recordings."""
+        for topic in topics:
+            if (topic, order) not in self._kept:
+                runs = [source.in_order(topic, order) for source in self._recordings]
+                self._kept[topic, order] = gather(runs)
+        return {topic: self._kept[topic, order] for topic in topics}
+
+
+def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:
+    """The ensemble of these runs, which may be one already."""
+    return sources if isinstance(sources, Ensemble) else Ensemble(sources)

@@ -6,9 +6,10 @@ others do not notice. Beside that, this counts for how much of each run there we
 time that the estimator took.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import cache, partial, reduce
 from math import isqrt
 from typing import TypeVar
 
@@ -77,7 +78,8 @@ class Watch:
     def exclude(self, reasons: Mapping[int, str]) -> None:
         """These runs cannot start, for a reason each."""
         self._unable |= reasons
-        self._end_ns[list(reasons)] = 0
+        for run in reasons:
+            self._end_ns[run] = 0
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
         """What `work` makes of the next streams of the runs that have not failed.
@@ -98,8 +100,8 @@ class Watch:
 
     def receive(self, outputs: Sequence[Ragged]) -> list[Ragged]:
         """A block's outputs without what is no estimate and all after it; failures are held back."""
-        cuts = {each.stream.topic: self._unsound(each) for each in outputs}
-        sound = [self._cut(each, cuts[each.stream.topic]) for each in outputs]
+        cuts = [self._unsound(each) for each in outputs]
+        sound = [self._cut(each, cut) for each, cut in zip(outputs, cuts, strict=True)]
         passed = []
         for each in sound:
             topic, schema = each.stream.topic, each.stream.schema.full_name
@@ -128,11 +130,12 @@ class Watch:
         )
         self._find_silence(failed)
         own_topic = f"/estimates/{self.name}/failure"
-        topic = next((topic for topic in told if topic == own_topic), next(iter(told), own_topic))
-        runs = sorted(self._failed)
-        own = failure_stream(topic, [self._failed[run] for run in runs])
-        ours = Ragged(own, np.searchsorted(runs, np.arange(self.runs + 1)))
-        told[topic] = join([told[topic], ours]) if topic in told else ours
+        topic = own_topic if own_topic in told else next(iter(told), own_topic)
+        if self._failed or not told:
+            runs = sorted(self._failed)
+            own = failure_stream(topic, [self._failed[run] for run in runs])
+            ours = Ragged(own, np.searchsorted(runs, np.arange(self.runs + 1)))
+            told[topic] = join([told[topic], ours]) if topic in told else ours
         return list(told.values())
 
     def coverage(self) -> list[Ragged]:
@@ -173,7 +176,7 @@ class Watch:
 
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
         """The messages of every run before its end (runs,)."""
-        if np.all(end_ns == FOREVER):
+        if (end_ns == FOREVER).all():
             return dict(streams)
         return {
             topic: _kept(ragged, ragged.stream.times(self._order) < end_ns[_run_of(ragged)])
@@ -223,18 +226,17 @@ class Watch:
             self._failed[run] = Failure(int(stamps[bad]), reason_of(found))
             self._end_ns[run] = 0 if self._is_batch else stamps[bad]
 
-    def _unsound(self, estimates: Ragged) -> Integers:
-        """The first row (runs,) of every run that is no estimate, and its end at that; else no row."""
+    def _unsound(self, estimates: Ragged) -> Integers | None:
+        """The first row (runs,) of every run that is no estimate, and its end at that; None for none."""
         stream = estimates.stream
-        rows = np.full(self.runs, FOREVER)
         if stream.schema.full_name != GAUSSIAN or not len(stream):
-            return rows
+            return None
         rhythm = self._rhythms.get(stream.topic.rpartition("/")[0])
         before_ns = rhythm.last_ns if rhythm else np.full(self.runs, -1)
-        found = np.full(self.runs, -1)
+        rows, found = np.full(self.runs, FOREVER), np.full(self.runs, -1)
         mean, covariance = (np.ascontiguousarray(stream[name]) for name in ("mean", "covariance"))
         size = isqrt(covariance.shape[1])
-        _compiled()(
+        _over_runs(find_unsound)(
             self.runs,
             estimates.offsets,
             stream.publish_time_ns,
@@ -245,7 +247,8 @@ class Watch:
             found,
             scratch=partial(np.empty, (size, size)),
         )
-        for run in np.flatnonzero(found >= 0):
+        bad = np.flatnonzero(found >= 0)
+        for run in bad:
             row = rows[run]
             first = row == estimates.offsets[run]
             last_ns = before_ns[run] if first else stream.publish_time_ns[row - 1]
@@ -254,14 +257,14 @@ class Watch:
             if known is None or time_ns < known.time_ns:
                 self._failed[int(run)] = Failure(time_ns, UNSOUND[found[run]])
             self._end_ns[run] = min(self._end_ns[run], time_ns)
-        return rows
+        return rows if len(bad) else None
 
-    def _cut(self, output: Ragged, first_bad: Integers) -> Ragged:
+    def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
         """An output without the rows from a run's first bad one on, or from the run's end on."""
-        if (first_bad == FOREVER).all() and (self._end_ns == FOREVER).all():
+        if first_bad is None and (self._end_ns == FOREVER).all():
             return output
         run = _run_of(output)
-        kept = np.arange(len(run)) < first_bad[run]
+        kept = np.ones(len(run), bool) if first_bad is None else np.arange(len(run)) < first_bad[run]
         if not self._is_batch:
             kept &= output.stream.publish_time_ns < self._end_ns[run]
         return output if kept.all() else _kept(output, kept)
@@ -274,10 +277,15 @@ class Watch:
         rhythms = [self._rhythms[case] for case in self._states]
         if not rhythms:
             return
-        mute = ~np.any([rhythm.said for rhythm in rhythms], axis=0)
-        silent = np.all([rhythm.misses(self._last_ns) for rhythm in rhythms], axis=0)
-        last_ns = np.max([rhythm.last_ns for rhythm in rhythms], axis=0)
-        found = (self._last_ns >= 0) & (mute | (silent & (not self._is_batch)))
+        mute = ~reduce(np.logical_or, (rhythm.said for rhythm in rhythms))
+        found = mute
+        if not self._is_batch:
+            silent = (rhythm.misses(self._last_ns) for rhythm in rhythms)
+            found = mute | reduce(np.logical_and, silent)
+        found = found & (self._last_ns >= 0)
+        if not found.any():
+            return
+        last_ns = reduce(np.maximum, (rhythm.last_ns for rhythm in rhythms))
         for run in set(np.flatnonzero(found).tolist()) - failed:
             if mute[run]:
                 self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
@@ -301,39 +309,31 @@ class _Rhythm:
         self.topic = topic
         self.last_ns = starts_ns.copy()
         self.said = np.zeros(len(starts_ns), bool)
-        self._counts = np.zeros((len(starts_ns), self.BINS), np.int64)
-        self._sums_ns = np.zeros((len(starts_ns), self.BINS))
+        # a bin's runs side by side: most runs use one or two bins, and the rest is never touched
+        self._counts = np.zeros((self.BINS, len(starts_ns)), np.int64)
+        self._sums_ns = np.zeros((self.BINS, len(starts_ns)))
 
     def note(self, estimates: Ragged) -> None:
         """Take in the stamps of a block."""
-        times, run = estimates.stream.publish_time_ns, _run_of(estimates)
-        runs = np.flatnonzero(np.diff(estimates.offsets))
-        before = np.concatenate([times[:1], times[:-1]])
-        before[estimates.offsets[runs]] = self.last_ns[runs]
-        interval = np.where(before < 0, 0, times - before)
-        counted = interval > 0
-        place = run[counted] * self.BINS + _bin_of(interval[counted])
-        size = self._counts.size
-        self._counts += np.bincount(place, minlength=size).reshape(self._counts.shape)
-        # exact in floats up to 2^53 ns, a hundred days
-        self._sums_ns += np.bincount(place, interval[counted], size).reshape(self._sums_ns.shape)
-        self.last_ns[runs] = times[estimates.offsets[runs + 1] - 1]
-        self.said[runs] = True
+        times_ns = estimates.stream.publish_time_ns
+        noted = self.said, self.last_ns, self._counts, self._sums_ns
+        _over_runs(note_intervals)(estimates.runs, estimates.offsets, times_ns, *noted)
 
     def estimated_s(self) -> Floats:
         """For how long (runs,) there were estimates, gaps left out."""
-        is_gap = np.arange(self.BINS) > self._longest()[:, None]
-        return np.where(is_gap, 0, self._sums_ns).sum(axis=1) * 1e-9
+        is_gap = np.arange(self.BINS)[:, None] > self._longest()
+        return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
 
     def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
         """Whether the time (runs,) since each run's last estimate is a gap."""
-        missed: NDArray[np.bool_] = _bin_of(now_ns - self.last_ns) > self._longest()
-        return missed
+        interval = _bin_of(now_ns - self.last_ns)
+        missed: NDArray[np.bool_] = interval > self.SECOND
+        return missed & (interval > self._longest()) if missed.any() else missed
 
     def _longest(self) -> Integers:
         """The bin (runs,) of the longest intervals that are no gaps."""
-        reached = np.cumsum(self._counts, axis=1)
-        median = np.argmax(2 * reached >= reached[:, -1:], axis=1)
+        reached = np.cumsum(self._counts, axis=0)
+        median = np.argmax(2 * reached >= reached[-1], axis=0)
         return np.maximum(median + self.GAP, self.SECOND)
 
 
@@ -349,9 +349,38 @@ def _kept(ragged: Ragged, kept: NDArray[np.bool_]) -> Ragged:
     return Ragged(ragged.stream.take(kept), ragged_rows(kept, ragged.offsets))
 
 
-@lru_cache(maxsize=1)
-def _compiled() -> Callable[..., None]:
-    return compile_over_runs(find_unsound, allocates=False)
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once, allocates=False)
+
+
+def note_intervals(
+    run: int,
+    offsets: Integers,
+    time_ns: Integers,
+    said: NDArray[np.bool_],
+    last_ns: Integers,
+    counts: Integers,
+    sums_ns: Floats,
+) -> None:
+    """Take in the stamps of a run; see `_Rhythm`.
+
+    Args:
+        run: which.
+        offsets: (runs + 1,) of the stamps.
+        time_ns: (n,) the stamps.
+        said: (runs,) whether there were any.
+        last_ns: (runs,) the last one; negative where there is none.
+        counts: (BINS, runs) of the intervals of every bin, how many there are.
+        sums_ns: (BINS, runs) and their sum, exact up to 2^53 ns, a hundred days.
+    """
+    for row in range(offsets[run], offsets[run + 1]):
+        interval = time_ns[row] - last_ns[run]
+        if last_ns[run] >= 0 and interval > 0:
+            _, exponent = math.frexp(float(interval))
+            counts[exponent - 1, run] += 1
+            sums_ns[exponent - 1, run] += interval
+        said[run], last_ns[run] = True, time_ns[row]
 
 
 def find_unsound(

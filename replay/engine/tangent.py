@@ -99,16 +99,6 @@ def rotation_vector(x: Floats) -> Floats:
     return (1.0 if x.shape[1] == 2 else 2.0) * scale * folded[:, 1:]
 
 
-def vector_part_covariance(x: Floats, second_moment: Floats) -> Floats:
-    """Covariances (n, t, t) of small rotations about unit vectors x (n, d) with E(y y^T) (n, d, d).
-
-    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
-    """
-    turn = np.stack([compose(conjugate(x), basis) for basis in np.eye(x.shape[1])], axis=-1)
-    local = turn @ second_moment @ np.swapaxes(turn, -1, -2)
-    return (1.0 if x.shape[1] == 2 else 4.0) * local[:, 1:, 1:]
-
-
 def _slerp(left: Floats, right: Floats, weight: Floats) -> Floats:
     """Along the great circle, from left to the nearer one of right and -right."""
     turn = rotation_vector(compose(conjugate(left), right))

@@ -16,6 +16,7 @@ from recorders.errors import BadInput
 from recorders.models import acoustic as model
 from recorders.models.acoustic import Medium, Noise
 from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats
 from replay.estimators.rays import intersect_rays
 from replay.inference.least_squares import (
     Bound,
@@ -25,8 +26,6 @@ from replay.inference.least_squares import (
     mask_missing,
     solve,
 )
-
-Array = NDArray[np.float64]
 
 # Derivatives by azimuth, range and trajectory.
 BY_AZIMUTH = (1.0, 0.0, 0.0)
@@ -64,10 +63,10 @@ class Detections(NamedTuple):
     The shockwave and the time difference are NaN where the shockwave was not heard.
     """
 
-    muzzle_blast_rad: Array
-    shockwave_rad: Array
-    time_difference_s: Array
-    position_m: Array
+    muzzle_blast_rad: Floats
+    shockwave_rad: Floats
+    time_difference_s: Floats
+    position_m: Floats
 
     def take(self, rows: NDArray[np.intp]) -> "Detections":
         """The runs `rows`."""
@@ -90,7 +89,7 @@ def estimate(setting: Setting, heard: Detections) -> Solution:
     )
 
 
-def bound(setting: Setting, shooter_m: Array, trajectory_rad: Array, sensor_m: Array) -> Bound:
+def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats) -> Bound:
     """CRLB at the truth: shooters (runs, 2), trajectories (runs,), sensors (sensors, 2) or per run."""
     heard = noise_free(setting.medium, shooter_m, trajectory_rad, sensor_m)
     parts = [shooter_m]
@@ -101,7 +100,9 @@ def bound(setting: Setting, shooter_m: Array, trajectory_rad: Array, sensor_m: A
     return cramer_rao_bound(linearize(setting, heard, np.concatenate(parts, axis=1)))
 
 
-def noise_free(medium: Medium, shooter_m: Array, trajectory_rad: Array, sensor_m: Array) -> Detections:
+def noise_free(
+    medium: Medium, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats
+) -> Detections:
     """What perfect sensors hear; shapes as for `bound`."""
     position = np.broadcast_to(sensor_m, (len(shooter_m), *sensor_m.shape[-2:]))
     with np.errstate(invalid="ignore"):
@@ -111,7 +112,7 @@ def noise_free(medium: Medium, shooter_m: Array, trajectory_rad: Array, sensor_m
     return Detections(*angles, position)
 
 
-def starting_point(setting: Setting, heard: Detections) -> Array:
+def starting_point(setting: Setting, heard: Detections) -> Floats:
     """Where the bearings meet, the mean trajectory that the shockwaves tell, and the position fixes.
 
     The tangents and cotangents of eqs (32)-(34) are the same rays with other weights.
@@ -128,7 +129,7 @@ def starting_point(setting: Setting, heard: Detections) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-def linearize(setting: Setting, heard: Detections, parameters: Array) -> Linearization:
+def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linearization:
     """The chosen measurements at `parameters` (runs, n), one block of correlated errors per sensor.
 
     Where the sensors are not estimated, the bound that follows leaves out how the position fixes' share
@@ -156,9 +157,9 @@ def linearize(setting: Setting, heard: Detections, parameters: Array) -> Lineari
 class _Geometry(NamedTuple):
     """How the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
 
-    azimuth_rad: Array
-    range_m: Array
-    trajectory_rad: Array
+    azimuth_rad: Floats
+    range_m: Floats
+    trajectory_rad: Floats
 
 
 class _Blocks(NamedTuple):
@@ -168,10 +169,10 @@ class _Blocks(NamedTuple):
     (..., k, k, d): by azimuth, range and trajectory (d = 3) at first, by all parameters in the end.
     """
 
-    residual: Array
-    jacobian: Array
-    covariance: Array
-    slope: Array | None
+    residual: Floats
+    jacobian: Floats
+    covariance: Floats
+    slope: Floats | None
 
 
 def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
@@ -266,13 +267,13 @@ def _blocks(residual: list, jacobian: list, covariance: list, slope: list | None
     )
 
 
-def _stack(entries: list | tuple | Array | float, shape: tuple[int, ...]) -> Array:
+def _stack(entries: list | tuple | Floats | float, shape: tuple[int, ...]) -> Floats:
     if isinstance(entries, list | tuple):
         return np.stack([_stack(entry, shape) for entry in entries], axis=len(shape))
     return np.broadcast_to(entries, shape)
 
 
-def _chain_rule(setting: Setting, azimuth: Array, distance: Array) -> Array:
+def _chain_rule(setting: Setting, azimuth: Floats, distance: Floats) -> Floats:
     """Derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
     runs, sensors = distance.shape
     x, y = np.cos(azimuth), np.sin(azimuth)
@@ -289,12 +290,12 @@ def _chain_rule(setting: Setting, azimuth: Array, distance: Array) -> Array:
     return np.concatenate(parts, axis=-1)
 
 
-def _by_parameters(view: _Blocks, chain: Array) -> _Blocks:
+def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
     slope = None if view.slope is None else view.slope @ chain[:, :, None]
     return view._replace(jacobian=view.jacobian @ chain, slope=slope)
 
 
-def _append_fixes(view: _Blocks, residual: Array, sigma_m: float) -> _Blocks:
+def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
     """Position fixes as two more measurements of every sensor, which are its last parameters."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)

@@ -9,16 +9,17 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.acoustic import Medium, Noise
 from recorders.parameters import Parameters
+from replay.engine.arrays import Floats
 from replay.engine.blocks import Ragged
+from replay.engine.channels import numbered
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.measurements import PLANE, read_vectors
-from replay.estimators.acoustic import Array, Detections, Mode, Setting, estimate, parameter_names
+from replay.estimators.acoustic import Detections, Mode, Setting, estimate, parameter_names
 from replay.estimators.solutions import (
     Batches,
     batches_of,
-    sensor_numbers,
+    positive,
     solution_streams,
-    stated,
     table_of,
 )
 
@@ -35,7 +36,7 @@ HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> list[Bound]:
-    sensors = sensor_numbers(topics, "detections", schemas.SHOT_DETECTION)
+    sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
     streams = [f"/sensor{s}/detections" for s in sensors]
     whole = [f"/sensor{s}/position" for s in sensors]
     if not sensors or not set(whole) <= set(topics):
@@ -52,8 +53,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
 
 def _world(topic: Topic) -> tuple[Noise, Medium]:
     return (
-        Noise(*(stated(topic, f"sigma_{field}") for field in Noise._fields)),
-        Medium(*(stated(topic, field) for field in Medium._fields)),
+        Noise(*(positive(topic, f"sigma_{field}") for field in Noise._fields)),
+        Medium(*(positive(topic, field) for field in Medium._fields)),
     )
 
 
@@ -79,7 +80,7 @@ def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tupl
     return batches, Detections(muzzle_blast, shockwave, time_difference, np.stack(places, axis=1))
 
 
-def _latest(positions: Ragged, batches: Batches) -> Array:
+def _latest(positions: Ragged, batches: Batches) -> Floats:
     """The latest fix (batches, 2) of a sensor at the end of each batch, NaN where it had none."""
     times = positions.stream.publish_time_ns
     latest = np.full(len(batches.run), -1)

@@ -29,6 +29,7 @@ from replay.distributions.bingham_kernels import (
     weighted_outer,
 )
 from replay.distributions.gaussian_kernels import condition
+from replay.engine.arrays import Floats, Integers
 from replay.engine.compile import compile_over_runs
 
 
@@ -44,9 +45,9 @@ class Steps(NamedTuple):
         measurement: unit vectors z (rows, d).
     """
 
-    offsets: NDArray[np.int64]
-    increment: NDArray[np.float64]
-    measurement: NDArray[np.float64]
+    offsets: Integers
+    increment: Floats
+    measurement: Floats
 
 
 def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
@@ -59,7 +60,7 @@ def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> St
     return Steps(offsets, _unit_or_nan(increment, "increment"), _unit_or_nan(measurement, "measurement"))
 
 
-def _unit_or_nan(x: NDArray, what: str) -> NDArray[np.float64]:
+def _unit_or_nan(x: NDArray, what: str) -> Floats:
     missing = np.isnan(x).all(axis=-1, keepdims=True)
     unit = require_unit(np.where(missing, np.eye(x.shape[-1])[0], x), what)
     return np.ascontiguousarray(np.where(missing, np.nan, unit))
@@ -75,15 +76,15 @@ class BinghamNoise(NamedTuple):
 class Gaussian(NamedTuple):
     """Gaussian states: mean (..., d) and covariance (..., d, d)."""
 
-    mean: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    mean: Floats
+    covariance: Floats
 
 
 class GaussianNoise(NamedTuple):
     """Covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
 
-    system: NDArray[np.float64]
-    measurement: NDArray[np.float64]
+    system: Floats
+    measurement: Floats
 
 
 @cache
@@ -92,7 +93,7 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
 
 
 def run_bingham_filter(
-    noise: BinghamNoise, state: Bingham, steps: Steps, rotations: NDArray[np.float64] | None = None
+    noise: BinghamNoise, state: Bingham, steps: Steps, rotations: Floats | None = None
 ) -> tuple[Bingham, Bingham]:
     """The recursive Bingham filter: algorithms 1 and 2.
 
@@ -123,7 +124,7 @@ def run_bingham_filter(
     return state, estimates
 
 
-def _rotations(steps: Steps) -> NDArray[np.float64]:
+def _rotations(steps: Steps) -> Floats:
     rows, d = steps.measurement.shape
     return np.empty((rows, d - 1, d - 1))
 
@@ -163,7 +164,7 @@ def run_kalman_filter(
     noise: GaussianNoise,
     state: Gaussian,
     steps: Steps,
-    rotations: NDArray[np.float64] | None = None,
+    rotations: Floats | None = None,
     *,
     rotated: bool,
 ) -> tuple[Gaussian, Gaussian]:
@@ -219,7 +220,7 @@ def _kalman_run(
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:
     """Fill the covariance (t, t) of small rotations, from the second moment about the identity.
 
-    See `replay.engine.tangent.vector_part_covariance`.
+    The vector part of a unit complex number is the angle, that of a quaternion half the rotation.
     """
     t = len(covariance)
     for i in range(t):

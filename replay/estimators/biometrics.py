@@ -11,7 +11,6 @@ from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
@@ -24,14 +23,13 @@ from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.estimators.mixture_hmm import Fit, fit, log_likelihood
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Scorer = Callable[[Floats], Floats]
-Learner = Callable[[Floats, NDArray[np.bool_], np.random.Generator], Scorer]
+Learner = Callable[[Floats, Booleans, np.random.Generator], Scorer]
 
 NEEDS = f"a stream {TOPIC} of at least two matchers' score vectors"
 TANH_SCALE = 0.01
@@ -47,9 +45,9 @@ class Pairs(NamedTuple):
     Without folds (None) nothing is learnt.
     """
 
-    probe: Indices
-    gallery: Indices
-    fold: Indices | None = None
+    probe: Integers
+    gallery: Integers
+    fold: Integers | None = None
 
 
 class Subsets(Parameters):
@@ -182,7 +180,7 @@ def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
     )
 
 
-def user_folds(users: int, folds: int, rng: np.random.Generator) -> Indices:
+def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
     """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
     if users < 2 * folds:
         fewer = f", or at most {users // 2} folds" if users >= 4 else ""
@@ -212,7 +210,7 @@ def cross_validate(
 def learn_classifier(
     parameters: ClassifierParameters,
     vectors: Floats,
-    genuine: NDArray[np.bool_],
+    genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
     """A classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
@@ -264,7 +262,7 @@ def learn_mixture(
     components: tuple[int, int],
     sequence: tuple[int, int],
     vectors: Floats,
-    genuine: NDArray[np.bool_],
+    genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
     """The log-likelihood ratio of two HMMs, eq. 5 with eta 0.

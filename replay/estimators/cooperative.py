@@ -8,7 +8,7 @@ could.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Annotated, Literal, NamedTuple
 
@@ -18,34 +18,25 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Topic
-from recorders.models.planar import drive, range_bearing
+from recorders.log import Topic, schemas
+from recorders.models.planar import drive
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Block, Ragged
+from replay.engine.channels import given_or_stated, numbered
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import Failure
-from replay.engine.priors import no_priors, read_priors
-from replay.engine.results import ALL_WELL, failures_by_run, failures_of, state_stream
+from replay.engine.priors import Priors, no_priors, priors_of
+from replay.engine.results import ALL_WELL, failures_by_run, failures_of, states_in
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
-from replay.estimators.landmarks import LANDMARKS, POSE, LocalizationParameters
-from replay.inference.binding import stated
-from replay.inference.gaussian import (
-    Floats,
-    Function,
-    Innovation,
-    add_through,
-    kalman_step,
-    keep_measured,
-    reduce_covariance,
-    whiten,
-    wrap,
-)
+from replay.estimators.landmarks import LANDMARKS, POSE, sight
+from replay.inference.gaussian import add_through, copy_gaussian, wrap
 from replay.inference.generate import Input, derivative
 from replay.inference.happenings import Points, points_of
+from replay.inference.small_matrices import UpdateMemory, update, update_memory
 from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
 
-Integers = NDArray[np.int64]
 Mode = Literal["alone", "naive", "ci", "joint"]
 
 
@@ -89,7 +80,7 @@ class State(NamedTuple):
     carried: Carried
     landmarks: Points
     reasons: NDArray[np.str_]
-    told: NDArray[np.bool_]
+    told: Booleans
 
 
 class Settings(NamedTuple):
@@ -97,7 +88,7 @@ class Settings(NamedTuple):
 
     density: Floats
     variance: Floats
-    anchor: NDArray[np.bool_]
+    anchor: Booleans
     gate: Floats
 
 
@@ -106,49 +97,50 @@ class Events(NamedTuple):
 
     `robots` (m, 2) are the one that speaks and the one that it sees, -1 where it sees none. Odometry has
     the value (forward, turn) and `is_sighting` false; a sighting has (range, bearing), of a robot or of
-    the map's row `place`. `emit` is the row of the output that an event fills, -1 for none.
+    a landmark's `place` (m, 2). `is_due` says that the speaker's estimate is wanted.
     """
 
     offsets: Integers
     time_ns: Integers
     robots: Integers
-    is_sighting: NDArray[np.bool_]
-    place: Integers
+    is_sighting: Booleans
+    place: Floats
     value: Floats
-    emit: Integers
+    is_due: Booleans
 
 
 class Results(NamedTuple):
-    """Poses (m, 3) and covariances (m, 3, 3), NaN after a failure."""
+    """The speaker's pose (m, 3) and covariance (m, 3, 3) after every event; NaN where none is said."""
 
     mean: Floats
     covariance: Floats
 
 
-class Sighting(NamedTuple):
-    """What is worked out of a sighting; first axis = the robot that sees, the one that is seen.
+class Work(NamedTuple):
+    """Memory of one run.
 
-    The innovation (2,), its rows (2, 2, 3) by both poses and its spreads (2, 2, 2) by both covariances.
+    Attributes:
+        state, transition, gain, variances: of a drive (3,), (3, 3), (3, 2), (2,).
+        predicted, rows: of a sighting (2,), and by the pose that sees (2, 3).
+        both: the same by the pose that sees and the one that is seen, (2, 2, 3).
+        spread, square: H P H' and H P P H' of both, (2, 2, 2).
+        whole: rows by the state of all robots, (2, 3 n).
+        product: (3, 3 n).
+        update: see `replay.inference.small_matrices`.
     """
-
-    innovation: Floats
-    rows: Floats
-    spread: Floats
-
-
-class Linear(NamedTuple):
-    """A robot's drive, linearised: the end (3,), by the pose (3, 3) and by the velocity (3, 2)."""
 
     state: Floats
     transition: Floats
     gain: Floats
-
-
-class Seen(NamedTuple):
-    """Range and bearing of a place (2,), and by the pose (2, 3)."""
-
+    variances: Floats
     predicted: Floats
     rows: Floats
+    both: Floats
+    spread: Floats
+    square: Floats
+    whole: Floats
+    product: Floats
+    update: UpdateMemory
 
 
 KINDS = tuple(POSE.values())
@@ -160,11 +152,11 @@ linear_drive = derivative(
     "state",
 )
 linear_sight = derivative(
-    range_bearing, [Input("pose", KINDS, "rows")], ("linear", "angle"), ("place",), "predicted"
+    sight, [Input("pose", KINDS, "rows")], ("linear", "angle"), ("place",), "predicted"
 )
 
 
-def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Floats) -> None:
+def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Floats, work: Work) -> None:
     """Move one robot to a time by its odometry, with its correlations."""
     duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
     if duration_s <= 0.0:
@@ -173,29 +165,22 @@ def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Float
     mean, covariance, first = carried.mean[run], carried.covariance[run], 3 * robot
     velocity = carried.velocity[run, robot]
     pose = (mean[first], mean[first + 1], mean[first + 2])
-    work = Linear(np.empty(3), np.empty((3, 3)), np.empty((3, 2)))
-    transition, variances = work.transition, np.empty(2)
     linear_drive(pose, (velocity[0], velocity[1]), duration_s, work)
     for k in range(3):
         mean[first + k] = work.state[k]
     for k in range(2):
-        variances[k] = density[k] * density[k] / duration_s
-    moved = np.empty(3)
-    for other in range(len(mean)):  # F P, and beside it P F'
-        if first <= other < first + 3:
-            continue
-        for row in range(3):
-            moved[row] = 0.0
-            for k in range(3):
-                moved[row] += transition[row, k] * covariance[first + k, other]
-        for row in range(3):
-            covariance[first + row, other] = covariance[other, first + row] = moved[row]
-    own = np.empty((3, 3))
-    fill_spread(covariance, first, transition, own)
-    add_through(own, work.gain, variances)
+        work.variances[k] = density[k] * density[k] / duration_s
     for row in range(3):
-        for column in range(3):
-            covariance[first + row, first + column] = own[row, column]
+        for column in range(len(mean)):
+            work.product[row, column] = 0.0
+            for k in range(3):
+                work.product[row, column] += work.transition[row, k] * covariance[first + k, column]
+    own = work.product[:, first : first + 3]
+    fill_spread(covariance, first, work.transition, own)
+    add_through(own, work.gain, work.variances)
+    for row in range(3):
+        for column in range(len(mean)):
+            covariance[first + row, column] = covariance[column, first + row] = work.product[row, column]
 
 
 def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
@@ -209,20 +194,34 @@ def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) ->
             spread[row, column] = spread[column, row] = entry
 
 
-def fill_square(covariance: Floats, first: int, rows: Floats, square: Floats) -> float:
-    """Fill rows P P rows' with the block P (3, 3) of one robot; returns its trace."""
-    cross, trace = np.empty((3, 2)), 0.0
+def look(
+    mean: Floats, robot: int, place: tuple[float, float], value: Floats, difference: Floats, work: Work
+) -> None:
+    """Fill the innovation of a robot's sighting of a place, and its rows by both robots."""
+    first = 3 * robot
+    linear_sight((mean[first], mean[first + 1], mean[first + 2]), place, work)
+    for row in range(2):
+        difference[row] = wrap(value[row] - work.predicted[row], row == 1)
+        for k in range(3):
+            work.both[0, row, k] = work.rows[row, k]
+            work.both[1, row, k] = -work.rows[row, k] if k < 2 else 0.0
+
+
+def see_through(covariance: Floats, first: int, side: int, work: Work) -> float:
+    """Fill what a sighting says of one robot's block of the covariance; returns the block's trace."""
+    rows, trace = work.both[side], 0.0
+    fill_spread(covariance, first, rows, work.spread[side])
     for k in range(3):
         trace += covariance[first + k, first + k]
         for row in range(2):
-            cross[k, row] = 0.0
+            work.rows[row, k] = 0.0
             for m in range(3):
-                cross[k, row] += covariance[first + k, first + m] * rows[row, m]
+                work.rows[row, k] += covariance[first + k, first + m] * rows[row, m]
     for row in range(2):
         for column in range(2):
-            square[row, column] = 0.0
+            work.square[side, row, column] = 0.0
             for k in range(3):
-                square[row, column] += cross[k, row] * cross[k, column]
+                work.square[side, row, column] += work.rows[row, k] * work.rows[column, k]
     return trace
 
 
@@ -233,58 +232,6 @@ def scale(covariance: Floats, first: int, factor: float) -> None:
             covariance[first + row, first + column] *= factor
 
 
-def look(
-    mean: Floats, robot: int, place: tuple[float, float], value: Floats, sighting: Sighting
-) -> None:
-    """Fill the innovation of a robot's sighting of a place, and its rows."""
-    first = 3 * robot
-    pose = (mean[first], mean[first + 1], mean[first + 2])
-    work = Seen(np.empty(2), sighting.rows[0])
-    linear_sight(pose, place, work)
-    sighting.innovation[0] = value[0] - work.predicted[0]
-    sighting.innovation[1] = wrap(value[1] - work.predicted[1], True)
-    for row in range(2):
-        for k in range(2):
-            sighting.rows[1, row, k] = -sighting.rows[0, row, k]
-        sighting.rows[1, row, 2] = 0.0
-
-
-def update(
-    mean: Floats,
-    covariance: Floats,
-    first: Integers,
-    sides: tuple[int, int],
-    sighting: Sighting,
-    noise: Floats,
-    gate: Floats,
-) -> tuple[float, bool]:
-    """The extended Kalman filter's update of the robots on these sides: NIS, and whether it was made."""
-    cross, spread, difference = np.zeros((len(mean), 2)), np.empty((2, 2)), np.empty(2)
-    for row in range(2):
-        difference[row] = sighting.innovation[row]
-        for side in range(sides[0], sides[1]):
-            for other in range(len(mean)):
-                for k in range(3):
-                    cross[other, row] += covariance[other, first[side] + k] * sighting.rows[side, row, k]
-    for row in range(2):
-        for column in range(2):
-            entry = noise[row, column]
-            for side in range(sides[0], sides[1]):
-                for k in range(3):
-                    entry += sighting.rows[side, row, k] * cross[first[side] + k, column]
-            spread[row, column] = entry
-    innovation, step = Innovation(difference, spread, cross), np.empty(len(mean))
-    size = keep_measured(innovation)
-    squared, _ = whiten(innovation, size)
-    if not squared <= gate[size]:
-        return squared, False
-    kalman_step(innovation, size, step)
-    reduce_covariance(covariance, cross, size)
-    for row in range(len(mean)):
-        mean[row] += step[row]
-    return squared, True
-
-
 def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
     """The loop over the events of one run."""
 
@@ -292,41 +239,45 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
         mean: Floats,
         covariance: Floats,
         robots: Integers,
-        sighting: Sighting,
+        difference: Floats,
         variance: Floats,
-        gate: Floats,
+        gate: float,
+        work: Work,
     ) -> bool:
         """Use a sighting; False where a covariance is not positive definite."""
-        own, noise, square = np.zeros((2, 2)), np.empty((2, 2)), np.empty((2, 2))
+        own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
+        first, both = 3 * robots, robots[1] >= 0
         for row in range(2):
             own[row, row] = variance[row]
-        first, both = 3 * robots, robots[1] >= 0
         for side in range(1 + both):
-            fill_spread(covariance, first[side], sighting.rows[side], sighting.spread[side])
+            traces[side] = see_through(covariance, first[side], side, work)
         for side in range(1 + (both and not joint)):
             weight, share = 1.0, 0.0
             if both and not joint:
                 share = 1.0
                 if intersect:
-                    trace = fill_square(covariance, first[side], sighting.rows[side], square)
-                    stake = Stake(3, trace, sighting.spread[side], square)
-                    weight = sighting_weight(by_trace, stake, sighting.spread[1 - side], own)
+                    stake = Stake(3, traces[side], work.spread[side], work.square[side])
+                    weight = sighting_weight(by_trace, stake, work.spread[1 - side], own)
                     share = 1.0 / (1.0 - weight)
-            blend(1.0, own, share, sighting.spread[1 - side], noise)
+            blend(1.0, own, share, work.spread[1 - side], noise)
             scale(covariance, first[side], 1.0 / weight)
-            sides = (side, side + 1 + (both and joint))
-            squared, used = update(mean, covariance, first, sides, sighting, noise, gate)
+            work.whole[:] = 0.0
+            for other in range(side, side + 1 + (both and joint)):
+                for row in range(2):
+                    for k in range(3):
+                        work.whole[row, first[other] + k] = work.both[other, row, k]
+            squared = update(mean, covariance, difference, work.whole, noise, work.update, gate)
             if np.isnan(squared):
                 return False
-            if not used:
+            if not squared <= gate:
                 scale(covariance, first[side], weight)
         return True
 
     def cooperate(
-        run: int, events: Events, places: Floats, settings: Settings, carried: Carried, results: Results
+        run: int, events: Events, settings: Settings, carried: Carried, results: Results
     ) -> None:
         mean, covariance = carried.mean[run], carried.covariance[run]
-        sighting = Sighting(np.empty(2), np.empty((2, 2, 3)), np.zeros((2, 2, 2)))
+        work, difference = memory(len(mean)), np.empty(2)
         for event in range(events.offsets[run], events.offsets[run + 1]):
             robots, now = events.robots[event], events.time_ns[event]
             robot, seen = robots[0], robots[1]
@@ -335,15 +286,17 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
             for side in range(2):
                 if robots[side] >= 0:
                     density = settings.density[robots[side]]
-                    advance(carried, run, robots[side], now, density)
+                    advance(carried, run, robots[side], now, density, work)
             if events.is_sighting[event]:
+                place = (events.place[event, 0], events.place[event, 1])
                 if seen >= 0:
                     place = (mean[3 * seen], mean[3 * seen + 1])
-                else:
-                    place = (places[events.place[event], 0], places[events.place[event], 1])
-                look(mean, robot, place, events.value[event], sighting)
-                variance = settings.variance[robot]
-                if not meet(mean, covariance, robots, sighting, variance, settings.gate):
+                look(mean, robot, place, events.value[event], difference, work)
+                measured, variance = 0, settings.variance[robot]
+                for k in range(2):
+                    measured += not np.isnan(difference[k])
+                gate = settings.gate[measured]
+                if measured > 0 and not meet(mean, covariance, robots, difference, variance, gate, work):
                     carried.failure[run] = NOT_POSITIVE_DEFINITE
                     continue
             else:
@@ -351,15 +304,30 @@ def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
                     carried.velocity[run, robot, k] = events.value[event, k]
             if not np.isfinite(mean.sum()):
                 carried.failure[run] = NOT_FINITE
-            elif events.emit[event] >= 0:
-                for row in range(3):
-                    results.mean[events.emit[event], row] = mean[3 * robot + row]
-                    for column in range(3):
-                        results.covariance[events.emit[event], row, column] = covariance[
-                            3 * robot + row, 3 * robot + column
-                        ]
+            elif events.is_due[event]:
+                own = slice(3 * robot, 3 * robot + 3)
+                found = results.mean[event], results.covariance[event]
+                copy_gaussian(mean[own], covariance[own, own], found[0], found[1])
 
     return cooperate
+
+
+def memory(states: int) -> Work:
+    """Memory for one run of so many states."""
+    return Work(
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty((3, 2)),
+        np.empty(2),
+        np.empty(2),
+        np.empty((2, 3)),
+        np.empty((2, 2, 3)),
+        np.zeros((2, 2, 2)),
+        np.empty((2, 2, 2)),
+        np.empty((2, states)),
+        np.empty((3, states)),
+        update_memory(states, 2),
+    )
 
 
 @lru_cache(maxsize=8)
@@ -373,30 +341,29 @@ def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
     that is so for all, or the map is not planar.
     """
-    priors, errors = [], []
-    for prefix in prefixes:
-        prior = whole[f"{prefix}/prior"]
-        try:
-            priors.append(read_priors(prior, POSE))
-        except BadInput as error:
-            errors.append(error)
-            priors.append(no_priors(prior.runs, POSE, str(error)))
-    if len(errors) == len(prefixes):
-        raise errors[0]
-    runs, size = len(priors[0].mean), 3 * len(prefixes)
+    priors = [_prior(whole[f"{prefix}/prior"]) for prefix in prefixes]
+    reasons = np.stack([each.reasons for each in priors], axis=1)
+    if (reasons != "").all():
+        raise BadInput(f"{reasons[0, 0]}; the filter cannot start")
+    runs, size = len(reasons), 3 * len(prefixes)
     covariance = np.zeros((runs, size, size))
     for index, each in enumerate(priors):
         covariance[:, 3 * index : 3 * index + 3, 3 * index : 3 * index + 3] = each.covariance
-    mean = np.concatenate([each.mean for each in priors], axis=1)
     carried = Carried(
-        np.nan_to_num(mean),
+        np.nan_to_num(np.concatenate([each.mean for each in priors], axis=1)),
         np.nan_to_num(covariance),
         np.zeros((runs, len(prefixes), 2)),
         np.stack([each.time_ns for each in priors], axis=1),
         np.full(runs, ALL_WELL),
     )
-    reasons = np.stack([each.reasons for each in priors], axis=1)
     return State(carried, points_of(whole["/landmarks"], LANDMARKS), reasons, reasons == "")
+
+
+def _prior(prior: Ragged) -> Priors:
+    try:
+        return priors_of(prior, POSE)
+    except BadInput as error:
+        return no_priors(prior.runs, POSE, str(error))
 
 
 def run(
@@ -410,68 +377,45 @@ def run(
     settings: Settings,
 ) -> tuple[State, list[Ragged]]:
     """Filter a block; see `replay.engine.estimator.Recursive`."""
-    before, landmarks, reasons, told = state
-    carried = copy.deepcopy(before)
-    is_able = reasons == ""
-    events = _events(block, landmarks, prefixes, mode, settings, carried.time_ns, is_able)
-    count = int(events.emit.max(initial=-1)) + 1
+    carried = copy.deepcopy(state.carried)
+    events = _events(block, state, prefixes, mode, settings)
+    count, topic = len(events.time_ns), f"/estimates/{name}"
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
-    loop = _compiled(mode, criterion)
-    loop(len(carried.mean), events, landmarks.places, settings, carried, results)
-    poses = [_poses(name, prefixes, robot, events, results) for robot in range(len(prefixes))]
-    failed_ns = carried.time_ns.max(axis=1)
-    failures = failures_of(f"/estimates/{name}", before.failure, carried.failure, failed_ns, FAILURES)
-    told, excluded = _excluded(name, prefixes, block, reasons, told)
-    return State(carried, landmarks, reasons, told), [*poses, failures, *excluded]
-
-
-def _excluded(
-    name: str,
-    prefixes: tuple[str, ...],
-    block: Block,
-    reasons: NDArray[np.str_],
-    told: NDArray[np.bool_],
-) -> tuple[NDArray[np.bool_], list[Ragged]]:
-    """Who takes no part (runs, robots) was told of, each at its first odometry; and these failures."""
-    told, outputs = told.copy(), []
-    for robot, prefix in enumerate(prefixes):
+    _compiled(mode, criterion)(len(carried.mean), events, settings, carried, results)
+    said = np.isfinite(results.mean[:, 0])
+    made = [
+        states_in(
+            np.flatnonzero(said & (events.robots[:, 0] == robot)),
+            f"{topic}{prefix}/pose",
+            events.time_ns,
+            events.offsets,
+            POSE,
+            f"{prefix}/truth",
+            *results,
+        )
+        for robot, prefix in enumerate(prefixes)
+    ]
+    before, failed_ns = state.carried.failure, carried.time_ns.max(axis=1)
+    made.append(failures_of(topic, before, carried.failure, failed_ns, FAILURES))
+    told = state.told.copy()
+    for robot, prefix in enumerate(prefixes):  # who takes no part, each told at its first odometry
         odometry = block.streams[f"{prefix}/odometry"]
         new = np.flatnonzero(~told[:, robot] & (np.diff(odometry.offsets) > 0))
         told[new, robot] = True
         times_ns = odometry.stream.publish_time_ns[odometry.offsets[new]]
         failures = {
-            run: Failure(time_ns, str(reasons[run, robot]))
+            run: Failure(time_ns, str(state.reasons[run, robot]))
             for run, time_ns in zip(new.tolist(), times_ns.tolist(), strict=True)
         }
-        outputs.append(failures_by_run(f"/estimates/{name}{prefix}", failures, len(told)))
-    return told, outputs
-
-
-def _poses(name: str, prefixes: tuple[str, ...], robot: int, events: Events, results: Results) -> Ragged:
-    """The estimates of one robot, up to a failure of its run."""
-    rows = np.flatnonzero((events.emit >= 0) & (events.robots[:, 0] == robot))
-    rows = rows[np.isfinite(results.mean[events.emit[rows], 0])]
-    mean, covariance = (part[events.emit[rows]] for part in results)
-    prefix = prefixes[robot]
-    topic = f"/estimates/{name}{prefix}/pose"
-    stream = state_stream(topic, events.time_ns[rows], POSE, f"{prefix}/truth", mean, covariance)
-    return Ragged(stream, np.searchsorted(rows, events.offsets))
+        made.append(failures_by_run(f"{topic}{prefix}", failures, len(told)))
+    return state._replace(carried=carried, told=told), made
 
 
 def _events(
-    block: Block,
-    landmarks: Points,
-    prefixes: tuple[str, ...],
-    mode: Mode,
-    settings: Settings,
-    start_ns: Integers,
-    is_able: NDArray[np.bool_],
+    block: Block, state: State, prefixes: Sequence[str], mode: Mode, settings: Settings
 ) -> Events:
-    """The block's events as columns; a robot's estimate is due at its odometry.
-
-    `is_able` (runs, robots) says who takes part.
-    """
-    order = block.events
+    """The block's events as columns; a robot's estimate is due at its odometry."""
+    order, is_able = block.events, state.reasons == ""
     value = np.stack(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
     )
@@ -483,18 +427,18 @@ def _events(
     acts = is_able[run_of, robot]
     is_fellow = (sees == 1) & (numbers[fellow] == target_id) & (fellow != robot) & acts
     is_fellow &= is_able[run_of, fellow]
-    place = landmarks.rows(run_of, target_id)
-    is_mapped = (sees == 1) & (place >= 0) & settings.anchor[robot] & acts
-    due = (sees == 0) & (order.time_ns >= start_ns[run_of, robot]) & acts
+    mapped = state.landmarks.rows(run_of, target_id)
+    is_mapped = (sees == 1) & (mapped >= 0) & settings.anchor[robot] & acts
+    due = (sees == 0) & (order.time_ns >= state.carried.time_ns[run_of, robot]) & acts
     kept = np.flatnonzero(((sees == 0) & acts) | is_mapped | (is_fellow & (mode != "alone")))
     return Events(
         np.searchsorted(kept, order.offsets),
         order.time_ns[kept],
         np.stack([robot, np.where(is_fellow, fellow, -1)], axis=1)[kept],
         sees[kept] == 1,
-        place[kept],
+        state.landmarks.at(mapped[kept]),
         value[kept],
-        np.where(due, np.cumsum(due) - 1, -1)[kept],
+        due[kept],
     )
 
 
@@ -504,14 +448,13 @@ def _number(prefix: str) -> int:
 
 def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
     """The prefixes of the robots that have what is needed, by number."""
-    found = (topic.removesuffix("/odometry") for topic in topics if topic.endswith("/odometry"))
-    able = [
-        prefix
-        for prefix in found
-        if prefix.removeprefix("/robot").isdigit()
-        and {f"{prefix}/range_bearing", f"{prefix}/prior"} <= topics.keys()
-    ]
-    return tuple(sorted(able, key=_number))
+    leaves = {
+        "odometry": schemas.ODOMETRY,
+        "range_bearing": schemas.RANGE_BEARING,
+        "prior": schemas.GAUSSIAN_ESTIMATE,
+    }
+    found = [numbered(topics, "robot", leaf, schema) for leaf, schema in leaves.items()]
+    return tuple(f"/robot{number}" for number in found[0] if all(number in each for each in found))
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters) -> list[Bound]:
@@ -526,21 +469,17 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
                 f"estimator {name}: anchor {anchor} is none of the robots "
                 f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
             )
-    density, variance = np.empty((len(prefixes), 2)), np.empty((len(prefixes), 2))
 
-    def number(topic: str, key: str) -> float:
-        """A parameter as given, else as its channel states it."""
-        given = getattr(parameters, key)
-        return stated(LocalizationParameters, [topics[topic]], key) if given is None else given
+    def stated(leaf: str, *names: str) -> Floats:
+        found = [
+            [given_or_stated(parameters, [topics[f"{prefix}/{leaf}"]], each) for each in names]
+            for prefix in prefixes
+        ]
+        return np.array(found)
 
-    for row, prefix in enumerate(prefixes):
-        for column, key in enumerate(("forward_noise_density", "turn_noise_density")):
-            density[row, column] = number(f"{prefix}/odometry", key)
-        for column, key in enumerate(("sigma_range_m", "sigma_bearing_rad")):
-            variance[row, column] = number(f"{prefix}/range_bearing", key) ** 2
     settings = Settings(
-        density,
-        variance,
+        stated("odometry", "forward_noise_density", "turn_noise_density"),
+        stated("range_bearing", "sigma_range_m", "sigma_bearing_rad") ** 2,
         np.isin(numbers, parameters.anchors),
         np.array([np.inf, *chi2.ppf(parameters.gate_probability, [1, 2])]),
     )

@@ -3,10 +3,8 @@
 Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
 Reinhardt, Hanebeck, Inverse Covariance Intersection (2017); Li, Nashashibi, Split CI (2013). A rule
-fuses K estimates of one state: scalar loops, so that networks compile it, called `fuse(count, means,
-covariances, independents, weights, mean, covariance) -> gap`, the last three filled, infinity where a
-covariance is singular. `independents` are the parts of the covariances that are known to be independent
-of all others; only split CI looks at them.
+fuses K estimates of one state: scalar loops, so that networks compile it, called `fuse(count, parts,
+weights, mean, covariance) -> gap`, the last three filled, infinity where a covariance is singular.
 """
 
 from collections.abc import Callable
@@ -17,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Floats, Function
 from replay.engine.compile import compile_over_runs
-from replay.inference.gaussian import Floats, Function, cholesky
+from replay.inference.gaussian import cholesky, copy_gaussian
 
 Criterion = Literal["trace", "determinant"]
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
@@ -43,7 +42,10 @@ class Fused(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others."""
+    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
+
+    Only split CI looks at the parts.
+    """
 
     mean: Floats
     covariance: Floats
@@ -159,18 +161,10 @@ def optimised(fill_slope: Function, power: float, tolerance: float, iterations: 
     At the least criterion no gain g_i = tr(I_i slope) exceeds 1, and those of weights above 0 are 1.
     """
 
-    def weigh(
-        count: int,
-        covariances: Floats,
-        information: Floats,
-        means: Floats,
-        weights: Floats,
-        mean: Floats,
-        covariance: Floats,
-    ) -> float:
+    def weigh(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
         gap = np.inf
-        size = len(mean)
-        slope, better = np.empty((size, size)), np.empty(count)
+        size = covariances.shape[1]
+        covariance, slope, better = np.empty((size, size)), np.empty((size, size)), np.empty(count)
         for i in range(count):
             weights[i] = 1.0 / count
         for _ in range(iterations):
@@ -190,31 +184,23 @@ def optimised(fill_slope: Function, power: float, tolerance: float, iterations: 
                 break
             for i in range(count):
                 weights[i] = better[i] / total
-        return gap if combined(count, weights, information, means, mean, covariance) else np.inf
+        return gap
 
     return weigh
 
 
-def weigh_by_trace_inverse(
-    count: int,
-    covariances: Floats,
-    information: Floats,
-    means: Floats,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-) -> float:
+def weigh_by_traces(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
     """Niehsen: weights in proportion to 1 / tr P_i."""
     total = 0.0
     for i in range(count):
         trace = 0.0
-        for row in range(len(mean)):
+        for row in range(covariances.shape[1]):
             trace += covariances[i, row, row]
         weights[i] = 1.0 / trace
         total += weights[i]
     for i in range(count):
         weights[i] /= total
-    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+    return 0.0
 
 
 def determinant(matrix: Floats) -> float:
@@ -229,17 +215,9 @@ def determinant(matrix: Floats) -> float:
     return product
 
 
-def weigh_by_shares(
-    count: int,
-    covariances: Floats,
-    information: Floats,
-    means: Floats,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-) -> float:
+def weigh_by_shares(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
     """Franken and Huepper: weights by what is lost from |sum of I| without I_i, plus |I_i|."""
-    size = len(mean)
+    size = covariances.shape[1]
     whole = np.zeros((size, size))
     rest = np.empty((size, size))
     for i in range(count):
@@ -252,52 +230,43 @@ def weigh_by_shares(
         total += weights[i]
     for i in range(count):
         weights[i] /= total
-    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+    return 0.0
 
 
-def weigh_fully(
-    count: int,
-    covariances: Floats,
-    information: Floats,
-    means: Floats,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-) -> float:
+def weigh_fully(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
     """Naive Kalman fusion, as if all errors were independent: every weight is 1."""
     for i in range(count):
         weights[i] = 1.0
-    return 0.0 if combined(count, weights, information, means, mean, covariance) else np.inf
+    return 0.0
 
 
 def weighted(weigh: Function) -> Function:
     """The rule that adds up weighted informations."""
 
-    def fuse(
-        count: int,
-        means: Floats,
-        covariances: Floats,
-        independents: Floats,
-        weights: Floats,
-        mean: Floats,
-        covariance: Floats,
-    ) -> float:
-        information = np.empty_like(covariances)
+    def fuse(count: int, parts: Estimate, weights: Floats, mean: Floats, covariance: Floats) -> float:
+        information = np.empty_like(parts.covariance)
         for i in range(count):
-            if not inverted(covariances[i], information[i]):
+            if not inverted(parts.covariance[i], information[i]):
                 return np.inf
-        return weigh(count, covariances, information, means, weights, mean, covariance)
+        gap = weigh(count, parts.covariance, information, weights)
+        if not gap < np.inf or not combined(count, weights, information, parts.mean, mean, covariance):
+            return np.inf
+        return gap
 
     return fuse
 
 
-def put(mean: Floats, covariance: Floats, independent: Floats, place: Estimate) -> None:
-    """Fill an estimate; loops, since slices are very slow to compile."""
-    for row in range(len(mean)):
-        place.mean[row] = mean[row]
-        for column in range(len(mean)):
-            place.covariance[row, column] = covariance[row, column]
-            place.independent[row, column] = independent[row, column]
+def put(given: Estimate, place: Estimate) -> None:
+    """Copy an estimate; loops, since slices are very slow to compile."""
+    copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
+    for row in range(len(given.mean)):
+        for column in range(len(given.mean)):
+            place.independent[row, column] = given.independent[row, column]
+
+
+def one_of(estimates: Estimate, i: int) -> Estimate:
+    """One of several estimates; changing it changes them."""
+    return Estimate(estimates.mean[i], estimates.covariance[i], estimates.independent[i])
 
 
 def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
@@ -398,25 +367,15 @@ def pairwise(mix: Function, steps: int) -> Function:
             trace += fused.covariance[row, row]
         return trace
 
-    def fuse(
-        count: int,
-        means: Floats,
-        covariances: Floats,
-        independents: Floats,
-        weights: Floats,
-        mean: Floats,
-        covariance: Floats,
-    ) -> float:
+    def fuse(count: int, parts: Estimate, weights: Floats, mean: Floats, covariance: Floats) -> float:
         size = len(mean)
         pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
-        first = Estimate(pair.mean[0], pair.covariance[0], pair.independent[0])
-        second = Estimate(pair.mean[1], pair.covariance[1], pair.independent[1])
         fused = Estimate(mean, covariance, np.empty((size, size)))
         weights[0] = 1.0
-        put(means[0], covariances[0], independents[0], fused)
+        put(one_of(parts, 0), fused)
         for i in range(1, count):
-            put(mean, covariance, fused.independent, first)
-            put(means[i], covariances[i], independents[i], second)
+            put(fused, one_of(pair, 0))
+            put(one_of(parts, i), one_of(pair, 1))
             section = np.empty(7)
             trace = np.inf
             for step in range(steps):
@@ -434,7 +393,7 @@ RULES: dict[str, Callable[[float], Function]] = {
     "ci-determinant": lambda tolerance: weighted(
         optimised(determinant_slope, 1.0, tolerance, ITERATIONS)
     ),
-    "niehsen": lambda _: weighted(weigh_by_trace_inverse),
+    "niehsen": lambda _: weighted(weigh_by_traces),
     "franken": lambda _: weighted(weigh_by_shares),
     "naive": lambda _: weighted(weigh_fully),
     "inverse-ci": lambda tolerance: pairwise(mix_inverse, steps_for(tolerance)),
@@ -461,15 +420,9 @@ def _over_runs(name: str, tolerance: float) -> Function:
     def fuse_run(
         run: int, means: Floats, covariances: Floats, independents: Floats, fused: Fused
     ) -> None:
-        fused.gap[run] = fuse_one(
-            means.shape[1],
-            means[run],
-            covariances[run],
-            independents[run],
-            fused.weights[run],
-            fused.mean[run],
-            fused.covariance[run],
-        )
+        parts = Estimate(means[run], covariances[run], independents[run])
+        count, weights = means.shape[1], fused.weights[run]
+        fused.gap[run] = fuse_one(count, parts, weights, fused.mean[run], fused.covariance[run])
 
     return compile_over_runs(fuse_run)
 
@@ -550,7 +503,12 @@ class Stake(NamedTuple):
 
 
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """The weight w of `fuse_sighting`; NaN where a covariance is singular.
+    """The weight w of the update by a measurement of part of a state that rests on another estimate.
+
+    Its noise has a part `shared` that is correlated with the state in an unknown way, and one that is
+    not, `own`, the sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace,
+    which depends on the state's units, or the least determinant, which does not. It is above 0: at 0
+    whatever the measurement does not see would be lost. NaN where a covariance is singular.
 
     With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
     tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
@@ -573,33 +531,3 @@ def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -
         else:
             value = np.log(determinant(noise) / determinant(total)) - stake.states * np.log(weight)
     return weight if np.isfinite(value) else np.nan
-
-
-def fuse_sighting(
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    rows: ArrayLike,
-    innovation: ArrayLike,
-    shared: ArrayLike,
-    own: ArrayLike,
-    criterion: Criterion = "trace",
-) -> tuple[Floats, Floats, float]:
-    """The update by a measurement of part of a state that rests on another node's estimate.
-
-    The innovation (m,), with rows (m, n), has a part with covariance `shared` that is correlated with
-    the state in an unknown way, and one that is not, `own`, the sensor's: P / w against
-    shared / (1 - w) + own, at the w of the least trace, which depends on the state's units, or the least
-    determinant, which does not. It is above 0: at 0 whatever the measurement does not see would be lost.
-
-    Returns mean (n,), covariance (n, n) and w. Raises BadInput where a covariance is singular.
-    """
-    x, p, h, v, r, q = (
-        np.asarray(part, float) for part in (mean, covariance, rows, innovation, shared, own)
-    )
-    spread = h @ p @ h.T
-    stake = Stake(len(x), float(np.trace(p)), spread, h @ p @ p @ h.T)
-    weight = sighting_weight(criterion == "trace", stake, r, q) if determinant(p) > 0 else np.nan
-    if not np.isfinite(weight):
-        raise BadInput("a covariance of the sighting is singular; it needs the sensor's own noise")
-    gain = np.linalg.solve(spread / weight + r / (1 - weight) + q, h @ p / weight).T
-    return x + gain @ v, p / weight - gain @ h @ p / weight, weight

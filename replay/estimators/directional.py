@@ -9,7 +9,6 @@ from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationError
 
 from recorders.errors import BadInput
@@ -20,6 +19,7 @@ from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Nois
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
+from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.estimator import Estimator
 from replay.engine.measurements import Vectors
@@ -40,7 +40,6 @@ from replay.estimators.torus import (
     run_unscented_filter,
 )
 
-Floats = NDArray[np.float64]
 # The states of all runs and their measurements -> the states after them; fills the results.
 Advance = Callable[[Any, Messages, Results], Any]
 
@@ -216,7 +215,7 @@ def _of_unit_vectors(
 
 
 def _of_headings(
-    summary: str, parameters: type[Any], filter_of: Callable[[Any], Callable[..., Any]]
+    summary: str, parameters: type[Any], filter_of: Callable[[Any], Function]
 ) -> Estimator[Any]:
     components: Components = {"heading1_rad": "angle", "heading2_rad": "angle"}
     return recursive(
@@ -232,11 +231,11 @@ def _of_headings(
     )
 
 
-def _toroidal(parameters: TorusParameters) -> Callable[..., Any]:
+def _toroidal(parameters: TorusParameters) -> Function:
     return partial(run_toroidal_filter, central_weight=parameters.central_weight)
 
 
-def _unscented(parameters: UnscentedTorusParameters) -> Callable[..., Any]:
+def _unscented(parameters: UnscentedTorusParameters) -> Function:
     return partial(run_unscented_filter, wrapped=parameters.wrapped)
 
 

@@ -13,8 +13,8 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from recorders.log import Stream, schemas
 from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_point
 from recorders.models.planar import Components
+from replay.engine.arrays import Floats
 from replay.engine.measurements import PLANE, read_vectors
-from replay.inference.gaussian import Floats
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 
 STATES = 4

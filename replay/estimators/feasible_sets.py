@@ -8,13 +8,12 @@ complements, half-planes. With |b|^2 - 4 a c = 1 the left side is the distance n
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
 from recorders.models.planar import drive, wrap_angle
 from recorders.models.relative_bearing import relative_bearing
-
-Floats = NDArray[np.float64]
+from replay.engine.arrays import Floats, Integers
 
 
 class Pairs(NamedTuple):
@@ -289,7 +288,7 @@ def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
     return np.concatenate([border.start[index : index + 1], points + beyond * outward])
 
 
-def to_blame(pairs: Pairs, arena: Arena) -> NDArray[np.int64]:
+def to_blame(pairs: Pairs, arena: Arena) -> Integers:
     """The pairs that contradict the others, the worst first; none where the exact set is not empty.
 
     They are those violated at the place in the arena where the fewest are; of all places where circles

@@ -12,30 +12,37 @@ from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Topic, make_stream, schemas
+from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.models.vehicles import noise_moments
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged
+from replay.engine.channels import bindings, given_or_stated
 from replay.engine.compile import compile_over_runs
 from replay.engine.components import Components
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.measurements import PLANE, read_vectors
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, state_stream
-from replay.inference.gaussian import cholesky
+from replay.inference.gaussian import (
+    Innovation,
+    cholesky,
+    coast,
+    copy_gaussian,
+    kalman_step,
+    no_innovation,
+    reduce_covariance,
+    whiten,
+)
 from replay.inference.steps import FAILURES, NOT_POSITIVE_DEFINITE
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 STATES = 4
-X, Y = 0, 2
-PLACE = (X, Y)
+PLACE = (0, 2)  # x and y; the velocity of each is next to it
 # A component is taken for a thing from this weight on.
 EXTRACTED = 0.5
 Probability = Annotated[float, Field(gt=0, le=1)]
@@ -64,18 +71,18 @@ class PhdParameters(Parameters):
 
 
 class Settings(NamedTuple):
-    """The parameters as the kernel has them, (1,) each; the gate is in squared sigmas."""
+    """The parameters as the kernel has them; the gate is in squared sigmas."""
 
-    variance: Floats
-    detection: Floats
-    clutter: Floats
-    survival: Floats
-    births: Floats
-    birth_variance: Floats
-    acceleration_variance: Floats
-    gate: Floats
-    prune_weight: Floats
-    merge_squared: Floats
+    variance_m2: float
+    detection_probability: float
+    clutter_per_m2: float
+    survival_probability: float
+    births_per_m2: float
+    birth_sigma_mps: float
+    acceleration_sigma_mps2: float
+    prune_weight: float
+    merge_squared: float
+    gate: float
 
 
 class Mixture(NamedTuple):
@@ -109,7 +116,7 @@ class Sets(NamedTuple):
     Scan s has room for elements from `room[s]` on, and has filled `elements[s]` of them.
     """
 
-    is_told: NDArray[np.bool_]
+    is_told: Booleans
     expected: Floats
     elements: Integers
     room: Integers
@@ -119,63 +126,78 @@ class Sets(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Memory of one core: components before they are reduced, and what merging needs of them."""
+    """Memory of one core.
+
+    Attributes:
+        weight, mean, covariance: the components after a scan, before they are reduced.
+        factor, is_merged, heaviest, step, shift: what merging needs of them.
+        innovation: of any detection with a component.
+        seen_factor, seen_gain, seen_covariance: of each component as if it were detected: the factor L
+            of the innovation's covariance S (2, 2), W = C L^-T (4, 2), and the covariance afterwards.
+    """
 
     weight: Floats
     mean: Floats
     covariance: Floats
     factor: Floats
-    is_merged: NDArray[np.bool_]
+    is_merged: Booleans
     heaviest: Integers
-    gain: Floats
-    solved: Floats
+    step: Floats
+    shift: Floats
+    innovation: Innovation
+    seen_factor: Floats
+    seen_gain: Floats
+    seen_covariance: Floats
 
 
-def predict(mean: Floats, covariance: Floats, duration_s: float, settings: Settings) -> None:
-    """Constant velocity for a while, in place."""
-    mean[0] += duration_s * mean[1]
-    mean[2] += duration_s * mean[3]
-    for column in range(STATES):
-        covariance[0, column] += duration_s * covariance[1, column]
-        covariance[2, column] += duration_s * covariance[3, column]
-    for row in range(STATES):
-        covariance[row, 0] += duration_s * covariance[row, 1]
-        covariance[row, 2] += duration_s * covariance[row, 3]
-    velocity = settings.acceleration_variance[0] * duration_s**2
-    for axis in PLACE:
-        covariance[axis, axis] += 0.25 * velocity * duration_s**2
-        covariance[axis, axis + 1] += 0.5 * velocity * duration_s
-        covariance[axis + 1, axis] += 0.5 * velocity * duration_s
-        covariance[axis + 1, axis + 1] += velocity
+def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int) -> None:
+    """Write a component down in a row of anything that has these columns."""
+    mixture.weight[row] = weight
+    copy_gaussian(mean, covariance, mixture.mean[row], mixture.covariance[row])
+
+
+def prepare(mean: Floats, covariance: Floats, variance: float, work: Work, parent: int) -> bool:
+    """Fill what all detections share in the update of a component; False where S is singular."""
+    factor, gain = work.seen_factor[parent], work.seen_gain[parent]
+    for i in range(2):
+        for j in range(2):
+            factor[i, j] = covariance[PLACE[i], PLACE[j]]
+        factor[i, i] += variance
+        work.innovation.difference[i] = 0.0
+        for row in range(STATES):
+            gain[row, i] = covariance[row, PLACE[i]]
+    innovation = Innovation(work.innovation.difference, factor, gain)
+    if np.isnan(whiten(innovation, 2)[0]):
+        return False
+    kalman_step(innovation, 2, work.step)
+    after = work.seen_covariance[parent]
+    copy_gaussian(mean, covariance, work.step, after)
+    reduce_covariance(after, gain, 2)
+    return True
 
 
 def add_detected(
     run: int, parents: int, place: Floats, mixture: Mixture, settings: Settings, work: Work, end: int
 ) -> int:
-    """Append what one detection makes of every component, and a birth; returns the new end.
-
-    work.gain of a parent are its gain (4, 2), the posterior covariance (4, 4) and the innovation's
-    inverse (3) and normaliser, from `prepare`.
-    """
+    """Append what one detection makes of every component, and a birth; returns the new end."""
     first = end
-    total = settings.clutter[0]
+    total = settings.clutter_per_m2
     for parent in range(parents):
-        mean = mixture.mean[run, parent]
-        dx, dy = place[0] - mean[X], place[1] - mean[Y]
-        gain = work.gain[parent]
-        squared = gain[24] * dx * dx + 2.0 * gain[25] * dx * dy + gain[26] * dy * dy
-        if squared > settings.gate[0]:
+        mean, factor, gain = mixture.mean[run, parent], work.seen_factor[parent], work.seen_gain[parent]
+        one = (place[0] - mean[PLACE[0]]) / factor[0, 0]
+        other = (place[1] - mean[PLACE[1]] - factor[1, 0] * one) / factor[1, 1]
+        squared = one * one + other * other
+        if squared > settings.gate:
             continue
-        weight = mixture.weight[run, parent] * gain[27] * np.exp(-0.5 * squared)
-        weight *= settings.detection[0] * settings.survival[0]
+        density = np.exp(-0.5 * squared) / (2.0 * np.pi * factor[0, 0] * factor[1, 1])
+        weight = mixture.weight[run, parent] * density
+        weight *= settings.detection_probability * settings.survival_probability
         total += weight
-        work.weight[end] = weight
+        put(weight, mean, work.seen_covariance[parent], work, end)
         for row in range(STATES):
-            work.mean[end, row] = mean[row] + gain[2 * row] * dx + gain[2 * row + 1] * dy
-            for column in range(STATES):
-                work.covariance[end, row, column] = gain[8 + STATES * row + column]
+            work.mean[end, row] += gain[row, 0] * one + gain[row, 1] * other
         end += 1
-    born = settings.detection[0] * settings.births[0]
+    born = settings.detection_probability * settings.births_per_m2
     if born > 0.0:
         total += born
         work.weight[end] = born
@@ -184,72 +206,34 @@ def add_detected(
             for column in range(STATES):
                 work.covariance[end, row, column] = 0.0
         for axis in range(2):
-            work.mean[end, 2 * axis] = place[axis]
-            work.covariance[end, 2 * axis, 2 * axis] = settings.variance[0]
-            work.covariance[end, 2 * axis + 1, 2 * axis + 1] = settings.birth_variance[0]
+            at = PLACE[axis]
+            work.mean[end, at] = place[axis]
+            work.covariance[end, at, at] = settings.variance_m2
+            work.covariance[end, at + 1, at + 1] = settings.birth_sigma_mps**2
         end += 1
     for component in range(first, end):
         work.weight[component] /= total
     return end
 
 
-def prepare(mean: Floats, covariance: Floats, variance: float, gain: Floats) -> bool:
-    """Fill what the update of a component needs and all detections share; see `add_detected`."""
-    a = covariance[X, X] + variance
-    b = covariance[X, Y]
-    c = covariance[Y, Y] + variance
-    determinant = a * c - b * b
-    if not determinant > 0.0:
-        return False
-    gain[24], gain[25], gain[26] = c / determinant, -b / determinant, a / determinant
-    gain[27] = 1.0 / (2.0 * np.pi * np.sqrt(determinant))
-    for row in range(STATES):
-        to_x, to_y = covariance[row, X], covariance[row, Y]
-        gain[2 * row] = to_x * gain[24] + to_y * gain[25]
-        gain[2 * row + 1] = to_x * gain[25] + to_y * gain[26]
-    for row in range(STATES):
-        for column in range(row + 1):
-            value = (
-                covariance[row, column]
-                - gain[2 * row] * covariance[X, column]
-                - gain[2 * row + 1] * covariance[Y, column]
-            )
-            gain[8 + STATES * row + column] = value
-            gain[8 + STATES * column + row] = value
-    return True
-
-
 def update(run: int, scan: int, scans: Scans, mixture: Mixture, settings: Settings, work: Work) -> int:
     """Fill `work` with the components after a scan, pruned; returns how many, -1 for a failure."""
-    parents, end = mixture.used[run], 0
+    parents = mixture.used[run]
+    missed = settings.survival_probability * (1.0 - settings.detection_probability)
     for parent in range(parents):
         mean, covariance = mixture.mean[run, parent], mixture.covariance[run, parent]
-        if not prepare(mean, covariance, settings.variance[0], work.gain[parent]):
+        if not prepare(mean, covariance, settings.variance_m2, work, parent):
             return -1
-        weight = mixture.weight[run, parent]
-        work.weight[end] = weight * settings.survival[0] * (1.0 - settings.detection[0])
-        for row in range(STATES):
-            work.mean[end, row] = mean[row]
-            for column in range(STATES):
-                work.covariance[end, row, column] = covariance[row, column]
-        end += 1
+        put(mixture.weight[run, parent] * missed, mean, covariance, work, parent)
+    end = parents
     for detection in range(scans.first[scan], scans.end[scan]):
         end = add_detected(run, parents, scans.place[detection], mixture, settings, work, end)
     kept = 0
     for component in range(end):
-        if work.weight[component] > settings.prune_weight[0]:
-            move(work, component, kept)
+        if work.weight[component] > settings.prune_weight:
+            put(work.weight[component], work.mean[component], work.covariance[component], work, kept)
             kept += 1
     return kept
-
-
-def move(work: Work, source: int, target: int) -> None:
-    """Copy a component of `work` to another place."""
-    work.weight[target] = work.weight[source]
-    for row in range(STATES):
-        work.mean[target, row] = work.mean[source, row]
-        for column in range(STATES):
-            work.covariance[target, row, column] = work.covariance[source, row, column]
 
 
 def squared_distance(work: Work, member: int, other: int) -> float:
@@ -258,9 +242,9 @@ def squared_distance(work: Work, member: int, other: int) -> float:
     for row in range(STATES):
         value = work.mean[member, row] - work.mean[other, row]
         for column in range(row):
-            value -= work.factor[member, row, column] * work.solved[column]
-        work.solved[row] = value / work.factor[member, row, row]
-        squared += work.solved[row] ** 2
+            value -= work.factor[member, row, column] * work.step[column]
+        work.step[row] = value / work.factor[member, row, row]
+        squared += work.step[row] ** 2
     return squared
 
 
@@ -296,7 +280,7 @@ def merge_group(seed: int, count: int, settings: Settings, work: Work) -> None:
     """
     work.is_merged[seed] = True
     total = work.weight[seed]
-    shift, second = work.gain[work.gain.shape[0] - 1], work.factor[seed]
+    shift, second = work.shift, work.factor[seed]
     for row in range(STATES):
         shift[row] = 0.0
         for column in range(STATES):
@@ -304,7 +288,7 @@ def merge_group(seed: int, count: int, settings: Settings, work: Work) -> None:
     for member in range(count):
         if work.is_merged[member]:
             continue
-        if squared_distance(work, member, seed) > settings.merge_squared[0]:
+        if squared_distance(work, member, seed) > settings.merge_squared:
             continue
         work.is_merged[member] = True
         weight = work.weight[member]
@@ -337,10 +321,8 @@ def keep(run: int, groups: int, mixture: Mixture, work: Work) -> None:
         work.heaviest[best] = work.heaviest[place]
         work.heaviest[place] = component
         mixture.weight[run, place] = work.weight[component]
-        for row in range(STATES):
-            mixture.mean[run, place, row] = work.mean[component, row]
-            for column in range(STATES):
-                mixture.covariance[run, place, row, column] = work.covariance[component, row, column]
+        mean, covariance = mixture.mean[run, place], mixture.covariance[run, place]
+        copy_gaussian(work.mean[component], work.covariance[component], mean, covariance)
     mixture.used[run] = kept
 
 
@@ -355,11 +337,8 @@ def extract(run: int, scan: int, mixture: Mixture, sets: Sets) -> None:
         for _ in range(max(1, int(np.floor(weight + 0.5)))):
             if row == sets.room[scan + 1]:
                 break
-            sets.weight[row] = weight
-            for i in range(STATES):
-                sets.mean[row, i] = mixture.mean[run, component, i]
-                for j in range(STATES):
-                    sets.covariance[row, i, j] = mixture.covariance[run, component, i, j]
+            mean, covariance = mixture.mean[run, component], mixture.covariance[run, component]
+            put(weight, mean, covariance, sets, row)
             row += 1
     sets.elements[scan] = row - sets.room[scan]
     sets.is_told[scan] = True
@@ -374,9 +353,10 @@ def follow(run: int, scans: Scans, mixture: Mixture, settings: Settings, sets: S
             duration_s = (scans.time_ns[scan] - mixture.time_ns[run]) * 1e-9
             if duration_s < 0.0:
                 continue
+            noise = noise_moments(settings.acceleration_sigma_mps2, duration_s)
             for component in range(mixture.used[run]):
-                mean = mixture.mean[run, component]
-                predict(mean, mixture.covariance[run, component], duration_s, settings)
+                mean, covariance = mixture.mean[run, component], mixture.covariance[run, component]
+                coast(mean, covariance, duration_s, (2, 1), noise)
         mixture.time_ns[run] = scans.time_ns[scan]
         count = update(run, scan, scans, mixture, settings, work)
         groups = merge(count, settings, work) if count >= 0 else -1
@@ -445,8 +425,12 @@ def _work(most: int, detections: int) -> Work:
         factor=np.empty((rows, STATES, STATES)),
         is_merged=np.empty(rows, bool),
         heaviest=np.empty(rows, np.int64),
-        gain=np.empty((most + 1, 28)),
-        solved=np.empty(STATES),
+        step=np.empty(STATES),
+        shift=np.empty(STATES),
+        innovation=no_innovation(STATES, 2),
+        seen_factor=np.empty((most, 2, 2)),
+        seen_gain=np.empty((most, STATES, 2)),
+        seen_covariance=np.empty((most, STATES, STATES)),
     )
 
 
@@ -454,7 +438,7 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: Settings) -> Sets:
     """Room for the elements: twice the weight that a scan can lead to at most."""
     count = len(scans.time_ns)
     bound = np.empty(count)
-    passed = (1.0 - settings.detection[0]) * settings.survival[0]
+    passed = (1.0 - settings.detection_probability) * settings.survival_probability
     for run in range(len(mixture.used)):
         weight = float(mixture.weight[run, : mixture.used[run]].sum())
         for scan in range(scans.offsets[run], scans.offsets[run + 1]):
@@ -473,13 +457,13 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: Settings) -> Sets:
 
 
 def run(
-    state: Mixture | None, block: Block, *, settings: Settings, most: int, outputs: "Outputs"
+    state: Mixture | None, block: Block, *, name: str, settings: Settings, most: int
 ) -> tuple[Mixture, list[Ragged]]:
     """Filter a block; see `replay.engine.estimator.Recursive`."""
     scans = scans_of(*block.streams.values())
     before = no_components(len(scans.offsets) - 1, most) if state is None else state
     after, sets = filter_scans(before, scans, settings)
-    return after, outputs.of(scans, sets, before, after)
+    return after, _outputs(f"/estimates/{name}", scans, sets, before, after)
 
 
 def scans_of(scan: Ragged, detection: Ragged) -> Scans:
@@ -514,125 +498,60 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
 
 
-class Outputs(NamedTuple):
-    """The output topics of one bound filter."""
-
-    name: str
-
-    def of(self, scans: Scans, sets: Sets, before: Mixture, after: Mixture) -> list[Ragged]:
-        """Per scan the set's size and the expected number, its elements, and the runs that failed."""
-        told = np.flatnonzero(sets.is_told)
-        offsets = np.searchsorted(told, scans.offsets)
-        time_ns, elements = scans.time_ns[told], sets.elements[told]
-        counts = np.concatenate([[0], np.cumsum(elements)])
-        rows = np.repeat(sets.room[told] - counts[:-1], elements) + np.arange(counts[-1])
-        expected = sets.expected[told]
-        state, topic = state_metadata(PLANE_MOTION), f"/estimates/{self.name}"
-        return [
-            self._ragged("set", schemas.ESTIMATE_SIZE, offsets, time_ns, state, elements=elements),
-            self._ragged(
-                "element",
-                schemas.DENSITY_ESTIMATE,
-                counts[offsets],
-                np.repeat(time_ns, elements),
-                state,
-                weight=sets.weight[rows],
-                mean=sets.mean[rows],
-                covariance=sets.covariance[rows].reshape(-1, STATES**2),
-            ),
-            # a PHD knows the number as a Poisson variable, whose variance is its mean
-            Ragged(
-                state_stream(
-                    f"{topic}/cardinality",
-                    time_ns,
-                    {"things": "linear"},
-                    None,
-                    expected[:, None],
-                    expected[:, None, None],
-                ),
-                offsets,
-            ),
-            failures_of(topic, before.failure, after.failure, after.time_ns, FAILURES),
-        ]
-
-    def _ragged(
-        self,
-        leaf: str,
-        schema: Schema,
-        offsets: Integers,
-        time_ns: Integers,
-        metadata: Mapping[str, str],
-        **columns: NDArray[Any],
-    ) -> Ragged:
-        topic = f"/estimates/{self.name}/{leaf}"
-        return Ragged(make_stream(topic, schema, time_ns, metadata=metadata, **columns), offsets)
-
-
-def settings_of(parameters: PhdParameters, stated: Mapping[str, str], topic: str) -> Settings:
-    """What the parameters say and, where they do not, the channel's metadata.
-
-    Raises BadInput where neither does, or the channel states what cannot be.
-    """
-
-    def known(name: str) -> float:
-        value = getattr(parameters, name)
-        try:
-            return float(stated[name] if value is None else value)
-        except (KeyError, ValueError):
-            raise BadInput(
-                f"topic {topic} does not state {name}; give it with --set {name}=..."
-            ) from None
-
-    variance, detection = known("variance_m2"), known("detection_probability")
-    clutter = known("clutter_per_m2")
-    if not (0.0 < variance < np.inf and 0.0 < detection <= 1.0 and 0.0 <= clutter < np.inf):
-        raise BadInput(
-            f"topic {topic} states variance_m2 {variance:g}, detection_probability {detection:g} and "
-            f"clutter_per_m2 {clutter:g}; the first two are positive, the others not negative"
-        )
-    single = (
-        variance,
-        detection,
-        clutter,
-        parameters.survival_probability,
-        parameters.births_per_m2,
-        parameters.birth_sigma_mps**2,
-        parameters.acceleration_sigma_mps2**2,
-        float(chi2.ppf(parameters.gate_probability, 2)),
-        parameters.prune_weight,
-        parameters.merge_squared,
+def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture) -> list[Ragged]:
+    """Per scan the set's size and the expected number, its elements, and the runs that failed."""
+    told = np.flatnonzero(sets.is_told)
+    offsets = np.searchsorted(told, scans.offsets)
+    time_ns, elements, expected = scans.time_ns[told], sets.elements[told], sets.expected[told]
+    ends = np.concatenate([[0], np.cumsum(elements)])
+    rows = np.repeat(sets.room[told] - ends[:-1], elements) + np.arange(ends[-1])
+    state = state_metadata(PLANE_MOTION)
+    size = make_stream(f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=state, elements=elements)
+    element = make_stream(
+        f"{topic}/element",
+        schemas.DENSITY_ESTIMATE,
+        np.repeat(time_ns, elements),
+        metadata=state,
+        weight=sets.weight[rows],
+        mean=sets.mean[rows],
+        covariance=sets.covariance[rows].reshape(-1, STATES**2),
     )
-    return Settings(*(np.array([each], float) for each in single))
+    # a PHD knows the number as a Poisson variable, whose variance is its mean
+    number, spread = expected[:, None], expected[:, None, None]
+    things: Components = {"things": "linear"}
+    cardinality = state_stream(f"{topic}/cardinality", time_ns, things, None, number, spread)
+    return [
+        Ragged(size, offsets),
+        Ragged(element, ends[offsets]),
+        Ragged(cardinality, offsets),
+        failures_of(topic, before.failure, after.failure, after.time_ns, FAILURES),
+    ]
+
+
+def settings_of(parameters: PhdParameters, scan: Topic) -> Settings:
+    """What the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
+    names = Settings._fields[:-1]
+    numbers = [given_or_stated(parameters, [scan], name) for name in names]
+    return Settings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> list[Bound]:
     """One filter for every sensor with scans and detections; priors of things start all of them."""
-
-    def has(topic: str, schema: Schema) -> bool:
-        return topic in topics and topics[topic].schema_name == schema.full_name
-
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
-        topic: components
-        for topic in topics
-        if topic.endswith("/prior")
-        and has(topic, schemas.GAUSSIAN_ESTIMATE)
-        and components.keys() <= set(topics[topic].metadata.get("components", "").split(","))
+        found["prior"].name: components
+        for _, found in bindings(topics, {"prior": schemas.GAUSSIAN_ESTIMATE})
+        if components.keys() <= set(found["prior"].metadata.get("components", "").split(","))
     }
     bound: list[Bound] = []
-    for topic in topics:
-        sensor, _, leaf = topic.rpartition("/")
-        detection = f"{sensor}/detection"
+    for sensor, found in bindings(topics, {"scan": schemas.SCAN, "detection": schemas.DETECTION}):
         if parameters.sensor and sensor.strip("/") != parameters.sensor.strip("/"):
             continue
-        if leaf == "scan" and has(topic, schemas.SCAN) and has(detection, schemas.DETECTION):
-            settings = settings_of(parameters, topics[topic].metadata, topic)
-            outputs = Outputs(f"{name}{sensor}")
-            most = parameters.most_components
-            begin = partial(start, most=most)
-            advance = partial(run, settings=settings, most=most, outputs=outputs)
-            read = (topic, detection)
-            bound.append(Recursive(outputs.name, read, tuple(priors), begin, advance, priors))
+        own, most = f"{name}{sensor}", parameters.most_components
+        settings = settings_of(parameters, found["scan"])
+        advance = partial(run, name=own, settings=settings, most=most)
+        read = (found["scan"].name, found["detection"].name)
+        bound.append(Recursive(own, read, tuple(priors), partial(start, most=most), advance, priors))
     return bound
 
 

@@ -12,6 +12,7 @@ from scipy import sparse
 from recorders.models.headings import turn_together
 from replay.distributions import bingham, wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal
+from replay.engine.arrays import Floats, Integers
 from replay.estimators.bingham import BinghamNoise, Steps
 from replay.estimators.torus import HeadingModel
 
@@ -19,9 +20,7 @@ from replay.estimators.torus import HeadingModel
 _NEGLIGIBLE = 1e-12
 
 
-def run_axis_grid_filter(
-    noise: BinghamNoise, state: NDArray[np.float64], steps: Steps
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def run_axis_grid_filter(noise: BinghamNoise, state: Floats, steps: Steps) -> tuple[Floats, Floats]:
     """The reference for `run_bingham_filter` with d = 2.
 
     Args:
@@ -55,10 +54,10 @@ def run_axis_grid_filter(
 
 def run_torus_grid_filter(
     model: HeadingModel,
-    state: NDArray[np.float64],
-    offsets: NDArray[np.int64],
-    measurement: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    state: Floats,
+    offsets: Integers,
+    measurement: Floats,
+) -> tuple[Floats, Floats]:
     """The reference for `run_toroidal_filter`.
 
     Args:
@@ -86,13 +85,13 @@ def run_torus_grid_filter(
     return probability.reshape(state.shape), means
 
 
-def torus_grid(n: int) -> NDArray[np.float64]:
+def torus_grid(n: int) -> Floats:
     """The angles (n, n, 2) of an n x n grid over [-pi, pi)^2."""
     angle = 2.0 * np.pi / n * np.arange(n) - np.pi
     return np.stack(np.meshgrid(angle, angle, indexing="ij"), axis=-1)
 
 
-def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> NDArray[np.float64]:
+def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> Floats:
     points = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.exp(bingham.log_density(distribution, points))
 
@@ -107,7 +106,7 @@ def _transition(model: HeadingModel, grid: NDArray) -> sparse.csr_array:
     return sparse.csr_array(reached / reached.sum(axis=0))
 
 
-def _in_step(offsets: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _in_step(offsets: Integers) -> Iterator[tuple[Integers, Integers]]:
     """Row by row through all runs at once: the runs that have a next row, and these rows."""
     counts = np.diff(offsets)
     for step in range(int(counts.max(initial=0))):

@@ -28,6 +28,7 @@ from replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
+from replay.engine.arrays import Floats, Integers
 from replay.engine.compile import compile_over_runs, compiled
 
 _NS = 1e-9
@@ -62,11 +63,11 @@ class InertialSamples(NamedTuple):
         field: magnetometer, (rows, 3), any unit.
     """
 
-    offsets: NDArray[np.int64]
-    time_ns: NDArray[np.int64]
-    rate: NDArray[np.float64]
-    force: NDArray[np.float64]
-    field: NDArray[np.float64]
+    offsets: Integers
+    time_ns: Integers
+    rate: Floats
+    force: Floats
+    field: Floats
 
 
 class InertialState(NamedTuple):
@@ -84,15 +85,15 @@ class InertialState(NamedTuple):
         field: the same of the magnetometer, (runs, 3).
     """
 
-    time_ns: NDArray[np.int64]
-    rate_sum: NDArray[np.float64]
-    rest_samples: NDArray[np.int64]
-    axes: NDArray[np.float64]
-    concentrations: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    increment: NDArray[np.float64]
-    force: NDArray[np.float64]
-    field: NDArray[np.float64]
+    time_ns: Integers
+    rate_sum: Floats
+    rest_samples: Integers
+    axes: Floats
+    concentrations: Floats
+    covariance: Floats
+    increment: Floats
+    force: Floats
+    field: Floats
 
 
 class OrientationEstimates(NamedTuple):
@@ -101,8 +102,8 @@ class OrientationEstimates(NamedTuple):
     NaN while the orientation is unknown, and where a sample is not finite.
     """
 
-    orientation: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    orientation: Floats
+    covariance: Floats
 
 
 class ReckoningState(NamedTuple):
@@ -115,10 +116,10 @@ class ReckoningState(NamedTuple):
         rest_samples: how many samples they have (runs,).
     """
 
-    orientation: NDArray[np.float64]
-    time_ns: NDArray[np.int64]
-    sums: NDArray[np.float64]
-    rest_samples: NDArray[np.int64]
+    orientation: Floats
+    time_ns: Integers
+    sums: Floats
+    rest_samples: Integers
 
 
 def start_reckoning(runs: int) -> ReckoningState:

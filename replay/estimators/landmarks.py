@@ -7,6 +7,7 @@ and Fox, Probabilistic Robotics, chapters 3 and 7.
 from collections.abc import Mapping
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import schemas
@@ -50,9 +51,17 @@ def velocity_noise(duration_s: Any, parameters: Any) -> Components:
     )
 
 
+def sight(pose: Components, place: Components) -> Components:
+    """Range and bearing of a place; NaN on the very spot, where neither has a derivative."""
+    distance, bearing = range_bearing(pose, place)
+    # 0, or NaN where the distance is 0: numba has no np.where for numbers
+    defined = np.minimum(np.inf * (distance > 0.0), 0.0)
+    return distance + defined, bearing + defined
+
+
 def see(pose: Components, landmark: Components, parameters: Any) -> Components:
     """Range and bearing of a landmark, with the sensor's bias."""
-    distance, bearing = range_bearing(pose, landmark)
+    distance, bearing = sight(pose, landmark)
     return distance + parameters.bias_range_m, bearing + parameters.bias_bearing_rad
 
 

@@ -8,12 +8,10 @@ per vector. Recursions: Rabiner, Proc. IEEE 1989; all sequences at once, probabi
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 
 from recorders.errors import BadInput
-
-Floats = NDArray[np.float64]
+from replay.engine.arrays import Floats
 
 
 class MixtureHmm(NamedTuple):

@@ -11,23 +11,23 @@ from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import Topic
+from recorders.log import Topic, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Ragged
+from replay.engine.channels import numbered
 from replay.engine.compile import compile_over_runs
 from replay.engine.components import components_of
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.priors import gaussians
-from replay.engine.results import ALL_WELL, failures_of, state_stream
-from replay.estimators.covariance_intersection import rule
-from replay.inference.gaussian import Floats, Function
+from replay.engine.results import ALL_WELL, failures_of, states_in
+from replay.estimators.covariance_intersection import Estimate, rule
+from replay.inference.gaussian import coast, copy_gaussian
 
-Integers = NDArray[np.int64]
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
 Rule = Literal[
     "alone",
@@ -95,21 +95,7 @@ class Results(NamedTuple):
 
 def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
     """Predict with constant velocity, in place."""
-    half = len(mean) // 2
-    position, both, velocity = noise_moments(density, duration_s)
-    for row in range(half):
-        mean[row] += duration_s * mean[half + row]
-    for row in range(half):
-        for column in range(len(mean)):
-            covariance[row, column] += duration_s * covariance[half + row, column]
-    for row in range(len(mean)):
-        for column in range(half):
-            covariance[row, column] += duration_s * covariance[row, half + column]
-    for row in range(half):
-        covariance[row, row] += position
-        covariance[row, half + row] += both
-        covariance[half + row, row] += both
-        covariance[half + row, half + row] += velocity
+    coast(mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s))
 
 
 def observe(
@@ -145,14 +131,6 @@ def observe(
                 covariance[column, row] = covariance[row, column]
 
 
-def assign(mean: Floats, covariance: Floats, new_mean: Floats, new_covariance: Floats) -> None:
-    """Fill the first two from the others; loops, since slices are very slow to compile."""
-    for row in range(len(mean)):
-        mean[row] = new_mean[row]
-        for column in range(len(mean)):
-            covariance[row, column] = new_covariance[row, column]
-
-
 def network(fuse: Function) -> Function:
     """The loop over the activities of one run; `own_first` fuses the own x*, not the prediction."""
 
@@ -171,14 +149,14 @@ def network(fuse: Function) -> Function:
         mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
         time_ns = np.empty(nodes, np.int64)
         for node in range(nodes):
-            assign(mean[node], covariance[node], prior_mean[run], prior_covariance[run])
+            copy_gaussian(prior_mean[run], prior_covariance[run], mean[node], covariance[node])
             time_ns[node] = prior_ns[run]
         begin, last = activities.offsets[run], activities.offsets[run + 1]
         most = 1
         for activity in range(begin, last):
             most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
-        means, weights = np.empty((most, size)), np.empty(most)
-        covariances, independents = np.empty((most, size, size)), np.empty((most, size, size))
+        weights, square = np.empty(most), (most, size, size)
+        parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
         while begin < last:
             now = activities.time_ns[begin]
             end = begin
@@ -189,7 +167,7 @@ def network(fuse: Function) -> Function:
                     move(mean[node], covariance[node], sensing.density[node], span_s)
                     time_ns[node] = now
                 sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
-                assign(sent_mean, sent_covariance, mean[node], covariance[node])
+                copy_gaussian(mean[node], covariance[node], sent_mean, sent_covariance)
                 for k in range(activities.measured[end], activities.measured[end + 1]):
                     observe(
                         sent_mean,
@@ -206,27 +184,21 @@ def network(fuse: Function) -> Function:
                 if count > 1:
                     for i in range(count):
                         source = activities.message[first + i - 1] if i > 0 else activity
+                        its_mean, its_covariance = mean[node], covariance[node]
                         if i > 0 or own_first:
-                            its_mean, its_covariance = (
-                                results.sent_mean[source],
-                                results.sent_covariance[source],
-                            )
-                        else:
-                            its_mean, its_covariance = mean[node], covariance[node]
-                        assign(means[i], covariances[i], its_mean, its_covariance)
+                            its_mean = results.sent_mean[source]
+                            its_covariance = results.sent_covariance[source]
+                        copy_gaussian(its_mean, its_covariance, parts.mean[i], parts.covariance[i])
                         late_s = (now - activities.time_ns[source]) * 1e-9
                         # what was new in a late one others may have passed on
                         new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
                         for row in range(size):
                             for column in range(size):
-                                independents[i, row, column] = (
-                                    new * results.sent_independent[source, row, column]
-                                )
+                                own = results.sent_independent[source, row, column]
+                                parts.independent[i, row, column] = new * own
                         if late_s > 0.0:
-                            move(means[i], covariances[i], sensing.density[node], late_s)
-                    gap = fuse(
-                        count, means, covariances, independents, weights, mean[node], covariance[node]
-                    )
+                            move(parts.mean[i], parts.covariance[i], sensing.density[node], late_s)
+                    gap = fuse(count, parts, weights, mean[node], covariance[node])
                     if not gap < np.inf:
                         failed_ns[run] = now
                         return
@@ -234,13 +206,12 @@ def network(fuse: Function) -> Function:
                     observe(
                         mean[node],
                         covariance[node],
-                        independents[0],  # of no use any more
+                        parts.independent[0],  # of no use any more
                         sensing.value[k],
                         sensing.variance[sensing.sensor[k]],
                     )
-                assign(
-                    results.mean[activity], results.covariance[activity], mean[node], covariance[node]
-                )
+                found_mean, found_covariance = results.mean[activity], results.covariance[activity]
+                copy_gaussian(mean[node], covariance[node], found_mean, found_covariance)
             begin = end
 
     return follow
@@ -294,32 +265,18 @@ def solve(
     outputs = [
         failures_of(f"/estimates/{name}", well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)
     ]
+    topic, kinds = f"/estimates/{name}", components_of(components)
     places = [f"node{number}" for number in sensors] if parameters.rule != CENTRALISED else ["centre"]
     done = np.isfinite(results.mean[:, 0])
+    stamps = activities.time_ns, activities.offsets
     for node, place in enumerate(places):
-        outputs.append(
-            _estimates(
-                f"/estimates/{name}/{place}/state",
-                activities,
-                (activities.node == node) & done,
-                components,
-                "/truth",
-                results.mean,
-                results.covariance,
-            )
-        )
-        if parameters.rule not in (ALONE, CENTRALISED):
-            outputs.append(
-                _estimates(
-                    f"/estimates/{name}/{place}/sent",
-                    activities,
-                    (activities.node == node) & done & sent,
-                    components,
-                    None,
-                    results.sent_mean,
-                    results.sent_covariance,
-                )
-            )
+        own = (activities.node == node) & done
+        estimates = ("state", own, "/truth", results.mean, results.covariance)
+        messages = ("sent", own & sent, None, results.sent_mean, results.sent_covariance)
+        is_sender = parameters.rule not in (ALONE, CENTRALISED)
+        for leaf, chosen, truth, mean, covariance in [estimates, messages][: 1 + is_sender]:
+            rows, where = np.flatnonzero(chosen), f"{topic}/{place}/{leaf}"
+            outputs.append(states_in(rows, where, *stamps, kinds, truth, mean, covariance))
     return outputs
 
 
@@ -329,7 +286,7 @@ def _schedule(
     components: Sequence[str],
     prior_ns: Integers,
     name: str,
-) -> tuple[Activities, Sensing, NDArray[np.bool_]]:
+) -> tuple[Activities, Sensing, Booleans]:
     """The activities of all nodes and runs, their measurements, and in which something is sent."""
     numbers = list(sensors)
     centralised = name == CENTRALISED
@@ -431,30 +388,10 @@ def _sensing(
     return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
 
 
-def _estimates(
-    topic: str,
-    activities: Activities,
-    chosen: NDArray[np.bool_],
-    components: Sequence[str],
-    truth: str | None,
-    mean: Floats,
-    covariance: Floats,
-) -> Ragged:
-    rows = np.flatnonzero(chosen)
-    time_ns, kinds = activities.time_ns[rows], components_of(components)
-    stream = state_stream(topic, time_ns, kinds, truth, mean[rows], covariance[rows])
-    return Ragged(stream, np.searchsorted(rows, activities.offsets))
-
-
 def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:
-    sensors: dict[int, Topic] = {}
-    for topic in topics.values():
-        node = topic.name.removeprefix("/node").removesuffix("/sensor")
-        if node.isdigit() and topic.name == f"/node{node}/sensor":
-            sensors[int(node)] = topic
+    sensors = numbered(topics, "node", "sensor", schemas.VECTOR_MEASUREMENT)
     if not sensors or "/links" not in topics or "/prior" not in topics:
         return []
-    sensors = dict(sorted(sensors.items()))
     components = state_of(topics["/prior"])
     read = ("/links", *(topic.name for topic in sensors.values()))
     work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)

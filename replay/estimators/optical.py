@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.models.optical import (
@@ -21,6 +20,7 @@ from recorders.models.optical import (
     turning_vector,
 )
 from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Booleans, Floats
 from replay.estimators.rays import intersect_rays
 from replay.inference.least_squares import (
     Linearization,
@@ -31,8 +31,6 @@ from replay.inference.least_squares import (
     solve,
     unobservable_directions,
 )
-
-Array = NDArray[np.float64]
 
 # Sensors turn together when their turning vectors differ by less than this part of them.
 SAME_TURN = 1e-6
@@ -45,13 +43,13 @@ class Scene(NamedTuple):
     is the noise of azimuth and elevation. known_bias_rad (sensors, 3) is NaN where it is wanted.
     """
 
-    position_m: Array
-    nominal_attitude_rad: Array
-    sigma_rad: Array
-    known_bias_rad: Array
+    position_m: Floats
+    nominal_attitude_rad: Floats
+    sigma_rad: Floats
+    known_bias_rad: Floats
 
     @property
-    def wanted(self) -> NDArray[np.bool_]:
+    def wanted(self) -> Booleans:
         """Which biases are estimated, (3 sensors,)."""
         return np.isnan(self.known_bias_rad).ravel()
 
@@ -65,7 +63,7 @@ class Observability(NamedTuple):
 
     rank: int
     parameters: int
-    turning_axis: Array | None
+    turning_axis: Floats | None
     sentence: str
 
 
@@ -76,12 +74,12 @@ def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]
     return places + [name for name, wanted in zip(biases, scene.wanted, strict=True) if wanted]
 
 
-def predict(scene: Scene, parameters: Array) -> Array:
+def predict(scene: Scene, parameters: Floats) -> Floats:
     """Azimuth and elevation in rad without noise, (runs, targets, sensors, 2), for (runs, n)."""
     return np.stack(line_of_sight(*_geometry(scene, parameters)), axis=-1)
 
 
-def estimate(scene: Scene, measured: Array, start: Array | None = None) -> Solution:
+def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Solution:
     """Positions and wanted biases from lines of sight (runs, targets, sensors, 2), NaN where not seen.
 
     The search begins at `start` (runs, n), else where the rays meet. Raises BadInput where shapes do not
@@ -94,7 +92,7 @@ def estimate(scene: Scene, measured: Array, start: Array | None = None) -> Solut
     )
 
 
-def starting_point(scene: Scene, measured: Array) -> Array:
+def starting_point(scene: Scene, measured: Floats) -> Floats:
     """Where the rays of each target meet, biases taken as zero, (runs, n)."""
     attitude = scene.nominal_attitude_rad + np.nan_to_num(scene.known_bias_rad)
     unit = np.stack(direction(measured[..., 0], measured[..., 1], attitude.T[:, None]), axis=-1)
@@ -102,7 +100,7 @@ def starting_point(scene: Scene, measured: Array) -> Array:
     return np.concatenate([targets, np.zeros((len(measured), scene.wanted.sum()))], axis=1)
 
 
-def printed_starting_point(scene: Scene, measured: Array) -> Array:
+def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
     """Eqs (21)-(23) for the first two sensors, nominal attitudes zero; the print has z, x, y as x, y, z.
 
     They hang on the difference of two azimuths: where all is nearly in one upright plane, as in the
@@ -119,7 +117,7 @@ def printed_starting_point(scene: Scene, measured: Array) -> Array:
     return np.concatenate([targets, np.zeros((len(measured), scene.wanted.sum()))], axis=1)
 
 
-def linearize(scene: Scene, measured: Array, parameters: Array) -> Linearization:
+def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearization:
     """Lines of sight (runs, targets, sensors, 2), NaN where not seen, at `parameters` (runs, n)."""
     runs, targets, sensors, _ = measured.shape
     m = 2 * targets * sensors
@@ -142,7 +140,7 @@ def linearize(scene: Scene, measured: Array, parameters: Array) -> Linearization
     return mask_missing(Linearization(residual, jacobian, variance), np.isfinite(residual))
 
 
-def observability(scene: Scene, measured: Array, parameters: Array) -> Observability:
+def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observability:
     """Rank and unobservable directions for one run: `measured` (targets, sensors, 2), parameters (n,).
 
     `measured` only says which lines of sight there are: NaN where none.
@@ -169,7 +167,7 @@ def observability(scene: Scene, measured: Array, parameters: Array) -> Observabi
     return Observability(rank, n, axis, sentence)
 
 
-def _turning_axis(scene: Scene, parameters: Array, unseen: Array) -> Array | None:
+def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
     """The axis about which this direction turns every sensor alike; None where it does not."""
     if not scene.wanted.all():
         return None
@@ -184,7 +182,7 @@ def _turning_axis(scene: Scene, parameters: Array, unseen: Array) -> Array | Non
     return axis * np.sign(axis[np.argmax(np.abs(axis))])
 
 
-def sigma_with_one_bias_known(scene: Scene, measured: Array, parameters: Array) -> Array:
+def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
     """CRLB standard deviations in rad of all wanted biases (columns) when one (row) is known.
 
     One run, as for `observability`. A row with infinite or large values is a bias that must not be the
@@ -201,7 +199,7 @@ def sigma_with_one_bias_known(scene: Scene, measured: Array, parameters: Array) 
     return table
 
 
-def _check(scene: Scene, measured: Array) -> None:
+def _check(scene: Scene, measured: Floats) -> None:
     sensors = len(scene.position_m)
     for (name, column), width in zip(scene._asdict().items(), (3, 3, 2, 3), strict=True):
         if column.shape != (sensors, width):
@@ -214,7 +212,7 @@ def _check(scene: Scene, measured: Array) -> None:
         raise BadInput("optical scene: sigma_rad must be positive; give each sensor's noise")
 
 
-def _geometry(scene: Scene, parameters: Array) -> tuple[Array, Array, Array]:
+def _geometry(scene: Scene, parameters: Floats) -> tuple[Floats, Floats, Floats]:
     """Targets, sensors and biased attitudes, components first, to broadcast over targets, sensors."""
     runs, sensors = len(parameters), len(scene.position_m)
     targets = (parameters.shape[1] - scene.wanted.sum()) // 3

@@ -10,27 +10,26 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters
+from replay.engine.arrays import Floats
 from replay.engine.blocks import Ragged
+from replay.engine.channels import numbered
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.measurements import check_width
 from replay.estimators.optical import Scene, estimate, parameter_names
 from replay.estimators.solutions import (
     Batches,
     batches_of,
-    sensor_numbers,
+    positive,
     solution_streams,
-    stated,
     table_of,
 )
 
-Array = NDArray[np.float64]
 NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/attitude"
 
 
@@ -49,7 +48,7 @@ class Sightings(NamedTuple):
 
     batches: Batches
     targets: list[int]
-    measured: Array
+    measured: Floats
 
 
 def gather_sightings(streams: list[Ragged]) -> Sightings:
@@ -66,14 +65,14 @@ def gather_sightings(streams: list[Ragged]) -> Sightings:
 def _bind(
     name: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
 ) -> list[Bound]:
-    sensors = sensor_numbers(topics, "line_of_sight", schemas.LINE_OF_SIGHT)
+    sensors = list(numbered(topics, "sensor", "line_of_sight", schemas.LINE_OF_SIGHT))
     streams = [f"/sensor{s}/line_of_sight" for s in sensors]
     whole = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
     if not sensors or not set(whole) <= set(topics):
         return []
     sigma = [
         [
-            stated(topics[f"/sensor{s}/line_of_sight"], f"sigma_{angle}_rad")
+            positive(topics[f"/sensor{s}/line_of_sight"], f"sigma_{angle}_rad")
             for angle in ("azimuth", "elevation")
         ]
         for s in sensors
@@ -84,7 +83,7 @@ def _bind(
     ]
 
 
-def known_biases(sensors: Sequence[int], parameters: Parameters) -> Array:
+def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
     """The known biases (sensors, 3) in rad, NaN where wanted."""
     if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
@@ -97,7 +96,7 @@ def known_biases(sensors: Sequence[int], parameters: Parameters) -> Array:
 
 
 def _solve(
-    name: str, sensors: list[int], sigma_rad: Array, known_rad: Array, streams: dict[str, Ragged]
+    name: str, sensors: list[int], sigma_rad: Floats, known_rad: Floats, streams: dict[str, Ragged]
 ) -> list[Ragged]:
     position = [_constant(streams[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
     turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
@@ -110,10 +109,10 @@ def _solve(
     )
 
 
-def _constant(ragged: Ragged, field: str, width: int) -> Array:
+def _constant(ragged: Ragged, field: str, width: int) -> Floats:
     """The one value (width,) that a stream has in all runs."""
     check_width(ragged.stream, field, width)
-    values: Array = ragged[field]
+    values: Floats = ragged[field]
     if len(values) == 0 or (values != values[:1]).any():
         raise BadInput(
             f"topic {ragged.stream.topic}: {field} must be the same in all messages and runs; replay "

@@ -12,13 +12,12 @@ from typing import Literal, NamedTuple
 
 import contourpy
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Floats
 from replay.estimators.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
 
-Floats = NDArray[np.float64]
 Order = Literal[4, 8]
 Weighting = Literal["area", "batch", "determinant", "equal"]
 Size = Callable[[Floats], float]
@@ -63,13 +62,6 @@ def monomials(points: Floats, order: Order) -> Floats:
     if order == 8:
         columns += [x * y, x * squared, y * squared, squared**2]
     return np.stack(columns, axis=-1)
-
-
-def parabola_ellipse(low: float, high: float) -> tuple[Floats, Floats]:
-    """Midpoint (2,) and V (2, 2) of the ellipse around (z, z^2), low <= z <= high; Example 1."""
-    z, h = 0.5 * (low + high), 0.5 * (high - low)
-    shape = np.array([[h, 0.0], [2 * z * h, h * h]])
-    return np.array([z, z * z + 2 * h * h / 3]), shape @ np.diag([4 / 3, 4 / 9]) @ shape.T
 
 
 def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:

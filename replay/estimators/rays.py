@@ -1,15 +1,14 @@
 """Where rays meet: the starting point of localization from angles."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from replay.engine.arrays import Floats
 
 # Rays closer to parallel than this (smallest eigenvalue of the mean projector) do not meet.
 PARALLEL = 1e-12
 
 
-def intersect_rays(origin_m: Array, direction: Array) -> Array:
+def intersect_rays(origin_m: Floats, direction: Floats) -> Floats:
     """The point nearest to rays in least squares, (..., d): (sum(I - u u'))^-1 sum((I - u u') origin).
 
     Unit vectors `direction` u are (..., rays, d), origins (rays, d) or alike; a ray of NaNs is left out.

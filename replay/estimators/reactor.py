@@ -12,7 +12,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from recorders.log import schemas
 from recorders.models.planar import Components
 from recorders.models.reactor import CONSUMED, PRODUCED, react, total_pressure
-from replay.inference.gaussian import Floats
+from replay.engine.arrays import Floats
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 
 

@@ -25,13 +25,11 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.measurements import PLANE, read_vectors
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 LEVELS = 4
 # How fast the usual interval of a track follows what it does.
@@ -66,19 +64,19 @@ class ReportTrackerParameters(Parameters):
 
 
 class Settings(NamedTuple):
-    """The parameters as the kernel has them; the levels' (LEVELS,), all else (1,)."""
+    """The parameters as the kernel has them; the levels' (LEVELS,)."""
 
     acceleration_density: Floats
     position_variance: Floats
     velocity_variance: Floats
-    forgetting: Floats
-    births: Floats
-    resting_share: Floats
-    usual_interval_s: Floats
-    slow_mps: Floats
-    course_width_rad: Floats
-    top_speed_mps: Floats
-    forget_s: Floats
+    forgetting: float
+    births: float
+    resting_share: float
+    usual_interval_s: float
+    slow_mps: float
+    course_width_rad: float
+    top_speed_mps: float
+    forget_s: float
 
 
 class Tracks(NamedTuple):
@@ -116,7 +114,7 @@ class Reports(NamedTuple):
 
     offsets: Integers
     time_ns: Integers
-    is_last: NDArray[np.bool_]
+    is_last: Booleans
     position: Floats
     velocity: Floats
     velocity_variance: Floats
@@ -137,7 +135,7 @@ class Candidates(NamedTuple):
 
     place: Integers
     score: Floats
-    is_open: NDArray[np.bool_]
+    is_open: Booleans
 
 
 def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
@@ -147,6 +145,18 @@ def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, f
         + duration_s * (2.0 * spread[1] + duration_s * (spread[2] + density * duration_s / 3.0)),
         spread[1] + duration_s * (spread[2] + density * duration_s / 2.0),
         spread[2] + density * duration_s,
+    )
+
+
+def reported(
+    spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: Settings
+) -> tuple[float, float, float]:
+    """The spread of one axis of what is reported after a while, at a level of noise."""
+    a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
+    return (
+        a + settings.position_variance[level],
+        b,
+        c + (settings.velocity_variance[level] + velocity_variance),
     )
 
 
@@ -172,8 +182,7 @@ def differences(
 
 def mixed(weight: float, settings: Settings) -> float:
     """The weight of a level before the next report."""
-    forgetting = settings.forgetting[0]
-    return (1.0 - forgetting) * weight + forgetting / LEVELS
+    return (1.0 - settings.forgetting) * weight + settings.forgetting / LEVELS
 
 
 def is_held(course_rad: float, before_rad: float, settings: Settings) -> bool:
@@ -181,22 +190,22 @@ def is_held(course_rad: float, before_rad: float, settings: Settings) -> bool:
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
     turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
-    return turned < settings.course_width_rad[0]
+    return turned < settings.course_width_rad
 
 
 def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: Settings) -> bool:
     """Whether a track was, and a report is, so slow that the course says little of the motion."""
-    return speed_mps < settings.slow_mps[0] and tracks.speed_mps[run, place] < settings.slow_mps[0]
+    return speed_mps < settings.slow_mps and tracks.speed_mps[run, place] < settings.slow_mps
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: Settings) -> float:
     """How densely vessels not met before report this, per m^2, s and (m/s)^2."""
-    moving = 1.0 / (np.pi * settings.top_speed_mps[0] ** 2)
-    variance = settings.slow_mps[0] ** 2 + own_variance
+    moving = 1.0 / (np.pi * settings.top_speed_mps**2)
+    variance = settings.slow_mps**2 + own_variance
     squared = (velocity[0] ** 2 + velocity[1] ** 2) / variance
     resting = np.exp(-0.5 * squared) / (2.0 * np.pi * variance)
-    share = settings.resting_share[0]
-    return settings.births[0] * ((1.0 - share) * moving + share * resting)
+    share = settings.resting_share
+    return settings.births * ((1.0 - share) * moving + share * resting)
 
 
 def score_of(
@@ -216,9 +225,7 @@ def score_of(
         return -np.inf
     density = 0.0
     for level in range(LEVELS):
-        a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
-        a += settings.position_variance[level]
-        c += settings.velocity_variance[level] + reports.velocity_variance[event]
+        a, b, c = reported(spread, level, duration_s, reports.velocity_variance[event], settings)
         weight = mixed(tracks.weight[run, place, level], settings)
         density += weight * density_at(difference, a, b, c)
     # the rate of reports rises until half the usual interval is over, and falls with a long silence
@@ -229,7 +236,7 @@ def score_of(
         held, turned = tracks.held[run, place, 0], tracks.held[run, place, 1]
         factor = turned / (held + turned)
         if is_held(course_rad, before_rad, settings):
-            factor += np.pi / settings.course_width_rad[0] * held / (held + turned)
+            factor += np.pi / settings.course_width_rad * held / (held + turned)
         density *= factor
     born = birth_density(reports.velocity[event], reports.velocity_variance[event], settings)
     return np.log(density / born) if density > 0.0 else -np.inf
@@ -268,7 +275,7 @@ def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Sett
     tracks.spread[run, place, 2] = settings.velocity_variance[widest] + reports.velocity_variance[event]
     for level in range(LEVELS):
         tracks.weight[run, place, level] = 1.0 / LEVELS
-    tracks.interval_s[run, place] = settings.usual_interval_s[0]
+    tracks.interval_s[run, place] = settings.usual_interval_s
     return place
 
 
@@ -282,9 +289,7 @@ def update(
     x, vx, y, vy = differences(mean, reports.position[event], reports.velocity[event], duration_s)
     total = 0.0
     for level in range(LEVELS):
-        a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
-        a += settings.position_variance[level]
-        c += settings.velocity_variance[level] + reports.velocity_variance[event]
+        a, b, c = reported(spread, level, duration_s, reports.velocity_variance[event], settings)
         weight[level] = mixed(weight[level], settings) * density_at((x, vx, y, vy), a, b, c)
         total += weight[level]
     # means of the gains (4), of the posterior spreads (3) and of the squares of the moves (3)
@@ -355,24 +360,18 @@ def forget(run: int, now_ns: int, tracks: Tracks, settings: Settings) -> None:
     """Drop the tracks that are silent for too long; the last takes the place of one that goes."""
     place = 0
     while place < tracks.used[run]:
-        if (now_ns - tracks.time_ns[run, place]) * 1e-9 <= settings.forget_s[0]:
+        if (now_ns - tracks.time_ns[run, place]) * 1e-9 <= settings.forget_s:
             place += 1
             continue
         last = tracks.used[run] - 1
         tracks.used[run] = last
-        tracks.number[run, place] = tracks.number[run, last]
-        tracks.time_ns[run, place] = tracks.time_ns[run, last]
-        for component in range(4):
-            tracks.mean[run, place, component] = tracks.mean[run, last, component]
-        for component in range(3):
-            tracks.spread[run, place, component] = tracks.spread[run, last, component]
-        for level in range(LEVELS):
-            tracks.weight[run, place, level] = tracks.weight[run, last, level]
-        for kind in range(2):
-            tracks.held[run, place, kind] = tracks.held[run, last, kind]
-        tracks.interval_s[run, place] = tracks.interval_s[run, last]
-        tracks.course_rad[run, place] = tracks.course_rad[run, last]
-        tracks.speed_mps[run, place] = tracks.speed_mps[run, last]
+        for whole in (tracks.number, tracks.time_ns):
+            whole[run, place] = whole[run, last]
+        for real in (tracks.interval_s, tracks.course_rad, tracks.speed_mps):
+            real[run, place] = real[run, last]
+        for vector in (tracks.mean, tracks.spread, tracks.weight, tracks.held):
+            for entry in range(vector.shape[2]):
+                vector[run, place, entry] = vector[run, last, entry]
 
 
 def track(
@@ -461,7 +460,7 @@ def _reports(block: Block, topic: str, settings: Settings) -> Reports:
     given = block.streams[topic]
     course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
     # nothing is known of the direction, or of the speed either: a wide velocity about zero
-    fastest = settings.top_speed_mps[0]
+    fastest = settings.top_speed_mps
     unknown = np.isnan(course_rad) | np.isnan(speed_mps)
     variance = np.where(unknown, np.where(np.isnan(speed_mps), fastest, speed_mps) ** 2, 0.0)
     velocity = np.stack([speed_mps * np.sin(course_rad), speed_mps * np.cos(course_rad)], axis=1)
@@ -518,34 +517,29 @@ def settings_of(parameters: ReportTrackerParameters) -> Settings:
         levels = getattr(parameters, name)
         if max(levels) > levels[-1]:
             raise BadInput(f"{name} {levels}: give the quiet levels first, the greatest last")
-    births = parameters.births_per_km2_h / (1e6 * 3600.0)
-    single = (
-        parameters.forgetting,
-        births,
-        parameters.resting_share,
-        parameters.usual_interval_s,
-        parameters.slow_mps,
-        np.radians(parameters.course_width_deg),
-        parameters.top_speed_mps,
-        parameters.forget_s,
-    )
     return Settings(
         np.array(parameters.acceleration_density),
         np.square(parameters.sigma_position_m),
         np.square(parameters.sigma_velocity_mps),
-        *(np.array([each], float) for each in single),
+        parameters.forgetting,
+        parameters.births_per_km2_h / (1e6 * 3600.0),
+        parameters.resting_share,
+        parameters.usual_interval_s,
+        parameters.slow_mps,
+        float(np.radians(parameters.course_width_deg)),
+        parameters.top_speed_mps,
+        parameters.forget_s,
     )
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: ReportTrackerParameters) -> list[Bound]:
-    found = [each for each in topics.values() if each.schema_name == schemas.COURSE_FIX.full_name]
     settings = settings_of(parameters)
     bound: list[Bound] = []
-    for topic in found:
-        prefix = topic.name.rpartition("/")[0]
-        own = f"{name}{prefix}"
-        advance = partial(run, name=own, topic=topic.name, settings=settings)
-        bound.append(Recursive(own, (topic.name,), (), start, advance))
+    for topic in topics.values():
+        if topic.schema_name == schemas.COURSE_FIX.full_name:
+            own = f"{name}{topic.name.rpartition('/')[0]}"
+            advance = partial(run, name=own, topic=topic.name, settings=settings)
+            bound.append(Recursive(own, (topic.name,), (), start, advance))
     return bound
 
 

@@ -6,24 +6,23 @@ repeated on the fault's topic.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
-from replay.engine.blocks import Ragged
+from replay.engine.arrays import Floats, Integers
+from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.measurements import PLANE, read_vectors
 from replay.estimators.feasible_sets import (
     Arena,
-    Floats,
     Pairs,
     arena_around,
     box,
@@ -81,7 +80,7 @@ class Frame(NamedTuple):
 
     time_ns: int
     pairs: Pairs
-    numbers: NDArray[np.int64]
+    numbers: Integers
     arena: Arena
 
 
@@ -166,18 +165,6 @@ def solve(
     parameters: SetParameters,
 ) -> list[Ragged]:
     """A set for every frame of every run; see `replay.engine.estimator.Batch`."""
-    sets, sizes, faults = _Rows(), _Rows(), _Rows()
-    landmarks, seen = whole["/landmarks"], whole[topic]
-    for run in range(seen.runs):
-        for frame in frames(seen.of_run(run), landmarks.of_run(run), known):
-            found = polygons(frame.pairs, frame.arena, parameters)
-            sizes.add(run, frame.time_ns, [sum(map(len, found))])
-            for number, ring in enumerate(found):
-                sets.add(run, frame.time_ns, np.full(len(ring), number), ring)
-            if not found:
-                blamed = to_blame(frame.pairs, frame.arena)[:1]
-                faults.add(run, frame.time_ns, frame.numbers[blamed], frame.pairs.angle_rad[blamed])
-    prefix = f"/estimates/{name}"
     metadata = {
         "components": "x_m,y_m",
         "kinds": "linear,linear",
@@ -185,56 +172,58 @@ def solve(
         "measured": topic,
         **known.metadata(),
     }
-    ring_id, vertex = sets.columns([(0,), (0, 2)])
-    (elements,) = sizes.columns([(0,)])
-    pair, angle = faults.columns([(0, 2), (0,)])
-    return [
-        sets.ragged(
-            f"{prefix}/set", schemas.SET_ESTIMATE, seen.runs, metadata, ring_id=ring_id, vertex=vertex
+    landmarks, seen = whole["/landmarks"], whole[topic]
+    solved = []
+    for run in range(seen.runs):
+        found = frames(seen.of_run(run), landmarks.of_run(run), known)
+        borders = [(frame, polygons(frame.pairs, frame.arena, parameters)) for frame in found]
+        solved.append(_streams(f"/estimates/{name}", metadata, borders))
+    return [gather(streams) for streams in zip(*solved, strict=True)]
+
+
+def _streams(
+    prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[Frame, list[Floats]]]
+) -> tuple[Stream, ...]:
+    """The sets of a run's frames, how many vertices each has, and what is to blame for empty ones."""
+
+    def whole(numbers: Iterable[int]) -> Integers:
+        return np.fromiter(numbers, np.int64)
+
+    rings_of = [(frame, *each) for frame, found in borders for each in enumerate(found)]
+    lengths = whole(len(ring) for *_, ring in rings_of)
+    blamed = [
+        (frame, pair)
+        for frame, found in borders
+        if not found
+        for pair in to_blame(frame.pairs, frame.arena)[:1]
+    ]
+    pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
+    return (
+        make_stream(
+            f"{prefix}/set",
+            schemas.SET_ESTIMATE,
+            np.repeat(whole(frame.time_ns for frame, *_ in rings_of), lengths),
+            metadata=metadata,
+            ring_id=np.repeat(whole(number for _, number, _ in rings_of), lengths),
+            vertex=np.concatenate([np.empty((0, 2)), *(ring for *_, ring in rings_of)]),
         ),
-        sizes.ragged(f"{prefix}/size", schemas.ESTIMATE_SIZE, seen.runs, metadata, elements=elements),
-        faults.ragged(
+        make_stream(
+            f"{prefix}/size",
+            schemas.ESTIMATE_SIZE,
+            whole(frame.time_ns for frame, _ in borders),
+            metadata=metadata,
+            elements=whole(sum(map(len, found)) for _, found in borders),
+        ),
+        make_stream(
             f"{prefix}/fault",
             schemas.RELATIVE_BEARING,
-            seen.runs,
-            {"purpose": "the set is empty; this relative bearing is to blame"},
-            first_id=pair[:, 0],
-            second_id=pair[:, 1],
-            angle_rad=angle,
+            whole(frame.time_ns for frame, _ in blamed),
+            metadata={"purpose": "the set is empty; this relative bearing is to blame"},
+            first_id=pairs[:, 0],
+            second_id=pairs[:, 1],
+            angle_rad=np.array([frame.pairs.angle_rad[pair] for frame, pair in blamed]),
         ),
-    ]
-
-
-class _Rows:
-    """Messages of one topic while they are collected, run by run."""
-
-    def __init__(self) -> None:
-        self._run: list[NDArray[np.int64]] = []
-        self._time_ns: list[NDArray[np.int64]] = []
-        self._parts: list[tuple[Any, ...]] = []
-
-    def add(self, run: int, time_ns: int, *parts: Any) -> None:
-        self._run.append(np.full(len(parts[0]), run))
-        self._time_ns.append(np.full(len(parts[0]), time_ns))
-        self._parts.append(parts)
-
-    def columns(self, empty: list[tuple[int, ...]]) -> list[NDArray[Any]]:
-        if not self._parts:
-            return [np.empty(shape) for shape in empty]
-        return [np.concatenate(column) for column in zip(*self._parts, strict=True)]
-
-    def ragged(
-        self,
-        topic: str,
-        schema: schemas.Schema,
-        runs: int,
-        metadata: Mapping[str, str],
-        **columns: NDArray[Any],
-    ) -> Ragged:
-        none = [np.empty(0, np.int64)]
-        run, time_ns = (np.concatenate(part or none) for part in (self._run, self._time_ns))
-        stream = make_stream(topic, schema, time_ns, metadata=metadata, **columns)
-        return Ragged(stream, np.searchsorted(run, np.arange(runs + 1)))
+    )
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> list[Bound]:

@@ -1,15 +1,16 @@
 """What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Stream, Topic, make_stream, schemas
+from recorders.log import Stream, Topic, make_stream, schemas
+from replay.engine.arrays import Booleans, Integers
 from replay.engine.blocks import Ragged
+from replay.engine.channels import stated
 from replay.engine.components import components_of
 from replay.engine.failures import reason_stream
 from replay.engine.results import state_stream
@@ -20,10 +21,10 @@ class Batches(NamedTuple):
     """Which measurements are solved together: the run of each batch, in order, and its last stamp."""
 
     runs: int
-    run: NDArray[np.int64]
-    time_ns: NDArray[np.int64]
+    run: Integers
+    time_ns: Integers
 
-    def ragged(self, stream: Stream, rows: NDArray[np.bool_]) -> Ragged:
+    def ragged(self, stream: Stream, rows: Booleans) -> Ragged:
         """An output stream with a message for each of these batches."""
         return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
 
@@ -46,7 +47,7 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
     )
 
 
-def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, NDArray[np.int64]]:
+def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integers]:
     """The batches of a table, one for each value of `key` in each run, and which one each row is of.
 
     A run's batches are in the order of their last stamps, whatever their keys.
@@ -95,19 +96,9 @@ def solution_streams(
     ]
 
 
-def sensor_numbers(topics: Mapping[str, Topic], leaf: str, schema: Schema) -> list[int]:
-    """The numbers of the sensors whose /sensorN/LEAF has this schema."""
-    names = [name for name, topic in topics.items() if topic.schema_name == schema.full_name]
-    split = [name.removeprefix("/sensor").partition("/") for name in names if name.startswith("/sensor")]
-    return sorted(int(number) for number, _, rest in split if rest == leaf and number.isdigit())
-
-
-def stated(topic: Topic, name: str) -> float:
+def positive(topic: Topic, name: str) -> float:
     """A positive number that the channel's metadata states; raises BadInput where it does not."""
-    try:
-        value = float(topic.metadata[name])
-    except (KeyError, ValueError):
-        value = np.nan
+    value = stated([topic], name)
     if not 0.0 < value < np.inf:
-        raise BadInput(f"topic {topic.name} does not state {name}; record it with its sensor's noise")
+        raise BadInput(f"topic {topic.name} states {name} = {value:g}, which must be positive")
     return value

@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.engine.arrays import Floats
+
 Numbers = NDArray  # real or complex
-Floats = NDArray[np.float64]
 
 
 class Pseudo(NamedTuple):

@@ -24,6 +24,7 @@ from replay.distributions.wrapped_normal import (
     require_central_weight,
 )
 from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+from replay.engine.arrays import Floats, Integers
 from replay.engine.compile import compile_over_runs
 
 
@@ -38,9 +39,9 @@ class HeadingModel(NamedTuple):
     """
 
     coupling_rad: float
-    drift_rad: NDArray[np.float64]
-    system: NDArray[np.float64]
-    measurement: NDArray[np.float64]
+    drift_rad: Floats
+    system: Floats
+    measurement: Floats
 
 
 def make_heading_model(
@@ -58,8 +59,8 @@ def make_heading_model(
 def run_toroidal_filter(
     model: HeadingModel,
     state: WrappedNormal,
-    offsets: NDArray[np.int64],
-    measurement: NDArray[np.float64],
+    offsets: Integers,
+    measurement: Floats,
     *,
     central_weight: float = 0.2,
 ) -> tuple[WrappedNormal, WrappedNormal]:
@@ -86,8 +87,8 @@ def run_toroidal_filter(
 def run_unscented_filter(
     model: HeadingModel,
     state: WrappedNormal,
-    offsets: NDArray[np.int64],
-    measurement: NDArray[np.float64],
+    offsets: Integers,
+    measurement: Floats,
     *,
     wrapped: bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
@@ -103,8 +104,8 @@ def _run(
     step: Callable[..., None],
     model: HeadingModel,
     state: WrappedNormal,
-    offsets: NDArray[np.int64],
-    measurement: NDArray[np.float64],
+    offsets: Integers,
+    measurement: Floats,
     option: float | bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     if measurement.shape != (offsets[-1], 2):
@@ -124,8 +125,8 @@ def _over_runs(step: Callable[..., None]) -> Callable[..., None]:
         run: int,
         model: HeadingModel,
         option: float | bool,
-        offsets: NDArray[np.int64],
-        measurement: NDArray[np.float64],
+        offsets: Integers,
+        measurement: Floats,
         state: WrappedNormal,
         estimates: WrappedNormal,
     ) -> None:

@@ -7,12 +7,10 @@ The weights are those of a scan with detection probability p_D and Poisson clutt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from replay.engine.arrays import Floats, Integers
 
 MISSED = -1
 # Detections farther than this from a vehicle are not tried for it, nor maps that are so improbable.

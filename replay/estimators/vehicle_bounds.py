@@ -7,11 +7,10 @@ supposes accelerations; the truth has them (stochastic) or none (deterministic).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.models.vehicles import noise_moments
+from replay.engine.arrays import Floats
 
-Floats = NDArray[np.float64]
 SETTLED = 2000
 
 

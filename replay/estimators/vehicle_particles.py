@@ -20,8 +20,9 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic
 from recorders.models.vehicles import turn
 from recorders.parameters import Parameters
+from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged
-from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.estimator import Bound, Estimator
 from replay.estimators.vehicle_association import (
     all_maps,
     log_likelihoods,
@@ -39,8 +40,6 @@ from replay.estimators.vehicle_streams import (
 from replay.estimators.vehicle_updates import Setup, blocks_of, innovations_of
 from replay.estimators.vehicles import (
     STATES,
-    Floats,
-    Integers,
     Joint,
     normalised,
     position_rows,
@@ -102,15 +101,12 @@ def parse_method(method: str, seed: int) -> Method:
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameters) -> list[Bound]:
     method = parse_method(parameters.method, parameters.seed)
-    bound = bind_vehicles(name, topics, "set", "topology" if method.uses_topology else "", 1)
-    if bound is None:
-        return []
-    setup, used, priors = bound
-    begin, advance = partial(_start, setup, method), partial(_run, setup, method)
-    return [Recursive(name, used, tuple(priors), begin, advance, priors)]
+    begin, advance = partial(_start, method), partial(_run, method)
+    sensor = "topology" if method.uses_topology else ""
+    return bind_vehicles(name, topics, "set", sensor, begin, advance)
 
 
-def _start(setup: Setup, method: Method, whole: Mapping[str, Ragged]) -> Cloud:
+def _start(method: Method, setup: Setup, whole: Mapping[str, Ragged]) -> Cloud:
     carried = start(setup, whole)
     runs = len(carried.mean)
     covariance = carried.covariance if method.kind == "associations" else np.empty((runs, 0, 0))
@@ -121,7 +117,7 @@ def _start(setup: Setup, method: Method, whole: Mapping[str, Ragged]) -> Cloud:
     return Cloud(carried, joint, np.zeros((runs, method.particles)), [None] * runs)
 
 
-def _run(setup: Setup, method: Method, before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
+def _run(method: Method, setup: Setup, before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
     """Filter a block; see `replay.engine.estimator.Recursive`."""
     cloud = copy.deepcopy(before)
     frames = frames_of(setup, block)

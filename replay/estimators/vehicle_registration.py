@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from replay.engine.arrays import Booleans, Floats, Integers
 
 MOST_VEHICLES = 8
 # A fit with so improbable a residual is of other things than the vehicles.
@@ -32,7 +30,7 @@ class Registration(NamedTuple):
 
     pose: Floats
     detection: Integers
-    is_clear: NDArray[np.bool_]
+    is_clear: Booleans
 
 
 def register(places: Floats, detections: Floats, variance_m2: Floats | float) -> Registration:
@@ -67,7 +65,7 @@ def register(places: Floats, detections: Floats, variance_m2: Floats | float) ->
     return Registration(pose, detection, is_clear)
 
 
-def is_spread(detections: Floats, variance_m2: Floats | float) -> NDArray[np.bool_]:
+def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
     """Whether detections (runs, vehicles, 2), NaN for none, are far enough apart to tell a heading."""
     count = np.isfinite(detections[..., 0]).sum(axis=1)
     squared = np.nansum((detections - _middle(detections)) ** 2, axis=(1, 2))

@@ -6,19 +6,20 @@ frame after frame is filtered in all runs at once.
 """
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged
+from replay.engine.channels import numbered, stated
 from replay.engine.components import Components, components_of
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import Failure, reason_stream
@@ -39,9 +40,7 @@ from replay.estimators.vehicle_updates import (
     update_by_topology,
     where,
 )
-from replay.estimators.vehicles import POSE, STATES, Floats, Integers, Joint, Motion, predict
-
-Booleans = NDArray[np.bool_]
+from replay.estimators.vehicles import POSE, STATES, Joint, Motion, predict
 
 POSE_COMPONENTS = ("x_m", "y_m", "heading_rad")
 FAILED = "the estimate is no longer finite"
@@ -121,14 +120,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters
     fixes, sensor = split_method(parameters.method)
     if fixes not in FIXES:
         raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
-    bound = bind_vehicles(
-        name, topics, fixes, sensor, parameters.registration_scan, parameters.sigma_fix_m
-    )
-    if bound is None:
-        return []
-    setup, used, priors = bound
-    begin, advance = partial(start, setup), partial(run, setup)
-    return [Recursive(name, used, tuple(priors), begin, advance, priors)]
+    scan, sigma_m = parameters.registration_scan, parameters.sigma_fix_m
+    return bind_vehicles(name, topics, fixes, sensor, start, run, scan, sigma_m)
 
 
 def bind_vehicles(
@@ -136,13 +129,12 @@ def bind_vehicles(
     topics: Mapping[str, Topic],
     fixes: str,
     sensor: str,
-    registration_scan: int,
+    begin: Callable[[Setup, Mapping[str, Ragged]], Any],
+    advance: Callable[[Setup, Any, Block], tuple[Any, list[Ragged]]],
+    registration_scan: int = 1,
     sigma_fix_m: float | None = None,
-) -> tuple[Setup, tuple[str, ...], dict[str, Components]] | None:
-    """What a method is told, the topics it follows, and the priors with what is wanted of each.
-
-    None where a topic is missing.
-    """
+) -> list[Bound]:
+    """A method over the topics it follows; nothing where one is missing."""
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -150,7 +142,7 @@ def bind_vehicles(
     if sensor:
         used += ["/infrastructure/scan", "/infrastructure/detection"]
     if not numbers or not set(used) <= set(topics):
-        return None
+        return []
     setup = Setup(
         name,
         tuple(numbers),
@@ -163,37 +155,27 @@ def bind_vehicles(
         sigma_fix_m,
     )
     state: Components = dict.fromkeys(PLANE_MOTION, "linear")
-    return setup, tuple(used), {f"/vehicle{number}/prior": state for number in numbers}
+    priors = {f"/vehicle{number}/prior": state for number in numbers}
+    start, run = partial(begin, setup), partial(advance, setup)
+    return [Recursive(name, tuple(used), tuple(priors), start, run, priors)]
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
     """The numbers of the vehicles of a log."""
-    names = [name.removeprefix("/vehicle").partition("/") for name in topics]
-    return sorted(int(number) for number, _, leaf in names if leaf == "prior" and number.isdigit())
+    return list(numbered(topics, "vehicle", "prior", schemas.GAUSSIAN_ESTIMATE))
 
 
 def motion_of(topics: Mapping[str, Topic], numbers: Sequence[int]) -> Motion:
     """How the vehicles move, as their priors' channels state it."""
-    stated = [topics[f"/vehicle{number}/prior"] for number in numbers]
-    return Motion(
-        np.array([_stated(topic, "turn_rate_radps") for topic in stated]),
-        np.array([_stated(topic, "acceleration_sigma_mps2") for topic in stated]),
-    )
+    priors = [topics[f"/vehicle{number}/prior"] for number in numbers]
+    return Motion(*(np.array([stated([prior], name) for prior in priors]) for name in Motion._fields))
 
 
 def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
     """What a scan's channel states of its sensor; a log without it has no such sensor."""
     if topic not in topics:
         return Scanning(1.0, 1.0, 0.0)
-    names = ("variance_m2", "detection_probability", "clutter_per_m2")
-    return Scanning(*(_stated(topics[topic], name) for name in names))
-
-
-def _stated(topic: Topic, name: str) -> float:
-    try:
-        return float(topic.metadata[name])
-    except (KeyError, ValueError):
-        raise BadInput(f"topic {topic.name} does not state {name}; record the vehicles again") from None
+    return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
 
 
 def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.estimators.symmetric_sums import (
     power_sums,
     power_sums_at,
@@ -28,8 +28,6 @@ from replay.estimators.vehicle_registration import fitted_pose, is_spread, regis
 from replay.estimators.vehicles import (
     POSE,
     STATES,
-    Floats,
-    Integers,
     Joint,
     Motion,
     collapse,
@@ -41,8 +39,6 @@ from replay.estimators.vehicles import (
     update_by_scalar,
     update_by_shape,
 )
-
-Booleans = NDArray[np.bool_]
 
 FIXES = {
     "known": "every vehicle's fixes are known to be its own",

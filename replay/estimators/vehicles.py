@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from recorders.models.vehicles import into_frame, noise_moments, turn
+from replay.engine.arrays import Floats, Integers
 from replay.estimators.vehicle_association import Hypotheses
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 STATES = 4  # of a vehicle
 POSE = 3  # components of the sensor's pose

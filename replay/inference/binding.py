@@ -5,16 +5,15 @@ as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is l
 """
 
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recorders.errors import BadInput
 from recorders.log import Schema, Topic, schemas
-from recorders.parameters import ParametersType, build
+from replay.engine.arrays import Floats, Function
+from replay.engine.channels import bindings, stated
 from replay.inference.generate import function_of
 from replay.inference.model import (
     Model,
@@ -25,9 +24,6 @@ from replay.inference.model import (
     check_state,
 )
 from replay.inference.steps import Stage
-
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
 
 
 class Found(NamedTuple):
@@ -41,31 +37,24 @@ class Found(NamedTuple):
 
 def topics_of(model: Model, topics: Mapping[str, Topic]) -> list[Found]:
     """Everything in a log that is of this model."""
+    needed = {model.prior: schemas.GAUSSIAN_ESTIMATE}
+    if model.control is not None:
+        needed[model.control.topic] = model.control.schema
+    senses = {sensor.topic: sensor.schema for sensor in model.sensors}
+    maps = {sensor.about.topic: sensor.about.schema for sensor in model.sensors if sensor.about}
     found = []
-    for name, prior in topics.items():
-        prefix, _, leaf = name.rpartition("/")
-        if leaf != model.prior or prior.schema_name != schemas.GAUSSIAN_ESTIMATE.full_name:
-            continue
-        control = None
-        if model.control is not None:
-            control = _topic(topics, prefix, model.control.topic, model.control.schema)
-            if control is None:
-                continue
+    for prefix, here in bindings(topics, {**needed, **senses, **maps}, [*senses, *maps]):
         sensors = tuple(
-            (sensor, topic)
+            (sensor, here[sensor.topic])
             for sensor in model.sensors
-            if (topic := _topic(topics, prefix, sensor.topic, sensor.schema)) is not None
-            and topic.metadata.get("system", model.system) == model.system
-            and (sensor.about is None or _topic(topics, "", sensor.about.topic, sensor.about.schema))
+            if sensor.topic in here
+            and here[sensor.topic].metadata.get("system", model.system) == model.system
+            and (sensor.about is None or sensor.about.topic in here)
         )
         if sensors or not model.needs_sensor:
-            found.append(Found(prefix, prior, control, sensors))
+            control = here[model.control.topic] if model.control is not None else None
+            found.append(Found(prefix, here[model.prior], control, sensors))
     return found
-
-
-def _topic(topics: Mapping[str, Topic], prefix: str, name: str, schema: Schema) -> Topic | None:
-    topic = topics.get(name if name.startswith("/") else f"{prefix}/{name}")
-    return topic if topic is not None and topic.schema_name == schema.full_name else None
 
 
 def needs_of(model: Model) -> str:
@@ -96,7 +85,9 @@ def _parts(model: Model, topics: Mapping[str, Topic], prefix: str) -> list[_Part
 
     def part(name: str, schema: Schema, system: str = "") -> _Part:
         place = name if name.startswith("/") else f"{prefix}/{name}"
-        found = _topic(topics, prefix, name, schema)
+        found = topics.get(place)
+        if found is not None and found.schema_name != schema.full_name:
+            found = None
         words = f"{place} ({schema.full_name}"
         words += f" of system {system})" if system else ")"
         if place in topics and found is None:
@@ -178,24 +169,31 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     given = {name: getattr(parameters, name) for name in names}
     everything = [topic for topic in (found.control, found.prior) if topic is not None]
     everything += [topic for _, topic in found.sensors]
-    where = f"estimator {label}"
-    check_state(where, model)
-    recorders = [_Recorder(given) for _ in range(1 + len(found.sensors))]
-    check_motion(where, model, stage.motion, recorders[0])
-    for (sensor, _), recorder in zip(found.sensors, recorders[1:], strict=True):
-        check_sensor(where, model, sensor, recorder)
+    needed = _needed(f"estimator {label}", stage, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
     return np.array(
         [
             [
-                stated(model.parameters, [*first, *everything], name, needed=name in recorder.read)
+                stated([*first, *everything], name, model.parameters, needed=name in read)
                 if given[name] is None
                 else float(given[name])
                 for name in names
             ]
-            for first, recorder in zip(own, recorders, strict=True)
+            for first, read in zip(own, needed, strict=True)
         ]
     )
+
+
+@lru_cache(maxsize=64)
+def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tuple[set[str], ...]:
+    """The parameters that motion and sensors read; BadInput where the model is not what it says."""
+    model, values = stage.model, dict(given)
+    check_state(where, model)
+    motion, *sensors = recorders = [_Recorder(values) for _ in range(1 + len(stage.sensors))]
+    check_motion(where, model, stage.motion, motion)
+    for sensor, recorder in zip(stage.sensors, sensors, strict=True):
+        check_sensor(where, model, sensor, recorder)
+    return tuple(each.read for each in recorders)
 
 
 def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
@@ -207,26 +205,3 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
         sensor.noise(recorder)
     mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))
     return f"topic {topic}: {sensor.covariance} is missing{mend}"
-
-
-def stated(
-    parameters: type[ParametersType], topics: Sequence[Topic], name: str, *, needed: bool = True
-) -> float:
-    """The first number that one of the channels states for a parameter; NaN where none needs to.
-
-    Raises BadInput where none states it though it is needed, or the parameter does not take it.
-    """
-    for topic in topics:
-        if name in topic.metadata:
-            text = topic.metadata[name]
-            try:
-                value = float(text)
-            except ValueError:
-                raise BadInput(
-                    f"topic {topic.name} states {name} = {text}, which is no number"
-                ) from None
-            build(parameters, {name: value}, f"topic {topic.name}")
-            return value
-    if needed:
-        raise BadInput(f"topic {topics[0].name} does not state {name}; give it with --set {name}=...")
-    return np.nan

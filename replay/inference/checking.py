@@ -4,17 +4,18 @@
 angle, numbers of components, variances. What it finds is one sentence with the function's file and line.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
 from recorders.parameters import build
+from replay.engine.arrays import Floats, Function
 from replay.engine.tangent import WIDTHS, tangent_components
 from replay.inference.binding import number_fields, settings_type
 from replay.inference.generate import (
@@ -25,17 +26,7 @@ from replay.inference.generate import (
     tangent_size,
     things,
 )
-from replay.inference.model import (
-    Function,
-    Model,
-    Motion,
-    Sensor,
-    check_motion,
-    check_sensor,
-    check_state,
-)
-
-Floats = NDArray[np.float64]
+from replay.inference.model import Model, Motion, Sensor, check_motion, check_sensor, check_state
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
@@ -337,7 +328,7 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
         )
 
 
-def _check_noise(noise: Callable[..., Any] | None, arguments: tuple[Any, ...], size: int) -> None:
+def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int) -> None:
     """Variances, or the rows of a lower triangle."""
     if noise is None:
         return

@@ -1,6 +1,5 @@
 """Estimators made of a model and a method, as a replay takes them."""
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters, build
 from recorders.registry import available, load
-from replay.engine.blocks import Block, Ragged, filled_rows, of_runs, ragged_rows
+from replay.engine.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
@@ -46,7 +45,15 @@ from replay.inference.happenings import (
 )
 from replay.inference.methods import METHODS, Method
 from replay.inference.model import Model, ModelParameters, Motion
-from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.recursion import (
+    Carried,
+    Estimates,
+    Happenings,
+    Innovations,
+    filled,
+    no_results,
+    recursion,
+)
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
@@ -56,6 +63,7 @@ Integers = NDArray[np.int64]
 Function = Callable[..., Any]
 
 
+@lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
     """The parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
@@ -178,7 +186,8 @@ def bind_model(
         whole = (found.prior.name, *maps)
         priors = {found.prior.name: model.state}
         start, run, finish = filtering.start, filtering.run, filtering.finish
-        bound.append(Recursive(name, streams, whole, start, run, priors, finish=finish))
+        made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
+        bound.append(made)
     return bound
 
 
@@ -319,16 +328,15 @@ class Filter:
         """Filter events."""
         model, sensors = self.stage.model, self.stage.sensors
         loop, steps = _compiled(self.stage, self.method)
-        before, carried = state.carried, copy.deepcopy(state.carried)
+        before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
-        estimates = Estimates(*_room(happenings.is_due, happenings.offsets, model.size, model.tangent))
+        due = ragged_rows(happenings.is_due, happenings.offsets)
+        noted = ragged_rows(happenings.source >= 0, happenings.offsets)
         slots = len(slots_of(sensors))
-        noted = _room(happenings.source >= 0, happenings.offsets, slots, slots)
-        innovations = Innovations(*noted, numbers=np.empty((len(noted[1]), 3)))
+        estimates, innovations = no_results(due, noted, model, slots)
         if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
-        starts = estimates.end.copy(), innovations.end.copy()
-        settings = np.broadcast_to(self.settings, (runs, *self.settings.shape)).copy()
+        settings = np.repeat(self.settings[None], runs, axis=0)
         generators = state.generators
         if any(each.redrawn for each in self.samplers):
             generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
@@ -343,73 +351,59 @@ class Filter:
                 innovations._replace(end=innovations.end[part]),
                 scratch=partial(steps.memory, sets),
             )
-        made = self.outputs(happenings, estimates, innovations, starts)
-        topic = f"/estimates/{self.name}"
-        made.append(failures_of(topic, before.failure, carried.failure, carried.time_ns, FAILURES))
+        made = self.outputs(filled(estimates, due), filled(innovations, noted))
+        if (carried.failure != before.failure).any():
+            failures = before.failure, carried.failure, carried.time_ns, FAILURES
+            made.append(failures_of(f"/estimates/{self.name}", *failures))
         return state._replace(carried=carried, generators=generators), made
 
     @cached_property
     def gates(self) -> Floats:
         """Bounds of the NIS (sensors, largest measurement + 1), by the number of components."""
         largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
-        gates = np.full((max(len(self.stage.sensors), 1), largest + 1), np.inf)
-        probability = self.parameters.gate_probability
-        gates[:, 1:] = chi2.ppf(probability, np.arange(1, largest + 1))
-        return gates
+        bounds = _nis_bounds(self.parameters.gate_probability, largest)
+        return np.repeat(bounds[None], max(len(self.stage.sensors), 1), axis=0)
 
     def outputs(
-        self,
-        happenings: Happenings,
-        estimates: Estimates,
-        innovations: Innovations,
-        starts: tuple[Integers, Integers],
+        self, estimated: tuple[Estimates, Integers], noted: tuple[Innovations, Integers]
     ) -> list[Ragged]:
-        """The streams of what the recursion filled in."""
+        """The streams of what the recursion filled in, and their offsets."""
         model, sensors = self.stage.model, self.stage.sensors
         prefix = self.found.prefix
         truth = model.truth if model.truth.startswith("/") else f"{prefix}/{model.truth}"
         topic = f"/estimates/{self.name}"
-        rows, offsets = filled_rows(np.append(starts[0], len(estimates.event)), estimates.end)
+        estimates, offsets = estimated
         state = state_stream(
             f"{topic}/{model.output}",
-            happenings.time_ns[estimates.event[rows]],
+            estimates.time_ns,
             model.state,
             truth,
-            estimates.mean[rows],
-            estimates.covariance[rows],
+            estimates.mean,
+            estimates.covariance,
         )
         made = [Ragged(state, offsets)]
         if not sensors:
             return made
-        rows, offsets = filled_rows(np.append(starts[1], len(innovations.event)), innovations.end)
-        event, numbers = innovations.event[rows], innovations.numbers[rows]
+        innovations, offsets = noted
         innovation = innovation_stream(
             f"{topic}/innovation",
-            happenings.time_ns[event],
+            innovations.time_ns,
             slots_of(sensors),
             truth,
-            target_id=happenings.target_id[event],
-            accepted=numbers[:, 2].astype(np.int64),
-            innovation=innovations.difference[rows],
-            covariance=innovations.covariance[rows],
-            squared=numbers[:, 0],
-            log_likelihood=numbers[:, 1],
+            target_id=innovations.target_id,
+            accepted=innovations.numbers[:, 2].astype(np.uint32),
+            innovation=innovations.difference,
+            covariance=innovations.covariance,
+            squared=innovations.numbers[:, 0],
+            log_likelihood=innovations.numbers[:, 1],
         )
         return [*made, Ragged(innovation, offsets)]
 
 
-def _room(
-    wanted: NDArray[np.bool_], offsets: Integers, size: int, spread: int
-) -> tuple[Integers, Integers, Floats, Floats]:
-    """Room for a row of every event that is wanted: where the runs' rows begin, and empty columns."""
-    starts = ragged_rows(wanted, offsets)
-    rows = int(starts[-1])
-    return (
-        starts[:-1].copy(),
-        np.empty(rows, np.int64),
-        np.empty((rows, size)),
-        np.empty((rows, spread, spread)),
-    )
+@lru_cache(maxsize=64)
+def _nis_bounds(probability: float, components: int) -> Floats:
+    """The quantiles (components + 1,) of the NIS of so many components; nothing is always let in."""
+    return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))
 
 
 def _seeded(

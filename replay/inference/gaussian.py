@@ -4,16 +4,12 @@ Means lie in the state's own space, covariances in its tangent space and are sym
 Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.models.planar import wrap_angle
-
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
+from replay.engine.arrays import Floats
 
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
@@ -144,6 +140,34 @@ def moved_covariance(covariance: Floats, transition: Floats, product: Floats) ->
             for k in range(size):
                 entry += product[row, k] * transition[column, k]
             covariance[row, column] = covariance[column, row] = entry
+
+
+def coast(
+    mean: Floats,
+    covariance: Floats,
+    duration_s: float,
+    layout: tuple[int, int],
+    noise: tuple[float, float, float],
+) -> None:
+    """Move positions at constant velocity for a while, in place.
+
+    Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
+    a variance of the position, a covariance of both, and a variance of the velocity.
+    """
+    stride, apart = layout
+    places = range(0, stride * (len(mean) // 2), stride)
+    for place in places:
+        mean[place] += duration_s * mean[place + apart]
+        for column in range(len(mean)):
+            covariance[place, column] += duration_s * covariance[place + apart, column]
+    for place in places:
+        for row in range(len(mean)):
+            covariance[row, place] += duration_s * covariance[row, place + apart]
+    for place in places:
+        covariance[place, place] += noise[0]
+        covariance[place, place + apart] += noise[1]
+        covariance[place + apart, place] += noise[1]
+        covariance[place + apart, place + apart] += noise[2]
 
 
 def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:

@@ -12,17 +12,17 @@ Hertzberg et al., Information Fusion 14, 2013; Sola, arXiv 1711.02508.
 
 import hashlib
 import linecache
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Function
 from replay.engine.tangent import WIDTHS
 from replay.inference.jets import jet, slope_of, value_of
 
-Function = Callable[..., Any]
 TANGENT = {"linear": 1, "angle": 1, "axis": 1, "quaternion": 3}
 # The basis of the imaginary units: e_i e_j = sign * e_k of Hamilton's product, as rows of `_product`.
 _PRODUCT = (
@@ -143,14 +143,10 @@ def differencing(kinds: tuple[str, ...]) -> Function:
             lines += [
                 f"    p = (b[{c}], b[{c + 1}], b[{c + 2}], b[{c + 3}])",
                 f"    q = (a[{c}], a[{c + 1}], a[{c + 2}], a[{c + 3}])",
-                f"    w, i, j, z = {', '.join(_terms('p', 'q', row, True) for row in range(4))}",
-                "    sign = -1.0 if w < 0.0 else 1.0",
-                "    length = np.sqrt(i * i + j * j + z * z)",
-                "    angle = np.arctan2(length, sign * w)",
-                "    scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)",
-                f"    d[k, {t}], d[k, {t + 1}], d[k, {t + 2}] = scale * i, scale * j, scale * z",
+                f"    turn = to_vector({', '.join(_terms('p', 'q', row, True) for row in range(4))})",
+                f"    d[k, {t}], d[k, {t + 1}], d[k, {t + 2}] = turn",
             ]
-    return function_of("\n".join([*lines, ""]), wrap_angle=wrap_angle)
+    return function_of("\n".join([*lines, ""]), wrap_angle=wrap_angle, to_vector=to_vector)
 
 
 @lru_cache(maxsize=64)
@@ -395,17 +391,13 @@ def recentring(kinds: tuple[str, ...]) -> Function:
                 f"    p = from_vector({', '.join(d)})",
                 "    for index in range(len(values)):",
                 f"        q = from_vector({', '.join(f'values[index, {t + row}]' for row in range(3))})",
-                f"        w, i, j, z = {', '.join(_terms('p', 'q', row, True) for row in range(4))}",
-                "        sign = -1.0 if w < 0.0 else 1.0",
-                "        length = np.sqrt(i * i + j * j + z * z)",
-                "        angle = np.arctan2(length, sign * w)",
-                "        scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)",
-                f"        values[index, {t}] = scale * i",
-                f"        values[index, {t + 1}] = scale * j",
-                f"        values[index, {t + 2}] = scale * z",
+                "        turn = to_vector("
+                f"{', '.join(_terms('p', 'q', row, True) for row in range(4))})",
+                *(f"        values[index, {t + row}] = turn[{row}]" for row in range(3)),
             ]
     lines.append("    return again")
-    return function_of("\n".join([*lines, ""]), wrap_angle=wrap_angle, from_vector=from_vector)
+    text = "\n".join([*lines, ""])
+    return function_of(text, wrap_angle=wrap_angle, from_vector=from_vector, to_vector=to_vector)
 
 
 def from_vector(x: float, y: float, z: float) -> tuple[float, float, float, float]:
@@ -413,3 +405,12 @@ def from_vector(x: float, y: float, z: float) -> tuple[float, float, float, floa
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
     scale = 0.5 * np.sinc(half / np.pi)
     return np.cos(half), scale * x, scale * y, scale * z
+
+
+def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The shortest rotation vector of a unit quaternion, which is that of its negative too."""
+    sign = -1.0 if w < 0.0 else 1.0
+    length = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(length, sign * w)
+    scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)
+    return scale * x, scale * y, scale * z

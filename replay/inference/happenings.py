@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Stream
+from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged, ragged_rows
 from replay.engine.measurements import read_fixes, read_vectors
 from replay.inference.binding import Found, number_fields, reading_settings
@@ -17,8 +18,7 @@ from replay.inference.model import Control, Map, Sensor
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
 from replay.inference.steps import Stage, reading
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,11 @@ class Points:
         rows = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return np.where(self.keys[rows] == keys, rows, -1)
 
+    def at(self, rows: Integers) -> Floats:
+        """The places (m, d) of rows as `rows` gives them; NaN where there is none."""
+        nowhere = np.full((1, self.places.shape[1]), np.nan)  # what has no row takes the last one
+        return np.concatenate([self.places, nowhere])[rows]
+
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
     """The points of all runs; raises BadInput where they lack a component."""
@@ -46,6 +51,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
+@lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
     """How many numbers an event has, and the first of the control's among them."""
     width, control = (
@@ -58,7 +64,7 @@ def data_columns(stage: Stage) -> tuple[int, int]:
 
 def happenings_of(
     stage: Stage, found: Found, block: Block, points: Mapping[str, Points], settings: Floats
-) -> tuple[Happenings, NDArray[np.bool_]]:
+) -> tuple[Happenings, Booleans]:
     """A block's messages as the recursion takes them, and which of them lack their covariance."""
     events, control = block.events, stage.model.control
     width, start = data_columns(stage)
@@ -86,7 +92,7 @@ def happenings_of(
     return happenings, lacking
 
 
-def last_of_stamps(happenings: Happenings) -> NDArray[np.bool_]:
+def last_of_stamps(happenings: Happenings) -> Booleans:
     """Whether no later event of the run has an event's stamp."""
     is_last = np.append(np.diff(happenings.time_ns) != 0, True)[: len(happenings.time_ns)]
     ends = happenings.offsets[1:]
@@ -100,7 +106,7 @@ class _Table(NamedTuple):
     data: Floats
     source: Integers
     target_id: Integers
-    is_lacking: NDArray[np.bool_]
+    is_lacking: Booleans
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, start: int) -> _Table:
@@ -141,14 +147,11 @@ def _sensor_table(
         parts = [_fields(stream, tuple(sensor.measured))]
     if sensor.about is not None:
         target = stream[sensor.about.of].astype(np.int64)
-        run, places = (
-            np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
-            points[sensor.about.topic],
-        )
+        run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
+        places = points[sensor.about.topic]
         rows = places.rows(run, target)
         source[rows < 0] = NOTHING
-        nowhere = np.full((1, sensor.about.size), np.nan)  # what is not on the map takes the last row
-        parts.insert(1, np.concatenate([places.places, nowhere])[rows])
+        parts.insert(1, places.at(rows))
     source[lacking] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
@@ -192,7 +195,7 @@ def joined(first: Happenings, second: Happenings) -> Happenings:
     return Happenings(first.offsets + second.offsets, *columns)
 
 
-def _of_rows(happenings: Happenings, chosen: NDArray[np.bool_]) -> Happenings:
+def _of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
     columns: Any = (column[chosen] for column in happenings[1:])
     return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
 
@@ -237,13 +240,19 @@ def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
 def with_ticks(
     happenings: Happenings, start_ns: Integers, tick: Integers, every_ns: int
 ) -> tuple[Happenings, Integers]:
-    """Events, and between them one every so often, at which an estimate is wanted."""
+    """Events, and between them one every so often, at which an estimate is wanted.
+
+    From the prior on, or, where that is more than EARLY such times before the run's first event, from
+    there on.
+    """
     times, runs, ticks = [], [], tick.copy()
     for number, (begin, end) in enumerate(pairwise(happenings.offsets)):
         if begin == end:
             continue
-        last_ns = happenings.time_ns[end - 1]
-        first = max(int(tick[number]), -(-int(start_ns[number]) // every_ns))
+        first_ns, last_ns = happenings.time_ns[begin], happenings.time_ns[end - 1]
+        is_old = tick[number] == 0 and first_ns - start_ns[number] > EARLY * every_ns
+        begins_ns = int(first_ns if is_old else start_ns[number])
+        first = max(int(tick[number]), -(-begins_ns // every_ns))
         stop = max(int(last_ns) // every_ns + 1, first)
         wanted = np.arange(first, stop) * every_ns
         own = happenings.time_ns[begin:end][happenings.is_due[begin:end]]

@@ -16,7 +16,7 @@ A derivative that is infinite elsewhere (`log` at 0, `1 / x`) makes slopes infin
 code take a tuple of jets apart by `a, b, c = model(x)`: an index carries all of the tuple along each
 time, and 240 of them took 25 s of compiling instead of 3.
 """
-# ruff: noqa: ARG001, ARG002, ARG005, D102 - what the tables and numba call has the arguments that they give
+# ruff: noqa: ARG002, ARG005, D102 - what the tables and numba call has the arguments that they give
 
 import math
 import operator
@@ -40,6 +40,7 @@ from numba.extending import (
 )
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Function
 
 _REFUSAL = (
     "a jet is a number with slopes: a model for jets uses np.* of scalars (not math.*), returns tuples "
@@ -123,7 +124,7 @@ _PREDICATES = (
     *(np.isnan, np.isfinite, np.isinf, np.signbit, np.logical_not),
 )
 # What is made of other functions; a true choice, so that NaN in what is not chosen stays there.
-_COMPOSED: dict[Any, Callable[..., Any]] = {
+_COMPOSED: dict[Any, Function] = {
     np.where: lambda condition, x, y: x if condition else y,
     np.minimum: lambda x, y: x if x <= y or np.isnan(x) else y,
     np.maximum: lambda x, y: x if x >= y or np.isnan(x) else y,
@@ -292,9 +293,7 @@ def _jet_type(*given: types.Type) -> JetType | None:
     return jets.pop() if jets else None
 
 
-def _teach(
-    function: Any, arity: int, type_of: Callable[[JetType], types.Type], lower: Callable[..., Any]
-) -> None:
+def _teach(function: Any, arity: int, type_of: Callable[[JetType], types.Type], lower: Function) -> None:
     """Have numba compile `function` of jets and numbers by `lower(context, builder, sig, args)`."""
 
     def typed(*given: types.Type) -> types.Type | None:
@@ -369,7 +368,7 @@ def _chained(context: Any, builder: Any, sig: Any, args: Any, value: Any, deriva
     return _made(context, builder, sig.return_type, value, slopes)
 
 
-def _teach_smooth(name: Any, function: Any, derivatives: Callable[..., Any], arity: int) -> None:
+def _teach_smooth(name: Any, function: Any, derivatives: Function, arity: int) -> None:
     by_argument = types.UniTuple(types.float64, arity)
     sig_of_derivatives = signature(by_argument, *[types.float64] * (1 + arity))
 
@@ -417,7 +416,7 @@ def _teach_power_by_constant(name: Any) -> None:
     lower_builtin(name, JetType, types.IntegerLiteral)(lower)
 
 
-def _teach_composed(name: Any, composed: Callable[..., Any]) -> None:
+def _teach_composed(name: Any, composed: Function) -> None:
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return _inlined(context, builder, composed, sig, args)
 
@@ -427,7 +426,7 @@ def _teach_composed(name: Any, composed: Callable[..., Any]) -> None:
     _teach(name, composed.__code__.co_argcount, type_of, lower)
 
 
-def _teach_least(name: Any, lesser: Callable[..., Any]) -> None:
+def _teach_least(name: Any, lesser: Function) -> None:
     """Python's `min` and `max`, of two numbers or more."""
 
     def type_of(*given: types.Type) -> types.Type | None:
@@ -459,7 +458,7 @@ def _teach_all() -> None:
     def names(function: Any) -> tuple[Any, ...]:
         return (function, *_ALIASES.get(function, ()))
 
-    def arity(formula: Callable[..., Any]) -> int:
+    def arity(formula: Function) -> int:
         return formula.__code__.co_argcount
 
     for function, derivatives in _DERIVATIVES.items():

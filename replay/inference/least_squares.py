@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Booleans, Floats, Integers
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 # Keeps the scaled normal equations (unit diagonal) solvable where a direction is not observed at all.
@@ -44,13 +43,13 @@ class Linearization(NamedTuple):
     covariance_jacobian: derivative of `covariance`, one axis n more; None where it is constant.
     """
 
-    residual: Array
-    jacobian: Array
-    covariance: Array
-    covariance_jacobian: Array | None = None
+    residual: Floats
+    jacobian: Floats
+    covariance: Floats
+    covariance_jacobian: Floats | None = None
 
 
-Model = Callable[[Array, Rows], Linearization]
+Model = Callable[[Floats, Rows], Linearization]
 
 
 class Status(IntEnum):
@@ -80,22 +79,22 @@ class Bound(NamedTuple):
     A parameter that takes part in an unobservable direction has infinite variance and no covariances.
     """
 
-    covariance: Array
-    rank: NDArray[np.int64]
+    covariance: Floats
+    rank: Integers
 
 
 class Solution(NamedTuple):
     """Estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half of chi-square."""
 
-    parameters: Array
-    covariance: Array
-    rank: NDArray[np.int64]
-    iterations: NDArray[np.int64]
-    cost: Array
-    status: NDArray[np.int64]
+    parameters: Floats
+    covariance: Floats
+    rank: Integers
+    iterations: Integers
+    cost: Floats
+    status: Integers
 
     @property
-    def converged(self) -> Flags:
+    def converged(self) -> Booleans:
         """Which runs have an estimate, (runs,)."""
         return self.status == Status.CONVERGED
 
@@ -103,23 +102,23 @@ class Solution(NamedTuple):
 class _Whitened(NamedTuple):
     """A linearization in standard deviations, and the whitener that made it so."""
 
-    residual: Array
-    jacobian: Array
-    whitener: Array
+    residual: Floats
+    jacobian: Floats
+    whitener: Floats
 
-    def take(self, rows: Rows | Flags) -> "_Whitened":
+    def take(self, rows: Rows | Booleans) -> "_Whitened":
         return _Whitened(*(column[rows] for column in self))
 
     @property
-    def cost(self) -> Array:
+    def cost(self) -> Floats:
         return _half_square(self.residual)
 
     @property
-    def usable(self) -> Flags:
+    def usable(self) -> Booleans:
         return np.isfinite(self.cost) & np.asarray(np.isfinite(self.jacobian).all(axis=(1, 2)))
 
 
-def solve(model: Model, start: Array, *, tolerance: float = 1e-6, max_iterations: int = 50) -> Solution:
+def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iterations: int = 50) -> Solution:
     """Search the weighted least-squares estimate of every run from `start` (runs, n).
 
     `model(parameters, rows)` linearizes the runs `rows`, which may be none. A run has converged when its
@@ -144,7 +143,7 @@ def solve(model: Model, start: Array, *, tolerance: float = 1e-6, max_iterations
     return Solution(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
-def _solve_block(model: Model, start: Array, tolerance: float, max_iterations: int) -> Solution:
+def _solve_block(model: Model, start: Floats, tolerance: float, max_iterations: int) -> Solution:
     parameters = start.astype(np.float64)
     iterations = np.zeros(len(start), np.int64)
     status = np.where(np.isfinite(start).all(axis=1), Status.NOT_FINITE, Status.NO_START)
@@ -167,7 +166,7 @@ def _solve_block(model: Model, start: Array, tolerance: float, max_iterations: i
     return _judge(model, parameters, iterations, status)
 
 
-def _gauss_newton(here: _Whitened) -> tuple[Array, Array]:
+def _gauss_newton(here: _Whitened) -> tuple[Floats, Floats]:
     """The full step, and its length in standard deviations."""
     scale = _column_scale(here.jacobian)
     scaled = here.jacobian * scale[:, None, :]
@@ -180,12 +179,12 @@ def _gauss_newton(here: _Whitened) -> tuple[Array, Array]:
 
 
 def _line_search(
-    model: Model, parameters: Array, rows: Rows, step: Array, here: _Whitened
-) -> tuple[Array, _Whitened, Flags]:
+    model: Model, parameters: Floats, rows: Rows, step: Floats, here: _Whitened
+) -> tuple[Floats, _Whitened, Booleans]:
     """Halve the steps of those runs whose cost would rise while the weights stay as they are here."""
     limit = here.cost + COST_ROUNDING * (1.0 + here.cost)
 
-    def attempt(some: Rows, factor: float) -> tuple[Array, _Whitened, Flags]:
+    def attempt(some: Rows, factor: float) -> tuple[Floats, _Whitened, Booleans]:
         trial = parameters[some] + factor * step[some]
         seen = model(trial, rows[some])
         found = _whiten(seen)
@@ -204,9 +203,7 @@ def _line_search(
     return reached, there, ~rising
 
 
-def _judge(
-    model: Model, parameters: Array, iterations: NDArray[np.int64], status: NDArray[np.int64]
-) -> Solution:
+def _judge(model: Model, parameters: Floats, iterations: Integers, status: Integers) -> Solution:
     """Bound, rank and cost where each run ended."""
     runs, n = parameters.shape
     covariance, cost = np.full((runs, n, n), np.nan), np.full(runs, np.nan)
@@ -219,13 +216,7 @@ def _judge(
     return Solution(parameters, covariance, rank, iterations, cost, status)
 
 
-def fisher_information(at: Linearization) -> Array:
-    """Fisher information (runs, n, n), trace term of a parameter-dependent covariance included."""
-    root = information_root(at)
-    return np.swapaxes(root, 1, 2) @ root
-
-
-def information_root(at: Linearization) -> Array:
+def information_root(at: Linearization) -> Floats:
     """Rows (runs, k, n) whose outer products sum to the Fisher information.
 
     First the whitened Jacobian; then, where the covariance depends on the parameters, one row for each
@@ -269,7 +260,7 @@ def cramer_rao_bound(at: Linearization) -> Bound:
     return Bound(covariance, rank)
 
 
-def unobservable_directions(at: Linearization) -> list[Array]:
+def unobservable_directions(at: Linearization) -> list[Floats]:
     """For each run the directions that no measurement sees, unit columns (n, n - rank), own units."""
     root, scale = _scaled_root(at)
     values, right = _singular_values(root)
@@ -279,7 +270,7 @@ def unobservable_directions(at: Linearization) -> list[Array]:
     return [columns[:, gap] for columns, gap in zip(directions, unseen, strict=True)]
 
 
-def _scaled_root(at: Linearization) -> tuple[Array, Array]:
+def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
     """The information root with columns of unit length, and the scale that made them so."""
     root = information_root(at)
     root = np.where(np.isfinite(root).all(axis=(1, 2), keepdims=True), root, 0.0)
@@ -287,7 +278,7 @@ def _scaled_root(at: Linearization) -> tuple[Array, Array]:
     return root * scale[:, None, :], scale
 
 
-def _inverse_factor(root: Array) -> tuple[Array, Flags]:
+def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
     """Matrices whose squares are the inverse information, and where the rank is full for sure.
 
     With F the inverse of the triangular factor, no singular value is below 1 / |F| nor above sqrt(n).
@@ -303,7 +294,7 @@ def _inverse_factor(root: Array) -> tuple[Array, Flags]:
     return inverse, ~singular & (norm * np.sqrt(n) < 1.0 / RANK_TOLERANCE)
 
 
-def _singular_values(root: Array) -> tuple[Array, Array]:
+def _singular_values(root: Floats) -> tuple[Floats, Floats]:
     """All n singular values, largest first, and their right vectors as columns."""
     runs, rows, n = root.shape
     _, singular, right = np.linalg.svd(root, full_matrices=rows < n)
@@ -312,19 +303,19 @@ def _singular_values(root: Array) -> tuple[Array, Array]:
     return values, np.swapaxes(right, 1, 2)
 
 
-def describe_direction(names: Sequence[str], direction: Array) -> str:
+def describe_direction(names: Sequence[str], direction: Floats) -> str:
     """Name a direction (n,): the shares of its parameters against the largest, in their order."""
     share = direction / direction[np.argmax(np.abs(direction))]
     parts = [(name, part) for name, part in zip(names, share, strict=True) if abs(part) > PARTICIPATION]
     return ", ".join(f"{name} {part:+.3g}" for name, part in parts)
 
 
-def mask_missing(at: Linearization, present: Flags) -> Linearization:
+def mask_missing(at: Linearization, present: Booleans) -> Linearization:
     """Take out the measurements that are not `present` (runs, m): they then carry no information."""
     if present.all():
         return at
     kept, slope = present, at.covariance_jacobian
-    unit: Array = np.ones(present.shape[1])
+    unit: Floats = np.ones(present.shape[1])
     if at.covariance.ndim == 4:
         block = present.reshape(at.covariance.shape[:3])
         kept, unit = block[..., :, None] & block[..., None, :], np.eye(at.covariance.shape[2])
@@ -342,7 +333,7 @@ def _whiten(at: Linearization) -> _Whitened:
     return _Whitened(residual, _apply(whitener, at.jacobian), whitener)
 
 
-def _whitener(covariance: Array) -> Array:
+def _whitener(covariance: Floats) -> Floats:
     """Inverse square root of the covariance, in its shape; NaN for a run where it is not positive."""
     if covariance.ndim == 2:
         positive = covariance > 0.0
@@ -355,7 +346,7 @@ def _whitener(covariance: Array) -> Array:
         return np.concatenate([_whitener(one[None]) for one in covariance])
 
 
-def _apply(whitener: Array, columns: Array) -> Array:
+def _apply(whitener: Floats, columns: Floats) -> Floats:
     """Whiten columns (runs, m, any)."""
     if whitener.ndim == 2:
         return whitener[:, :, None] * columns
@@ -363,11 +354,11 @@ def _apply(whitener: Array, columns: Array) -> Array:
     return (whitener @ blocks).reshape(columns.shape)
 
 
-def _half_square(residual: Array) -> Array:
+def _half_square(residual: Floats) -> Floats:
     return 0.5 * (residual[:, None, :] @ residual[:, :, None])[:, 0, 0]
 
 
-def _column_scale(matrix: Array) -> Array:
+def _column_scale(matrix: Floats) -> Floats:
     """What gives each column (runs, m, n) unit length, (runs, n); 1 for a column of zeros."""
     norm = np.sqrt((matrix * matrix).sum(axis=1))
     return 1.0 / np.where(norm > 0.0, norm, 1.0)

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import NonNegativeInt, PositiveFloat
 
 from recorders.parameters import Parameters
+from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
 from replay.inference.binding import number_fields, settings_type
 from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
@@ -42,9 +42,6 @@ from replay.inference.steps import (
 )
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
-
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
 
 ITERATIONS = 50
 SETTLED = 1e-12  # of the iterated update: the largest component of the last step
@@ -146,7 +143,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,  # noqa: ARG001
+        use: int,
         work: Workspace,
         note: Note,
     ) -> int:
@@ -165,7 +162,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
             squared, determinant = whiten(innovation, size)
             if np.isnan(squared):
                 return NOT_POSITIVE_DEFINITE
-            if iteration == 0 and not squared <= gate[size]:
+            if size == 0 or (iteration == 0 and not squared <= gate[size]):
                 note_numbers(note, squared, determinant, size, False)
                 return ALL_WELL
             for row in range(t):
@@ -241,7 +238,7 @@ def _exact_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,  # noqa: ARG001
+        use: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)
@@ -260,12 +257,7 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 
     def innovate(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        use: int,  # noqa: ARG001
-        work: Workspace,
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
     ) -> bool:
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted

@@ -11,18 +11,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream
 from recorders.parameters import Parameters
+from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.tangent import are_kinds
 from replay.inference.generate import tangent_size
-
-Function = Callable[..., Any]
-Floats = NDArray[np.float64]
 
 
 class ModelParameters(Parameters):
@@ -123,7 +120,8 @@ class Sensor:
         schema: of its messages.
         measured: the components by name, with their kinds ("linear" or "angle").
         measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
-            empty. With `noises`, (state, noise, about, parameters).
+            empty. With `noises`, (state, noise, about, parameters). A component that says nothing of
+            this state, or has no derivative there, is NaN: as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
             with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
             has neither is passed over, and counted.

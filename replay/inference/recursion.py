@@ -5,14 +5,18 @@ what drives the next prediction. Messages before the state's own time say nothin
 belief is no Gaussian any more.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.engine.blocks import filled_rows
 from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
+from replay.inference.model import Model
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
@@ -71,7 +75,7 @@ class Estimates(NamedTuple):
     """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
-    event: Integers
+    time_ns: Integers
     mean: Floats
     covariance: Floats
 
@@ -80,10 +84,48 @@ class Innovations(NamedTuple):
     """The innovations as the recursion fills them in, see `Estimates` and `steps.Note`."""
 
     end: Integers
-    event: Integers
+    time_ns: Integers
+    target_id: NDArray[np.uint32]
     difference: Floats
     covariance: Floats
     numbers: Floats
+
+
+ResultsType = TypeVar("ResultsType", Estimates, Innovations)
+
+
+def no_results(
+    due: Integers, noted: Integers, model: Model, slots: int
+) -> tuple[Estimates, Innovations]:
+    """Results to be filled in: run r has the rows due[r]:due[r + 1] and noted[r]:noted[r + 1].
+
+    All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
+    every page by itself, and that takes as long as half of a small filter.
+    """
+    n, t = model.size, model.tangent
+    shapes = [
+        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
+        *((int(noted[-1]), *shape) for shape in ((), (), (slots,), (slots, slots), (3,))),
+    ]
+    ends = list(accumulate(map(math.prod, shapes), initial=0))
+    memory = np.empty(ends[-1])
+    time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
+        memory[begin:end].reshape(shape)
+        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
+    )
+    estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
+    about = target_id.view(np.uint32)[: len(target_id)]
+    told = Innovations(noted[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers)
+    return estimates, told
+
+
+def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
+    """What was filled in of results that began at these offsets, laid end to end, and its offsets."""
+    rows, kept = filled_rows(offsets, results.end)
+    if isinstance(rows, slice):
+        return results, kept
+    columns: Any = (column[rows] for column in results[1:])
+    return type(results)(kept[1:], *columns), kept
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
@@ -151,7 +193,8 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             if told >= 0:
                 return told
             if told == ALL_WELL:
-                innovations.event[row] = event
+                innovations.time_ns[row] = happenings.time_ns[event]
+                innovations.target_id[row] = happenings.target_id[event]
                 innovations.end[run] = row + 1
         return ALL_WELL
 
@@ -181,7 +224,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 estimate(run, carried.belief, mean, covariance)
                 failure = fault_of(mean, covariance)
                 if failure == ALL_WELL:
-                    estimates.event[row] = event
+                    estimates.time_ns[row] = happenings.time_ns[event]
                     estimates.end[run] = row + 1
             carried.failure[run] = failure
 

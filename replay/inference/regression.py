@@ -5,12 +5,12 @@ Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF
 vectors, and means are intrinsic: the weighted differences from them sum to zero.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from replay.engine.arrays import Floats, Function
 from replay.inference.gaussian import cholesky, wrap
 from replay.inference.generate import (
     differencing,
@@ -32,13 +32,12 @@ from replay.inference.steps import (
     Workspace,
     motion_derivative,
     motion_noise,
+    nothing,
     reading,
     sensor_noise,
 )
 from replay.sampling.sets import SampleSets
 
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
 MEANS = 30  # at most so many steps to an intrinsic mean
 
 
@@ -165,6 +164,10 @@ def regression(
     return regress
 
 
+def _no_variances(*_: Any) -> tuple[float, ...]:
+    return ()
+
+
 def sampled_motion(stage: Stage, number: int) -> Function:
     """Prediction by regression at the samples `work.samples[number]`.
 
@@ -174,8 +177,8 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     entering = motion.noise if motion.noises else None
     regress = regression(_moved(motion), model.kinds, motion.noises, model.kinds)
     variances_of = entering or _no_variances
-    add_noise = _no_noise_left if entering else motion_noise(model, motion)
-    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else _unused
+    add_noise = nothing if entering else motion_noise(model, motion)
+    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     fill = filling(model.size)
 
@@ -214,24 +217,10 @@ def _moved(motion: Motion) -> Function:
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
         return move(state, arguments[0], arguments[1], arguments[2])
 
     return without
-
-
-def _no_variances(state: Any, duration_s: float, parameters: Any) -> tuple[float, ...]:  # noqa: ARG001
-    return ()
-
-
-def _no_noise_left(
-    state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any
-) -> None:
-    pass
-
-
-def _unused(state: Any, control: Any, duration_s: float, parameters: Any, work: Any) -> None:
-    pass
 
 
 def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
@@ -242,8 +231,8 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     read_about, m = reading(sensor).about, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
-    variances_of = entering or _no_sensor_variances
-    add_noise = _no_sensor_noise if sensor.noises else sensor_noise(sensor)
+    variances_of = entering or _no_variances
+    add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(
         mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
@@ -270,15 +259,7 @@ def _measured(sensor: Sensor) -> Function:
 
         return with_noise
 
-    def without(state: Any, noise: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
         return measure(state, arguments[0], arguments[1])
 
     return without
-
-
-def _no_sensor_variances(parameters: Any) -> tuple[float, ...]:  # noqa: ARG001
-    return ()
-
-
-def _no_sensor_noise(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
-    pass

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replay.engine.arrays import Floats
 from replay.inference.gaussian import (
-    Floats,
     Innovation,
     cholesky,
     kalman_step,
@@ -99,6 +99,7 @@ def update(
     rows: Floats,
     noise: Floats,
     memory: UpdateMemory,
+    gate: float = float("inf"),
 ) -> float:
     """The Kalman update in place: x + K v and P - K S K' with S = H P H' + R and K = P H' S^-1.
 
@@ -109,6 +110,7 @@ def update(
         rows: H (m, n), the derivative of the measurement by the state.
         noise: R (m, m).
         memory: of `update_memory`.
+        gate: nothing changes where the NIS is beyond this.
 
     Returns the NIS v' S^-1 v; NaN where S is not positive definite, and nothing has changed.
     """
@@ -124,12 +126,12 @@ def update(
         for j in range(i + 1):
             entry = noise[i, j]
             for k in range(len(mean)):
-                entry += rows[j, k] * innovation.cross_covariance[k, i]
+                entry += rows[i, k] * innovation.cross_covariance[k, j]
             innovation.covariance[i, j] = innovation.covariance[j, i] = entry
     size = keep_measured(innovation)
     squared = whiten(innovation, size)[0]
-    if np.isnan(squared):
-        return np.nan
+    if not squared <= gate:
+        return squared
     kalman_step(innovation, size, step)
     for row in range(len(mean)):
         mean[row] += step[row]

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
 from replay.inference.gaussian import (
     LOG_TWO_PI,
@@ -37,9 +37,6 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
-
-Floats = NDArray[np.float64]
-Function = Callable[..., Any]
 
 FAILURES = (
     "the covariance is no longer positive definite",
@@ -214,7 +211,7 @@ def linear_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,  # noqa: ARG001
+        use: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)
@@ -263,12 +260,13 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     elif motion.noise is not None:
         pieces.append(_additive_noise(motion.noise, model.tangent))
     if not pieces:
-        return _no_noise
+        return nothing
     return pieces[0] if len(pieces) == 1 else _both(*pieces)
 
 
-def _no_noise(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
-    pass
+def nothing(*_: Any) -> None:
+    """Do nothing, in place of what a model does not need."""
+    return
 
 
 def _both(first: Function, second: Function) -> Function:
@@ -282,7 +280,7 @@ def _both(first: Function, second: Function) -> Function:
 def _control_noise(variances: Function, controls: int) -> Function:
     fill = filling(controls)
 
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:  # noqa: ARG001
+    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         fill(work.control_variance, variances(duration_s, parameters))
         add_through(covariance, work.gain, work.control_variance)
 
@@ -302,7 +300,7 @@ def _entering_noise(variances: Function, noises: int) -> Function:
 def _additive_noise(noise: Function, tangent: int) -> Function:
     add_noise = adding_noise(tangent)
 
-    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:  # noqa: ARG001
+    def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         add_noise(covariance, noise(state, duration_s, parameters))
 
     return add
@@ -333,7 +331,7 @@ def sensor_noise(sensor: Sensor) -> Function:
     if sensor.covariance:
         read, add_message = reading(sensor).noise, adding_noise(m)
 
-        def add_read(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:  # noqa: ARG001
+        def add_read(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
             add_message(spread, read(data))
 
         return add_read
@@ -342,14 +340,14 @@ def sensor_noise(sensor: Sensor) -> Function:
     if sensor.noises:
         noises, fill = sensor.noises, filling(sensor.noises)
 
-        def add_entering(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:  # noqa: ARG001
+        def add_entering(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
             fill(work.noise_variance[:noises], variances(parameters))
             add_through(spread, work.noise_gain, work.noise_variance[:noises])
 
         return add_entering
     add_noise = adding_noise(m)
 
-    def add(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:  # noqa: ARG001
+    def add(spread: Floats, data: Floats, parameters: Any, work: Any) -> None:
         add_noise(spread, variances(parameters))
 
     return add
@@ -380,12 +378,7 @@ def linear_sensor(stage: Stage, number: int) -> Function:
     linearise, compare = sensor_derivative(stage.model, sensor), linear_innovation(sensor, number)
 
     def innovate(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        use: int,  # noqa: ARG001
-        work: Workspace,
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
     ) -> bool:
         linearise(read_state(mean), read_about(data), parameters, work)
         compare(covariance, data, parameters, work)
@@ -455,7 +448,7 @@ def correcting(model: Model) -> Function:
     add = retraction(model.kinds)
     if is_flat(model.kinds):
 
-        def move(mean: Floats, covariance: Floats, work: Workspace) -> None:  # noqa: ARG001
+        def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
             add(mean, work.step)
 
         return move
@@ -472,8 +465,9 @@ def correcting(model: Model) -> Function:
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     """The Kalman update by sensor `number`, after `innovate` has filled its innovation.
 
-    Missing components are left out of v, S and C; the log-likelihood is that of the components present,
-    and zero where the gate is shut. `gate` (m + 1,) bounds the NIS by the number of components.
+    Missing components are left out of v, S and C, and so are those of which the model predicts nothing
+    (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
+    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components.
     """
     m, tell, correct = (
         len(stage.sensors[number].measured),
@@ -504,7 +498,7 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         squared, determinant = whiten(innovation, size)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
-        accepted = squared <= gate[size]
+        accepted = size > 0 and squared <= gate[size]
         if accepted:
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)

@@ -27,6 +27,14 @@ Floats = NDArray[np.float64]
 POSITION = ("x_m", "y_m", "z_m")
 
 
+class Quantity(NamedTuple):
+    """What an error figure shows of an estimate: its RMSE's name, its columns, the scale of its unit."""
+
+    rmse: str
+    columns: list[int]
+    scale: float = 1.0
+
+
 @dataclass(frozen=True)
 class Errors:
     """One estimate stream of an ensemble against its truth, where there is truth.
@@ -69,6 +77,15 @@ class Errors:
     def rotation(self) -> list[int]:
         """The indices of an orientation's components, which are a rotation vector in rad."""
         return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
+
+    @property
+    def main(self) -> Quantity:
+        """The position, else the orientation, else the first component."""
+        if self.position:
+            return Quantity("position_rmse_m", self.position)
+        if self.rotation:
+            return Quantity("orientation_rmse_deg", self.rotation, float(np.degrees(1)))
+        return Quantity(f"rmse_{self.components[0]}", [0])
 
 
 # The fields of `Errors` that have an entry per estimate.
@@ -113,6 +130,31 @@ def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> t
     tail = 0.5 * (1 - probability)
     interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
     return float(interval[0]), float(interval[1])
+
+
+def rmse_interval(
+    runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
+) -> tuple[Floats, Floats]:
+    """Where an RMSE over so many runs lies with this probability if the covariances P are right.
+
+    A sum of squared errors has mean tr P and variance 2 tr P^2, and nearly the distribution of a scaled
+    chi-square variable with these (Box 1954, theorem 3.1); exactly so where all variances are equal.
+
+    Args:
+        runs: (n,).
+        trace: (n,) the mean of tr P over the runs.
+        squared: (n,) that of tr P^2.
+        probability: of lying there.
+
+    Returns the lower and the upper bounds (n,); NaN where a covariance is zero or not finite.
+    """
+    tail = 0.5 * (1 - probability)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = runs * trace**2 / squared
+        low, high = (
+            np.sqrt(trace * chi2.ppf(quantile, degrees) / degrees) for quantile in (tail, 1 - tail)
+        )
+    return low, high
 
 
 def errors_of(

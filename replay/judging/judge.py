@@ -21,9 +21,11 @@ from replay.judging.evaluation import (
     Errors,
     Floats,
     Innovations,
+    chi_square_interval,
     errors_at,
     errors_of,
     innovations_of,
+    rmse_interval,
     split_topic,
     unjudged,
 )
@@ -35,6 +37,7 @@ from replay.judging.metrics import (
     covered,
     estimated_share,
     find_metrics,
+    metric_key,
     step_bounds,
 )
 from replay.judging.set_errors import SetErrors, set_errors
@@ -68,7 +71,7 @@ class Quantities:
     """Sums of one estimate stream: what tables and figures are made of.
 
     The columns of both sums are elapsed time, squared error of the position, of the rotation and of
-    each component, and NEES.
+    each component, trace of the main quantity's covariance and of its square, and NEES.
     """
 
     errors: Errors  # the last block: for names and kinds
@@ -126,6 +129,7 @@ class Judge:
         self._steps: dict[str, NDArray[np.int64]] = {}
         self._told: dict[str, Told] = {}
         self._unjudged: dict[str, str] = {}
+        self._degrees: Counter[str] = Counter()
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
@@ -137,6 +141,7 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
+                self._degrees[topic] += int(innovations.degrees.sum())
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -199,6 +204,7 @@ class Judge:
         self._names |= other._names
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
+        self._degrees.update(other._degrees)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -217,6 +223,30 @@ class Judge:
     def metrics(self) -> dict[str, float]:
         """The numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
         return self._measured.finish()
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Where metrics of NEES and NIS lie with 95 % if an estimator is consistent, by their keys.
+
+        Errors of a run's steps hang together, so that NEES has the interval of one step's mean over the
+        runs; innovations do not, and NIS has that of them all.
+        """
+        found: dict[str, tuple[float, float]] = {}
+        for quantities in self._quantities.values():
+            errors, cells = quantities.errors, quantities.by_time.filled()[0]
+            runs = len(np.unique(cells[:, 0]))
+            sizes = {"nees": len(errors.components), "position_nees": len(errors.position)}
+            for name, size in sizes.items():
+                if runs and size:
+                    key = metric_key(errors.estimator, name, errors.case)
+                    found[key] = chi_square_interval(size, runs)
+        for topic, degrees in self._degrees.items():
+            if degrees:
+                low, high = chi_square_interval(degrees, 1)
+                estimator, case = split_topic(topic)
+                key = metric_key(estimator, "nis_per_component", case)
+                found[key] = low / degrees, high / degrees
+        return {key: found[key] for key in self.metrics if key in found}
 
     @property
     def tells(self) -> bool:
@@ -293,14 +323,18 @@ def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
 
 
 def _columns_of(errors: Errors) -> Floats:
-    """Rows (n, 4 + d) of what is summed; see `Quantities`."""
+    """Rows (n, 6 + d) of what is summed; see `Quantities`."""
     squared = errors.error**2
+    main = errors.main.columns
+    covariance = errors.covariance[:, main][:, :, main]
     return np.column_stack(
         [
             errors.elapsed_s,
             squared[:, errors.position].sum(axis=1),
             squared[:, errors.rotation].sum(axis=1),
             squared,
+            np.trace(covariance, axis1=1, axis2=2),
+            np.sum(covariance**2, axis=(1, 2)),
             errors.nees,
         ]
     )
@@ -320,20 +354,25 @@ def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
 
 
 def step_table(quantities: Quantities) -> pd.DataFrame:
-    """One row per step over the runs: RMSE of position and components, mean NEES with its interval.
+    """One row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
     Where there are more than `STEPS` steps, a row is of several; `step` is the first of them.
     """
     errors, by_step = quantities.errors, quantities.by_step
     cells, count, sums = by_step.filled()
-    low, high = step_bounds(np.ceil(count / by_step.width), len(errors.components))
+    runs = np.ceil(count / by_step.width)
+    low, high = step_bounds(runs, len(errors.components))
+    rmse, _, scale = errors.main
+    rmse_low, rmse_high = rmse_interval(runs, *(sums[:, -3:-1] / count[:, None]).T)
     columns: dict[str, object] = {
         "estimator": errors.estimator,
         "case": errors.case,
         "step": cells[:, 1] * by_step.width,
-        "runs": np.ceil(count / by_step.width).astype(np.int64),
+        "runs": runs.astype(np.int64),
         "elapsed_s": sums[:, 0] / count,
         **_means(errors, count, sums),
+        f"{rmse}_low": scale * rmse_low,
+        f"{rmse}_high": scale * rmse_high,
     }
     return pd.DataFrame({**columns, "nees_low": low, "nees_high": high})
 

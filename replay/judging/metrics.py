@@ -112,6 +112,11 @@ def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any, Any]]:
     return {name: load("metrics", name, Metric) for name in names or available("metrics")}
 
 
+def metric_key(estimator: str, quantity: str, case: str) -> str:
+    """What a number is called: `estimator.quantity[.case]`."""
+    return ".".join(filter(None, (estimator, quantity, case)))
+
+
 class Measurement:
     """What metrics make of all that is judged, as it comes.
 
@@ -154,11 +159,10 @@ class Measurement:
             if of is not None and not of(place[1]):
                 continue
             estimator, case = self._named[place]
-            end = f".{case}" if case else ""
             for name, state in states.items():
                 with foreign_code(f"metric {name}"):
                     for quantity, value in self._metrics[name].finish(state).items():
-                        values[f"{estimator}.{quantity}{end}"] = float(value)
+                        values[metric_key(estimator, quantity, case)] = float(value)
         return values
 
 
@@ -300,10 +304,10 @@ def innovation(sums: Sums) -> dict[str, float]:
     """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
     if not sums.get("messages"):
         return {}
-    return {
-        "nis_per_component": sums["squared"] / sums["degrees"],
-        "gated_share": 1 - sums["accepted"] / sums["messages"],
-    }
+    gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
+    if not sums["degrees"]:  # all said nothing of their states
+        return gated
+    return {"nis_per_component": sums["squared"] / sums["degrees"], **gated}
 
 
 def _log_likelihoods(innovations: Innovations) -> Sums:

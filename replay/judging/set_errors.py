@@ -9,7 +9,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
@@ -116,11 +115,6 @@ def _judge_run(
         counts = len(estimated), len(there)
         rows[step] = ospa(estimated, there, cutoff_m, ORDER), *parts, *counts
     return rows
-
-
-def set_table(found: SetErrors) -> pd.DataFrame:
-    """One row per run and step."""
-    return pd.DataFrame(found._asdict())
 
 
 def _sums(found: SetErrors) -> Sums:

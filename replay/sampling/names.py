@@ -9,6 +9,7 @@ s2kf-50:seed=3:rotation=7     of another optimisation, and turned at random
 
 import re
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -118,6 +119,7 @@ FAMILIES = {
 }
 
 
+@lru_cache(maxsize=64)
 def parse_sampling(name: str) -> Sampling:
     """Return the sampling that a name stands for; see the module's head for the names.
 

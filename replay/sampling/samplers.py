@@ -48,11 +48,6 @@ def fixed(samples: Samples) -> Sampler:
     return Sampler(dimension, count, False, partial(_repeat, samples))
 
 
-def no_samples(dimension: int) -> Sampler:
-    """Return the sampler of a filter that needs none."""
-    return fixed(Samples(np.empty((0, dimension)), np.empty(0)))
-
-
 def randomised(dimension: int, iterations: int) -> Sampler:
     """Return the sampler of `randomised_unscented`."""
     count = 2 * dimension * iterations + 1

@@ -17,6 +17,7 @@ from replay.sampling.samplers import Sampler
 
 Generators = tuple[Generator | None, ...]
 DRAWN_AT_ONCE = 1 << 23  # numbers
+_UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
@@ -38,7 +39,7 @@ def sets_by_runs(
     """
     runs = len(offsets) - 1
     if not sampler.redrawn:
-        points, weights = sampler.draw(np.random.default_rng(), (1,))
+        points, weights = sampler.draw(_UNUSED, (1,))
         yield slice(0, runs), SampleSets(np.array(points), np.array(weights), 0, 0)
         return
     at_once = DRAWN_AT_ONCE // (sampler.count * (sampler.dimension + 1))

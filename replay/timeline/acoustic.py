@@ -8,8 +8,8 @@ import rerun.blueprint as rrb
 from recorders.log import Stream, schemas
 from recorders.models.acoustic import Medium, sensor_components
 from replay.engine.blocks import gather
+from replay.engine.channels import numbered
 from replay.estimators.acoustic_streams import gather_detections
-from replay.estimators.solutions import sensor_numbers
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
 from replay.timeline.events import draw_events
@@ -42,7 +42,7 @@ class Cone(NamedTuple):
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     """The map and events beside errors and NEES."""
     turn_up(canvas)
-    numbers = sensor_numbers(scene.source.topics, "detections", schemas.SHOT_DETECTION)
+    numbers = list(numbered(scene.source.topics, "sensor", "detections", schemas.SHOT_DETECTION))
     sensors = [s for s in numbers if f"/sensor{s}/position" in scene.source.topics]
     places = np.array([_place(scene, s) for s in sensors]).reshape(-1, 2)
     truths = scene.truths_of(CASE)

@@ -6,6 +6,7 @@ because Rerun itself waits many seconds for one that is not there, and forever f
 
 import os
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ _HTTP2_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0,
 _SETTINGS = 4
 _ANSWER_S = 2.0
 _FLUSH_S = 60.0
+_GIVEN_UP_S = 2.0
 
 
 @contextmanager
@@ -49,7 +51,7 @@ def open_recording(
             new = stack.enter_context(whole_file(save, parents=False))
             sinks.append(rr.FileSink(new))
         recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
-        stack.callback(recording.disconnect)
+        stack.callback(_close, recording, _GIVEN_UP_S)
         recording.set_sinks(*sinks)
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
@@ -70,16 +72,25 @@ def rerun_path(path: Path) -> str:
 
 def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:
     """Hand over everything that is still queued, and close."""
-    failure = None
+    failure: Exception | None = None
     try:
         recording.flush(timeout_sec=_FLUSH_S)
     except RuntimeError as error:
         failure = error
-    recording.disconnect()
+    is_closed = _close(recording, _FLUSH_S if failure is None else _GIVEN_UP_S)
     if connect is not None and not _answers(connect):  # which a flush does not always notice
         raise BadInput(f"--connect {connect}: the receiver went away; start it again") from failure
-    if failure is not None:
-        raise BadInput(f"{save or connect}: the timeline could not be written ({failure})") from failure
+    if failure is not None or not is_closed:
+        why = failure or "Rerun does not end"
+        raise BadInput(f"{save or connect}: the timeline could not be written ({why})") from failure
+
+
+def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
+    """Disconnect; whether that ended: of a file that cannot be written, Rerun may wait forever."""
+    closing = threading.Thread(target=recording.disconnect, daemon=True)
+    closing.start()
+    closing.join(limit_s)
+    return not closing.is_alive()
 
 
 def _require_receiver(url: str) -> None:

@@ -7,10 +7,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
 from recorders.log import Clock, RunMetadata, Stream, Topic, schemas
 from replay.engine.failures import join_streams
-from replay.engine.sources import Source
+from replay.engine.sources import Source, is_sensed
 from replay.judging.evaluation import PER_ROW, Errors, errors_at
 from replay.timeline.canvas import DRAWN_ROWS
 
@@ -221,7 +220,7 @@ class Sensed:
     def __init__(self, source: Source, *, is_live: bool) -> None:
         self.source = source.whole()
         self._is_live = is_live
-        self._topics = [topic for topic in source.topics if self._is_sensed(topic)]
+        self._topics = [topic for topic in source.topics if is_sensed(source, topic)]
         self._kept, self._fresh = self._empty(KEPT_ROWS), self._empty(DRAWN_ROWS)
         self._blocks = self.source.blocks(self._topics, "publish_time", BLOCK_MESSAGES)
         self._read_to_ns = -1
@@ -232,15 +231,6 @@ class Sensed:
         for each in streams:
             kept[each.topic].add(each)
         return kept
-
-    def _is_sensed(self, topic: str) -> bool:
-        if topic.startswith("/estimates/"):
-            return False
-        try:
-            self.source.empty(topic)
-        except BadInput:  # no columns, such as an image; the timeline says so
-            return False
-        return True
 
     def read_to(self, time_ns: int) -> Held:
         """What comes up to a stamp, and has not come yet, thinned to what is drawn; maps whole."""

@@ -79,7 +79,7 @@ def filter_seconds(sources: list) -> float:
     scans = scans_of(*(gather([each.streams[name] for each in sources]) for name in names))
     priors = [name for name in sources[0].streams if name.endswith("/prior")]
     whole = {name: gather([each.streams[name] for each in sources]) for name in priors}
-    settings = settings_of(PARAMETERS, sources[0].streams[names[0]].metadata, names[0])
+    settings = settings_of(PARAMETERS, sources[0].topics[names[0]])
     mixture = start(whole, most=PARAMETERS.most_components)
     filter_scans(mixture, scans, settings)
     times = []

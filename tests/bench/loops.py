@@ -9,12 +9,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.blocks import filled_rows
 from replay.engine.estimator import Bound
 from replay.engine.replaying import replay
 from replay.engine.sources import Source
 from replay.inference import estimators
-from replay.inference.recursion import Estimates, Innovations
+from replay.inference.recursion import Estimates, Innovations, filled
 
 Floats = NDArray[np.float64]
 
@@ -37,8 +36,7 @@ class Call(NamedTuple):
         )
         arguments = (*columns, copy.deepcopy(carried), estimates, innovations)
         self.loop(self.runs, *arguments, scratch=self.scratch)
-        rows, _ = filled_rows(np.append(self.results[0].end, len(estimates.event)), estimates.end)
-        return estimates.mean[rows]
+        return filled(estimates, np.append(self.results[0].end, len(estimates.mean)))[0].mean
 
 
 def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:

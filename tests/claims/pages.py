@@ -20,7 +20,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from pipeline.results import MetricValue, Result, Verdict, read_result
+from pipeline.claims import Verdict
+from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.claims import Claim
 from pipeline.experiment import load_experiment, shipped
-from pipeline.results import Claim, Outcome, result_folder, write_outcome
+from pipeline.results import Outcome, result_folder, write_outcome
 from tests.claims import pages
 
 README = (pages.ROOT / "README.md").read_text(encoding="utf-8")

@@ -448,3 +448,21 @@ def test_a_full_standard_output_is_said(world: Path, start_fuselog: Callable[...
         process = start_fuselog("info", str(world / "log.mcap"), stdout=full)
     assert process.communicate()[1] == "fuselog: standard output: No space left on device\n"
     assert process.returncode == 2
+
+
+@pytest.mark.usefixtures("here")
+def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> None:
+    """Defaults too, and those that were given."""
+    log = str(world / "log.mcap")
+    asked = ["-e", "ekf", "-e", "ukf", "--set", "ukf.kappa=1", "--out"]
+    assert "kappa" not in fuselog("replay", log, *asked, "a.mcap").out
+    [row] = [
+        line
+        for line in fuselog("replay", log, *asked, "b.mcap", "--parameters").out.splitlines()
+        if line.split()[:1] == ["kappa"]
+    ]
+    assert row.split() == ["kappa", "1"]
+    told = fuselog("replay", log, *asked, "c.mcap", "--json").json["parameters"]
+    assert told["ukf"] == {**told["ekf"], "kappa": 1.0}
+    said = fuselog("run", log, "-e", "ukf", "--parameters", "--out", "d").out
+    assert "kappa" in said

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.ensemble import replay_ensemble
+from pipeline.ensemble import Part, replay_parts
 from pipeline.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
@@ -44,8 +44,8 @@ def test_an_estimator_without_estimates_is_told():
         magnetic_field_ut=np.tile([0.0, 0.0, 40.0], (count, 1)),
     )
     source = memory_source(Recording([samples]), RunMetadata("broad"))
-    replayed = replay_ensemble([source], {"bingham-inertial": {}}, gap_limit_s=1)
+    judge = replay_parts([Part([source])], {"bingham-inertial": {}}, gap_limit_s=1).judge
     at_s = f"{SIMULATION_EPOCH_NS * 1e-9:.3f} s"
-    assert replayed.failures == [
+    assert judge.failures == [
         f"{source.name}: bingham-inertial trial failed at {at_s}: it gave no estimate"
     ]

@@ -341,8 +341,8 @@ def test_the_timeline_in_a_notebook(
 
 def test_a_figure_shows_a_case() -> None:
     done = fl.replay(fl.record("landmarks", robots=2, **SHORT), "ekf")
-    assert done.figure("robot2").axes[0].get_title() == "robot2, 1 run"
-    assert done.figure().axes[0].get_title() == "robot1, 1 run"
+    assert done.figure("robot2").get_suptitle().startswith("robot2, 1 run")
+    assert done.figure().get_suptitle().startswith("robot1, 1 run")
     with pytest.raises(fl.BadInput, match="nothing called 'robot3' was judged"):
         done.figure("robot3")
 

@@ -6,14 +6,16 @@ taken from `replay.distributions`.
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import predict, turn_columns, update
+from replay.engine.compile import compile_over_runs
 
 
 class Steps(NamedTuple):
@@ -33,7 +35,6 @@ class Steps(NamedTuple):
     measurement: NDArray[np.float64]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
 def filter_runs(
     steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
 ) -> None:
@@ -42,14 +43,19 @@ def filter_runs(
     `system` is the system noise's second moment, `inverse_noise` the parameter matrix of the measurement
     noise's likelihood.
     """
-    for run in prange(len(steps.offsets) - 1):
-        _filter_run(steps, system, inverse_noise, state, estimates, run)
+    compiled()(len(steps.offsets) - 1, steps, system, inverse_noise, state, estimates)
 
 
-@njit(cache=True, error_model="numpy")
-def _filter_run(
-    steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham, run: int
+@cache
+def compiled() -> Callable[..., None]:
+    """The loop over the runs."""
+    return compile_over_runs(filter_run)
+
+
+def filter_run(
+    run: int, steps: Steps, system: NDArray, inverse_noise: NDArray, state: Bingham, estimates: Bingham
 ) -> None:
+    """The steps of one run."""
     axes, z = state.axes[run], state.concentrations[run]
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):

@@ -5,10 +5,11 @@ a Bingham distribution is predicted and updated by is taken from `replay.distrib
 """
 
 import math
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from replay.distributions.bingham_kernels import (
@@ -21,6 +22,7 @@ from replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
+from replay.engine.compile import compile_over_runs
 
 _NS = 1e-9
 
@@ -112,7 +114,6 @@ def start_inertial_filter(runs: int) -> InertialState:
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
 def filter_runs(
     model: InertialModel,
     state: InertialState,
@@ -120,17 +121,32 @@ def filter_runs(
     estimates: OrientationEstimates,
 ) -> None:
     """Fill the estimates of all rows, and leave the state after the last in `state`."""
-    for run in prange(len(samples.offsets) - 1):
-        for row in range(samples.offsets[run], samples.offsets[run + 1]):
-            elapsed_s = _accumulate(model, state, run, samples, row)
-            if elapsed_s >= model.block_s:
-                _end_block(model, state, run, elapsed_s)
-                elapsed_s = 0.0
-            if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
-                _dead_reckon(model, state, run, elapsed_s, estimates, row)
+    compiled()(len(samples.offsets) - 1, model, state, samples, estimates)
 
 
-@njit(cache=True, error_model="numpy")
+@cache
+def compiled() -> Callable[..., None]:
+    """The loop over the runs."""
+    return compile_over_runs(filter_run)
+
+
+def filter_run(
+    run: int,
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+) -> None:
+    """The samples of one run."""
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        elapsed_s = _accumulate(model, state, run, samples, row)
+        if elapsed_s >= model.block_s:
+            _end_block(model, state, run, elapsed_s)
+            elapsed_s = 0.0
+        if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
+            _dead_reckon(model, state, run, elapsed_s, estimates, row)
+
+
 def _accumulate(
     model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
 ) -> float:
@@ -169,7 +185,6 @@ def _accumulate(
     return (time_ns - times[2]) * _NS
 
 
-@njit(cache=True, error_model="numpy")
 def _start_block(state: InertialState, run: int, time_ns: int) -> None:
     state.time_ns[run, 2] = time_ns
     state.increment[run] = 0.0
@@ -178,7 +193,6 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
     state.field[run] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
     """One prediction over the block and one update with its attitude, in place."""
     axes, z = state.axes[run], state.concentrations[run]
@@ -199,7 +213,6 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
     _start_block(state, run, state.time_ns[run, 1])
 
 
-@njit(cache=True, error_model="numpy")
 def _dead_reckon(
     model: InertialModel,
     state: InertialState,
@@ -221,7 +234,6 @@ def _dead_reckon(
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
 
 
-@njit(cache=True, error_model="numpy")
 def _isotropic(sigma_rad: float) -> NDArray:
     """Concentrations about the identity, in the order of a quaternion's components."""
     z = np.full(4, -2.0 / sigma_rad**2)
@@ -229,7 +241,6 @@ def _isotropic(sigma_rad: float) -> NDArray:
     return z
 
 
-@njit(cache=True, error_model="numpy")
 def _increment(rotation_rad: NDArray) -> NDArray:
     """The quaternion of a rotation vector (3,)."""
     x, y, z = 0.5 * rotation_rad
@@ -238,7 +249,6 @@ def _increment(rotation_rad: NDArray) -> NDArray:
     return np.array([math.cos(angle), scale * x, scale * y, scale * z])
 
 
-@njit(cache=True, error_model="numpy")
 def _carry(turned: NDArray, vector: NDArray) -> None:
     """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
@@ -249,7 +259,6 @@ def _carry(turned: NDArray, vector: NDArray) -> None:
     vector[2] = c + w * f + x * e - y * d
 
 
-@njit(cache=True, error_model="numpy")
 def _triad(force: NDArray, field: NDArray) -> NDArray:
     """The orientation (4,) under which force points up and field north; NaN where they are parallel."""
     up = force / math.sqrt((force**2).sum())
@@ -273,12 +282,10 @@ def _triad(force: NDArray, field: NDArray) -> NDArray:
     return column / math.sqrt((column**2).sum())
 
 
-@njit(cache=True, error_model="numpy")
 def _cross(a: NDArray, b: NDArray) -> NDArray:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True, error_model="numpy")
 def _diagonal(values: NDArray) -> NDArray:
     out = np.zeros((len(values), len(values)))
     for i in range(len(values)):

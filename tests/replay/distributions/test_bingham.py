@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import i0e, i1e
 
 from recorders.errors import BadInput
+from recorders.models.directional_noise import saddlepoint
 from recorders.models.orientation import compose as compose_points
 from recorders.models.orientation import conjugate, left_matrix
 from replay.distributions import bingham, bingham_kernels
@@ -282,6 +283,36 @@ def test_gaussian_noise_becomes_bingham_noise():
         assert bingham.square_moments(concentrations)[0] == pytest.approx(expected, rel=1e-3)
 
 
+def saddlepoint_log_normaliser(concentrations, order=2):
+    """The paper's log F (...) of concentrations (..., d): Kume and Wood's saddlepoint approximation.
+
+    Our `log_normaliser` is exact, and faster. At order 1, F is off by up to 16.6 %,
+    where all concentrations but one are large. Order 2 has the factor exp(T) and is off by up to 6.4 %,
+    at z = (-4.1, -4.1, -4.1, 0).
+    """
+    z = np.asarray(concentrations, float)
+    top = z.max(axis=-1, keepdims=True)
+    t = saddlepoint(z - top)
+    factors = 1.0 / (t[..., None] - (z - top))
+    second, third, fourth = (scale * (factors**n).sum(-1) for n, scale in ((2, 0.5), (3, 1.0), (4, 3.0)))
+    log_f = 0.5 * np.log(2.0 * np.pi ** (z.shape[-1] - 1) / second) + 0.5 * np.log(factors).sum(-1) + t
+    correction = fourth / (8.0 * second**2) - 5.0 * third**2 / (24.0 * second**3)
+    return log_f + top[..., 0] + (correction if order == 2 else 0.0)
+
+
+def saddlepoint_square_moments(concentrations, order=2):
+    """The paper's E(x_i^2) (..., d), scaled to sum 1: F with z_i taken thrice over 2 pi F.
+
+    Kume and Wood, Statistics & Probability Letters 77, 2007. Off by up to 10 % at order 1, 5.2 % at 2.
+    """
+    z = np.asarray(concentrations, float)
+    d = z.shape[-1]
+    thrice = np.take(z, [[*range(d), i, i] for i in range(d)], axis=-1)
+    log_moments = saddlepoint_log_normaliser(thrice, order)
+    moments = np.exp(log_moments - log_moments.max(axis=-1, keepdims=True))
+    return moments / moments.sum(-1, keepdims=True)
+
+
 def test_saddlepoint_errors_are_as_stated():
     """The sheet says 16.6 % and 5.9 %; at its worst point order 2 is 6.4 % off."""
     generator = np.random.default_rng(0)
@@ -290,14 +321,12 @@ def test_saddlepoint_errors_are_as_stated():
     z[:, 3] = 0.0
     z[0], z[1] = [-1e6, -1e6, -1e6, 0.0], [-4.0894, -4.0894, -4.0894, 0.0]
     exact = bingham.log_normaliser(z)
-    first, second = (
-        np.exp(bingham.saddlepoint_log_normaliser(z, order) - exact) - 1.0 for order in (1, 2)
-    )
+    first, second = (np.exp(saddlepoint_log_normaliser(z, order) - exact) - 1.0 for order in (1, 2))
     assert np.abs(first).max() == pytest.approx(0.166, abs=5e-4)
     assert np.abs(second).max() == pytest.approx(0.0637, abs=5e-4)
     moments = bingham.square_moments(z)
     for order, limit in ((1, 0.104), (2, 0.053)):
-        error = bingham.saddlepoint_square_moments(z, order) / moments - 1.0
+        error = saddlepoint_square_moments(z, order) / moments - 1.0
         assert 0.9 * limit < np.abs(error).max() < limit
 
 
@@ -328,7 +357,6 @@ def test_samples_have_the_second_moment_of_their_distribution():
         (lambda: bingham.fit([[np.nan, 0.0], [0.0, 0.5]]), "finite"),
         (lambda: bingham.fit(np.eye(3) / 3.0), "d = 2 or 4"),
         (lambda: bingham.fit_projected_gaussian([1.0, 0.0], np.diag([1.0, -1.0])), "negative"),
-        (lambda: bingham.saddlepoint_log_normaliser([-1.0, 0.0], 3), "order 3"),
     ],
 )
 def test_bad_input_is_told(make, message):

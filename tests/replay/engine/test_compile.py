@@ -49,11 +49,11 @@ MODULE = """
 """
 
 
-def imported(module: str, folder: Path, cache: Path) -> list[str]:
+def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]:
     """What the module prints when a new process imports it."""
     (folder / "third_party.py").write_text(textwrap.dedent(module))
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", "import third_party"],
+        [sys.executable, "-W", "error", *options, "-c", "import third_party"],
         cwd=folder,
         env={
             "HOME": str(folder),
@@ -434,3 +434,38 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
         compile_over_runs(through_a_module)
     with pytest.raises(BadInput, match="kernel 'one' does not compile: No implementation of function"):
         compile_over_runs(kernel_of(twice))(1, "text")
+
+
+FORKED = """
+    import os
+    import numpy as np
+    from replay.engine.compile import compile_over_runs
+
+    def one(run, found, memory):
+        memory[0] = run
+        found[run] += memory[0]
+
+    made, found = [], np.zeros(1000)
+
+    def scratch():
+        made.append(np.empty(1))
+        return made[-1]
+
+    loop = compile_over_runs(one, allocates=False)
+    loop(1000, found, scratch=scratch)
+    print(len(made), found.sum())
+    child = os.fork()
+    loop(1000, found, scratch=scratch)
+    if child == 0:
+        os._exit(int(found.sum() != 999000.0))
+    print(os.waitpid(child, 0)[1])
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_cores_work_in_memory_of_their_own_also_in_a_forked_process(tmp_path: Path):
+    """Made once for each, and once to compile; a fork has none of the threads that its parent has."""
+    told = imported(FORKED, tmp_path, tmp_path / "cache", "-W", "ignore")
+    made, total = told[0].split()
+    assert int(made) <= numba.config.NUMBA_NUM_THREADS + 1
+    assert (float(total), told[1]) == (499500.0, "0")

@@ -17,7 +17,7 @@ from replay.engine.blocks import Block, Ragged, filled_rows, gather, merge_event
 from replay.engine.estimator import Bound, Recursive, bind
 from replay.engine.replaying import Report, collect, replay
 from replay.engine.results import state_stream
-from replay.engine.sources import LogSource, MemorySource, Source, memory_source
+from replay.engine.sources import Ensemble, LogSource, MemorySource, Source, memory_source
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 
@@ -340,3 +340,23 @@ def test_filled_rows_are_those_before_every_runs_end(runs: list[tuple[int, int]]
     assert_array_equal(packed, np.cumsum([0, *filled]))
     chosen = np.isin(np.arange(sum(room)), expected)
     assert_array_equal(ragged_rows(chosen, offsets), packed)
+
+
+@pytest.mark.parametrize("order", ["publish_time", "log_time"])
+def test_an_ensemble_lays_its_recordings_end_to_end_once(order: Clock):
+    """However often it is replayed, by either clock; what was kept is what would be read anew."""
+    sources = [record(run, **LATE, **values) for run, values in enumerate(({}, {"landmarks": 3}))]
+    ensemble = Ensemble(sources)
+    first, again = replayed(ensemble, order), replayed(ensemble, order)
+    anew = replayed(sources, order)
+    for ours in (first, again):
+        assert_equal(
+            {topic: rows.stream for topic, rows in ours.items()},
+            {topic: rows.stream for topic, rows in anew.items()},
+        )
+    topics = ["/robot1/odometry", "/robot1/range_bearing"]
+    [one], [other] = (list(ensemble.blocks(topics, order, 1)) for _ in range(2))
+    assert all(one[topic] is other[topic] for topic in topics)
+    assert_array_equal(
+        one[topics[1]].of_run(1).times(order), np.sort(sources[1].streams[topics[1]].times(order))
+    )

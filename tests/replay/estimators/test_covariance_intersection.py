@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recorders.errors import BadInput
-from replay.estimators.covariance_intersection import RULES, fuse, fuse_sighting
+from replay.estimators.covariance_intersection import RULES, Stake, fuse, sighting_weight
 
 PAIR = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
 THREE = np.array([np.diag([1.0, 4.0]), np.diag([4.0, 1.0]), [[2.0, 1.5], [1.5, 2.0]]])
@@ -138,6 +138,19 @@ def test_batches_equal_their_members_and_all_rules_keep_equal_estimates():
         assert all(np.array_equal(a[2], b) for a, b in zip(many, one, strict=True))
         same = fuse(name, np.repeat(means[:1, :1], 3, 1), np.repeat(covariances[:1, :1], 3, 1))
         np.testing.assert_allclose(same.mean[0], means[0, 0], rtol=1e-9)
+
+
+def fuse_sighting(mean, covariance, rows, innovation, shared, own, criterion="trace"):
+    """A sighting's update with the weight of `sighting_weight`, written as in the textbook.
+
+    Returns mean (n,), covariance (n, n) and the weight.
+    """
+    x, p, h, v, r, q = map(np.asarray, (mean, covariance, rows, innovation, shared, own))
+    spread = h @ p @ h.T
+    stake = Stake(len(x), np.trace(p), spread, h @ p @ p @ h.T)
+    weight = sighting_weight(criterion == "trace", stake, r, q)
+    gain = np.linalg.solve(spread / weight + r / (1 - weight) + q, h @ p / weight).T
+    return x + gain @ v, p / weight - gain @ h @ p / weight, weight
 
 
 @pytest.mark.parametrize("criterion", ["trace", "determinant"])

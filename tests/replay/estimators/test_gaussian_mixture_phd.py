@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.ensemble import judge, replay_in_memory
 from recorders.errors import BadInput
-from recorders.log import make_stream, schemas
+from recorders.log import Topic, make_stream, schemas
 from replay.engine.blocks import gather
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
@@ -25,6 +25,13 @@ from replay.judging.truths import Truths
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source
 
 STATED = {"variance_m2": "0.5", "detection_probability": "0.9", "clutter_per_m2": "1e-3"}
+
+
+def scan_of(stated):
+    """A channel of scans that states something."""
+    return Topic("/scan", schemas.SCAN.full_name, "protobuf", (), stated, 0)
+
+
 PRIOR = np.array([[2.5, 0.3, 0.2, 0], [0.3, 1, 0, 0.1], [0.2, 0, 2, 0.4], [0, 0.1, 0.4, 1.5]])
 SEEN = np.array([1, 0, 0, 0, 0, 0, 1, 0]).reshape(2, 4)
 
@@ -45,7 +52,7 @@ def test_one_update_of_one_target_by_hand():
     """Vo and Ma, table I, with matrices: weights, mean and covariance after 2 s, and a birth."""
     mixture, scans = one_target()
     parameters = PhdParameters(births_per_m2=1e-4, merge_squared=1e-9)
-    after, sets = filter_scans(mixture, scans, settings_of(parameters, STATED, "/scan"))
+    after, sets = filter_scans(mixture, scans, settings_of(parameters, scan_of(STATED)))
     motion = np.kron(np.eye(2), [[1, 2], [0, 1]])
     noise = 0.25 * np.kron(np.eye(2), [[4.0, 4.0], [4.0, 4.0]])
     mean = motion @ mixture.mean[0, 0]
@@ -79,7 +86,7 @@ def test_merging_keeps_weight_and_moments():
     def moments(merge_squared: float):
         mixture, scans = one_target()
         parameters = PhdParameters(births_per_m2=1e-4, merge_squared=merge_squared)
-        after, _ = filter_scans(mixture, scans, settings_of(parameters, STATED, "/scan"))
+        after, _ = filter_scans(mixture, scans, settings_of(parameters, scan_of(STATED)))
         weight, mean = after.weight[0, : after.used[0]], after.mean[0, : after.used[0]]
         centre = weight @ mean / weight.sum()
         offset = mean - centre
@@ -103,7 +110,7 @@ def test_two_things_in_one_place_are_two():
     scans = Scans(np.array([0, 1]), np.array([0]), np.array([0]), np.array([2]), place)
     sure = {**STATED, "detection_probability": "1", "clutter_per_m2": "0"}
     parameters = PhdParameters(survival_probability=1.0, births_per_m2=0)
-    after, sets = filter_scans(mixture, scans, settings_of(parameters, sure, "/scan"))
+    after, sets = filter_scans(mixture, scans, settings_of(parameters, scan_of(sure)))
     assert after.used[0] == 1
     assert_allclose(after.weight[0, 0], 2.0, rtol=1e-12)
     assert sets.elements[0] == 2
@@ -148,7 +155,7 @@ def test_blocks_and_ensembles_change_nothing():
     scans = scans_of(
         *(gather([sources[0].streams[f"/sensor/{leaf}"]]) for leaf in ("scan", "detection"))
     )
-    settings = settings_of(PhdParameters(), sources[0].streams["/sensor/scan"].metadata, "/scan")
+    settings = settings_of(PhdParameters(), sources[0].topics["/sensor/scan"])
     whole, _ = filter_scans(no_components(1, 100), scans, settings)
     state = no_components(1, 100)
     for part in (slice(0, 5), slice(5, 12)):
@@ -193,9 +200,9 @@ def test_bad_input_is_named():
     with pytest.raises(BadInput, match="scan 0 says"):
         collect(replay([type(good)(lost, good.run, "x")], bind("gm-phd", [good], {})))
     with pytest.raises(BadInput, match="does not state variance_m2"):
-        settings_of(PhdParameters(), {}, "/scan")
-    with pytest.raises(BadInput, match="detection_probability 0"):
-        settings_of(PhdParameters(), {**STATED, "detection_probability": "0"}, "/scan")
+        settings_of(PhdParameters(), scan_of({}))
+    with pytest.raises(BadInput, match="'detection_probability' is 0"):
+        settings_of(PhdParameters(), scan_of({**STATED, "detection_probability": "0"}))
     with pytest.raises(BadInput, match="priors for 2 components"):
         collect(replay([good], bind("gm-phd", [good], {"most_components": 2})))
     line = make_stream(

@@ -18,6 +18,7 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.judging.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.judging.metrics import INNOVATION
 from replay.judging.truths import Truths
 from replay.sampling.samplers import unscented
 
@@ -254,6 +255,27 @@ def _spread(outputs: dict[str, Ragged]) -> Floats:
     """The standard deviations (3,) in the mean over the run."""
     covariance = outputs["pose"]["covariance"].reshape(-1, 3, 3)
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).mean(axis=0)
+
+
+@pytest.mark.parametrize("name", ["ekf", "iekf", "ukf"])
+def test_a_landmark_on_the_very_spot_is_passed_over_and_counted(name: str):
+    """Its bearing has no meaning and no derivative: it must not turn the heading."""
+    source = record(duration_s=2.0)
+    prior, seen = source.streams["/robot1/prior"], source.streams["/robot1/range_bearing"]
+    landmarks = source.streams["/landmarks"]
+    places = landmarks["position_m"].copy()
+    places[landmarks["landmark_id"] == seen["target_id"][0]] = prior["mean"][0, :2]
+    spot = replace(landmarks, columns={**landmarks.columns, "position_m": places})
+    first = replace(seen.take(slice(0, 1)), publish_time_ns=prior.publish_time_ns[:1])
+    others = {f"/robot1/{leaf}" for leaf in SENSES}
+    kept = {topic: each for topic, each in source.streams.items() if topic not in others}
+    ours = replayed(name, [changed(replace(source, streams=kept), spot, first)])
+    pose = ours["pose"]
+    assert pose.stream.publish_time_ns[0] == prior.publish_time_ns[0]
+    np.testing.assert_array_equal(pose["mean"][0], prior["mean"][0])
+    np.testing.assert_array_equal(pose["covariance"][0], prior["covariance"][0])
+    assert ours["innovation"]["accepted"].tolist() == [0]
+    assert INNOVATION.of(innovations_of(ours["innovation"]))["gated_share"] == 1.0
 
 
 def test_dead_reckoning_is_the_prediction_alone():

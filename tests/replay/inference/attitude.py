@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
-from recorders.models.orientation import compose, conjugate, from_rotation_vector, rotate
+from recorders.models.orientation import compose, conjugate, rotate
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
@@ -111,14 +112,14 @@ def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
     """The log, the true states after every step, and what the gyro said."""
     rng = np.random.default_rng(seed)
     start = np.array([0.3] * 3 + [0.02] * 3) * rng.standard_normal(6)
-    q, bias = from_rotation_vector(start[:3]), start[3:]
+    q, bias = Rotation.from_rotvec(start[:3]).as_quat(scalar_first=True), start[3:]
     gyro, force, field, truth = [], [], [], []
     for k in range(500):
         t = k * STEP_S
         rate = np.array([0.5 * np.sin(0.7 * t), 0.4 * np.cos(0.5 * t), 0.3])
         gyro.append(rate + bias + 0.01 / np.sqrt(STEP_S) * rng.standard_normal(3))
         bias = bias + 0.001 * np.sqrt(STEP_S) * rng.standard_normal(3)
-        q = compose(q, from_rotation_vector(rate * STEP_S))
+        q = compose(q, Rotation.from_rotvec(rate * STEP_S).as_quat(scalar_first=True))
         if (k + 1) % 5 == 0:
             up = rotate(conjugate(q), np.array([0.0, 0.0, 9.81]))
             force.append((k + 1, up + 0.3 * rng.standard_normal(3)))

@@ -1,6 +1,7 @@
 """What is asked of a model, and the one sentence where it, the log or the settings do not meet it."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -101,6 +102,18 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
 }
 
 
+def told(state: Any, *_: Any) -> Any:
+    return (float(np.base_repr(3)),)  # which numba does not know
+
+
+@pytest.mark.skipif("FUSELOG_UNCOMPILED" in os.environ, reason="nothing is compiled")
+def test_a_model_that_does_not_compile_is_named_with_its_line() -> None:
+    """The estimator, and the file and line of the model's function."""
+    line = told.__code__.co_firstlineno + 1
+    with pytest.raises(BadInput, match=rf"estimator test: kernel .* \({__file__}, line {line}\)"):
+        outputs(with_sensor(SPEED, measure=told), "ekf", [SOURCE])
+
+
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_model_is_one_sentence(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
@@ -141,7 +154,7 @@ def test_a_number_that_no_channel_states_or_states_as_nonsense() -> None:
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> dict[str, Model]:
+def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Model]]:
     """The registered models, to be changed at will."""
     models: dict[str, Model] = {"vehicle-a": VEHICLE_A}
 
@@ -153,7 +166,8 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> dict[str, Model]:
     monkeypatch.setattr(estimators, "load", load)
     monkeypatch.setattr(estimators, "available", lambda _: dict.fromkeys([*models, "broken"]))
     estimators._any_parameters.cache_clear()
-    return models
+    yield models
+    estimators._any_parameters.cache_clear()
 
 
 def fit(source: MemorySource, method: str = "ekf", **settings: Any) -> list[Any]:

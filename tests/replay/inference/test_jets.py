@@ -23,10 +23,10 @@ from recorders.models.acoustic import (
     time_difference_gradient,
 )
 from recorders.models.optical import line_of_sight_gradients
-from recorders.models.planar import drive_jacobians, range_bearing_jacobian
 from replay.engine.compile import compile_over_runs
 from replay.inference import jets
 from replay.inference.jets import jet, slope_of, value_of
+from tests.bench.reference.landmarks import drive_jacobians, range_bearing_jacobian
 
 pytestmark = pytest.mark.paper
 

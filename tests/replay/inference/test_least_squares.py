@@ -10,11 +10,17 @@ from replay.inference.least_squares import (
     Status,
     cramer_rao_bound,
     describe_direction,
-    fisher_information,
+    information_root,
     mask_missing,
     solve,
     unobservable_directions,
 )
+
+
+def fisher_information(at: Linearization) -> np.ndarray:
+    """Fisher information (runs, n, n), from its root."""
+    root = information_root(at)
+    return np.swapaxes(root, 1, 2) @ root
 
 
 def linear_model(matrix: np.ndarray, measured: np.ndarray, covariance: np.ndarray):

@@ -16,6 +16,8 @@ from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.blocks import Ragged
 from replay.engine.sources import LogSource, MemorySource, memory_source
+from replay.inference.happenings import times_alone, with_ticks
+from replay.inference.recursion import no_results
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A
@@ -131,6 +133,21 @@ CONTROLS = {
     "none at the prior's stamp": np.arange(-1, 15) * 0.1 + 0.04,
     "the first after the prior, at stamps of sensors": np.arange(1, 21) * 0.1,
 }
+
+
+def test_a_prior_of_long_before_makes_no_ticks_before_the_log() -> None:
+    """A year of them at 20 Hz would be 600 million estimates; a second of them is as asked for."""
+    year_ns, second_ns, every_ns = 366 * 86_400 * 10**9, 10**9, 50_000_000
+    log_ns = 2 * year_ns + np.arange(0, 2 * second_ns, 10**8)
+    events = times_alone(np.array([0, 10, 20]), log_ns, 1, is_due=True)
+    start_ns = np.array([log_ns[0] - year_ns, log_ns[10] - second_ns])
+    found, tick = with_ticks(events, start_ns, np.zeros(2, np.int64), every_ns)
+    runs = np.split(found.time_ns, found.offsets[1:-1])
+    assert [run[0] for run in runs] == [log_ns[0], log_ns[10] - second_ns]
+    assert [len(run) for run in runs] == [19, 39]
+    assert tick.tolist() == [log_ns[9] // every_ns + 1, log_ns[19] // every_ns + 1]
+    gap = times_alone(np.array([0, 1, 1]), log_ns[9:10] + 100 * second_ns, 1, is_due=True)
+    assert len(with_ticks(gap, log_ns[[9, 19]], tick, every_ns)[0].time_ns) == 2000
 
 
 @pytest.mark.parametrize("method", ["ekf", "ukf"])
@@ -297,3 +314,26 @@ def test_ticks_are_multiples_of_their_interval_beside_the_sensors_stamps() -> No
     at_own = np.isin(times_ns, own)
     assert_allclose(ticked["mean"][at_own], plain["mean"], atol=0.05)  # shorter steps of the motion
     assert_array_equal(ticked["mean"][0], vehicle_a.MEAN)
+
+
+def test_results_are_one_piece_of_memory_and_columns_of_their_own():
+    """Runs of 2 and 3 estimates, and of 1 and 4 innovations in two slots."""
+    due, noted = np.array([0, 2, 5]), np.array([0, 1, 5])
+    estimates, innovations = no_results(due, noted, VEHICLE_A, 2)
+    n, t = VEHICLE_A.size, VEHICLE_A.tangent
+    columns = [*estimates[1:], *innovations[1:]]
+    shapes = [(5,), (5, n), (5, t, t), (5,), (5,), (5, 2), (5, 2, 2), (5, 3)]
+    assert [column.shape for column in columns] == shapes
+    for number, column in enumerate(columns):
+        column[...] = number
+    for number, column in enumerate(columns):
+        assert_array_equal(column, number)
+        assert column.flags.c_contiguous
+        assert np.shares_memory(column, _whole(columns[1]))
+    assert_array_equal(estimates.end, [0, 2])
+    assert_array_equal(innovations.end, [0, 1])
+
+
+def _whole(column: Any) -> Any:
+    """The memory that a column is a part of."""
+    return column if column.base is None else _whole(column.base)

@@ -15,6 +15,7 @@ from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import bind
 from replay.engine.replaying import Report, collect, replay
 from replay.engine.sources import MemorySource, memory_source
+from replay.judging.evaluation import chi_square_interval, rmse_interval
 from replay.judging.judge import Judge
 from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths
@@ -68,6 +69,7 @@ def assert_alike(one: Judge, other: Judge) -> None:
         pd.testing.assert_frame_equal(getattr(one, table), getattr(other, table), rtol=1e-12)
     for topic, steps in one.steps.items():
         pd.testing.assert_frame_equal(steps, other.steps[topic], rtol=1e-12)
+    assert one.bounds == other.bounds
     assert (one.failures, one.losses, one.unjudged) == (other.failures, other.losses, other.unjudged)
 
 
@@ -102,6 +104,38 @@ def test_the_runs_add_up_to_the_metrics(sources: list[MemorySource], outputs: di
         assert np.average(own["nees"], weights=own["estimates"]) == pytest.approx(
             judge.metrics["ekf.nees.robot1"], rel=1e-12
         )
+
+
+def test_nees_and_nis_have_the_bounds_of_what_is_independent(
+    sources: list[MemorySource], outputs: dict[str, Ragged]
+) -> None:
+    """NEES those of a mean over the three runs, NIS those of all innovations; chi-squares of a table."""
+    judge = judged(sources, [outputs])
+    bounds = judge.bounds
+    assert bounds.keys() <= judge.metrics.keys()
+    assert bounds["ekf.nees.robot1"] == pytest.approx((2.70039 / 3, 19.02277 / 3), rel=1e-5)  # 9 degrees
+    position = (1.23734 / 3, 14.44938 / 3)  # 6 degrees
+    assert bounds["ekf.position_nees.robot1"] == pytest.approx(position, rel=1e-5)
+    degrees = 2 * len(outputs["/estimates/ekf/robot1/innovation"])
+    expected = tuple(bound / degrees for bound in chi_square_interval(degrees, 1))
+    assert bounds["ekf.nis_per_component.robot1"] == pytest.approx(expected, rel=1e-12)
+    assert "dead-reckoning.nis_per_component.robot1" not in bounds
+
+
+def test_the_rmse_of_a_step_stands_beside_what_its_covariances_promise(
+    sources: list[MemorySource], outputs: dict[str, Ragged]
+) -> None:
+    """At step 5, from the covariances themselves."""
+    steps = judged(sources, [outputs]).steps["/estimates/ekf/robot1/pose"]
+    rows = outputs["/estimates/ekf/robot1/pose"]
+    blocks = [rows.of_run(run)["covariance"][5].reshape(3, 3)[:2, :2] for run in range(3)]
+    trace, squared = (
+        np.array([np.mean([np.trace(each) for each in of])])
+        for of in (blocks, [block @ block for block in blocks])
+    )
+    low, high = rmse_interval(np.array([3.0]), trace, squared)
+    assert_allclose(steps["position_rmse_m_low"][5], low[0], rtol=1e-12)
+    assert_allclose(steps["position_rmse_m_high"][5], high[0], rtol=1e-12)
 
 
 class InBlocks(MemorySource):

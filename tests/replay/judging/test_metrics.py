@@ -6,7 +6,7 @@ import pytest
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from replay.engine.blocks import Ragged
-from replay.judging.evaluation import Errors, Innovations
+from replay.judging.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
 from replay.judging.metrics import (
     ACCURACY,
     FAILURES,
@@ -36,6 +36,18 @@ def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:
         nees=np.sum(error**2, axis=1),
         without_truth=2,
     )
+
+
+def test_rmse_lies_in_its_interval_as_often_as_it_says() -> None:
+    """Exactly so where the variances are equal; nearly where one is nine times the other."""
+    [low], [high] = rmse_interval(np.array([4.0]), np.array([2.0]), np.array([2.0]))
+    assert (low**2, high**2) == pytest.approx(chi_square_interval(2, 4), rel=1e-12)
+    covariance = np.array([[5.0, 4.0], [4.0, 5.0]])
+    moments = np.trace(covariance), np.trace(covariance @ covariance)
+    [low], [high] = rmse_interval(np.array([5.0]), *np.reshape(moments, (2, 1)))
+    samples = np.random.default_rng(1).multivariate_normal([0, 0], covariance, (2000, 5))
+    rmse = np.sqrt(np.mean(np.sum(samples**2, axis=2), axis=1))
+    assert np.mean((low < rmse) & (rmse < high)) == pytest.approx(0.95, abs=0.01)
 
 
 def test_registered_metrics_by_name() -> None:

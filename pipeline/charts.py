@@ -1,0 +1,215 @@
+"""Charts: figures made of series over axes, described once.
+
+A study says what there is to see: series, bands, labels with their units. The result folder keeps that
+as JSON, beside the SVG picture that is drawn of it here; the report draws it for a person to zoom.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import PositiveInt, model_validator
+
+from recorders.parameters import Parameters
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# A person sees no more points of a line than these.
+MOST_POINTS = 1000
+# Each stands out from white and from black, by 3 to 1 at least (WCAG 2.2, 1.4.11), and from the others.
+COLOURS = (
+    *("#2f7fd1", "#d2640a", "#2a9147", "#d8433b", "#9461d6"),
+    *("#138f97", "#d0459a", "#9c6b3f", "#878a12", "#5f78a8"),
+)
+REFERENCE_COLOUR = "#808080"
+
+
+Numbers = list[float | None]
+Places = list[float | None] | list[str]
+Style = Literal["line", "dashed", "markers", "line+markers"]
+
+
+class Axis(Parameters):
+    """What an axis measures, with its unit; `ticks` are texts by place, where it has its own."""
+
+    label: str = ""
+    log: bool = False
+    limits: tuple[float, float] | None = None
+    ticks: dict[float, str] = {}
+
+
+class Drawn(Parameters):
+    """What is drawn over x, numbers or names.
+
+    What has one label has one colour in all panels, and is hidden together. A reference is what the
+    others are seen against, such as the truth.
+    """
+
+    label: str
+    x: Places
+    reference: bool = False
+
+
+class Series(Drawn):
+    """Values y over x."""
+
+    y: Numbers
+    style: Style = "line"
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        _check_lengths(self.x, self.y)
+        return self
+
+
+class Band(Drawn):
+    """A range over x, such as where a value lies with 95 % if all is well."""
+
+    low: Numbers
+    high: Numbers
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        _check_lengths(self.x, self.low, self.high)
+        return self
+
+
+def _check_lengths(*columns: Sequence[Any]) -> None:
+    if len(set(map(len, columns))) > 1:
+        raise ValueError("x and the values over it must be of one length")
+
+
+class Panel(Parameters):
+    """Series and bands over two axes; a `plane` has one scale on both."""
+
+    x: Axis = Axis()
+    y: Axis = Axis()
+    series: list[Series] = []
+    bands: list[Band] = []
+    title: str = ""
+    plane: bool = False
+
+
+class Chart(Parameters):
+    """Panels in rows of so many columns, with one legend."""
+
+    panels: list[Panel]
+    title: str = ""
+    columns: PositiveInt = 1
+
+    def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
+        """The colour of every label; charts that begin with the same labels agree on theirs."""
+        drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
+        own = dict.fromkeys([*first, *(each.label for each in drawn if not each.reference)])
+        colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
+        return {each.label: REFERENCE_COLOUR for each in drawn if each.reference} | colours
+
+
+def thinned(count: int) -> slice:
+    """Every k-th of so many points, so that a line has no more of them than a person sees."""
+    return slice(None, None, max(1, -(-count // MOST_POINTS)))
+
+
+def curve(
+    label: str, x: ArrayLike, y: ArrayLike, style: Style = "line", *, reference: bool = False
+) -> Series:
+    """A series of numbers y over x, numbers or names."""
+    return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
+
+
+def path(
+    label: str, points: NDArray[np.float64], style: Style = "line", *, reference: bool = False
+) -> Series:
+    """Points (n, 2) over the plane."""
+    return curve(label, points[:, 0], points[:, 1], style, reference=reference)
+
+
+def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference: bool = False) -> Band:
+    """A range over x, numbers or names."""
+    return Band(label=label, x=_places(x), low=_numbers(low), high=_numbers(high), reference=reference)
+
+
+def level(label: str, x: ArrayLike, y: float) -> Series:
+    """A value that others are seen against, from end to end."""
+    ends = np.asarray(x)[[0, -1]]
+    return curve(label, ends, [y, y], reference=True)
+
+
+def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
+    """One range that others are seen against, from end to end."""
+    ends = np.asarray(x)[[0, -1]]
+    return band(label, ends, [low, low], [high, high], reference=True)
+
+
+def _places(values: ArrayLike) -> Places:
+    array = np.asarray(values)
+    return array.astype(str).tolist() if array.dtype.kind in "OSU" else _numbers(array)
+
+
+def _numbers(values: ArrayLike) -> Numbers:
+    """Numbers as JSON has them, to seven digits, which no screen resolves; NaN and infinity are null."""
+    array = np.asarray(values, dtype=float)
+    return [float(f"{value:.7g}") if np.isfinite(value) else None for value in array.tolist()]
+
+
+def draw(chart: Chart) -> "Figure":
+    """The chart as a figure of matplotlib."""
+    from matplotlib.figure import Figure
+
+    rows = -(-len(chart.panels) // chart.columns)
+    height_in = 4.5 if any(panel.plane for panel in chart.panels) else 2.8
+    size_in = (max(8.0, min(3.4 * chart.columns, 12.0)), height_in * rows + 0.5)
+    figure = Figure(figsize=size_in, layout="constrained")
+    colours = chart.colours()
+    for place, panel in enumerate(chart.panels):
+        _draw_panel(figure.add_subplot(rows, chart.columns, place + 1), panel, colours)
+    if chart.title:
+        figure.suptitle(chart.title, fontsize=10, parse_math=False)
+    handles: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if handles:
+        columns = min(len(handles), 5)
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8
+        )
+    return figure
+
+
+STYLES: dict[Style, dict[str, Any]] = {
+    "line": {},
+    "dashed": {"linestyle": "--"},
+    "markers": {"linestyle": "", "marker": "o", "markersize": 4},
+    "line+markers": {"marker": "o", "markersize": 3},
+}
+
+
+def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
+    for each in panel.bands:
+        x, low, high = map(_known, (each.x, each.low, each.high))
+        colour = colours[each.label]
+        axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0, label=each.label)
+    for series in panel.series:
+        x, y, look = _known(series.x), _known(series.y), STYLES[series.style]
+        axes.plot(x, y, color=colours[series.label], label=series.label, linewidth=1.0, **look)
+    axes.set_title(panel.title, fontsize=9)
+    axes.grid(alpha=0.3)
+    for name, of, axis in (("x", panel.x, axes.xaxis), ("y", panel.y, axes.yaxis)):
+        axes.set(**{f"{name}label": of.label, f"{name}scale": "log" if of.log else "linear"})
+        if of.ticks:
+            axis.set_ticks(list(of.ticks), list(of.ticks.values()))
+            axis.set_ticks([], minor=True)
+        if of.limits:
+            axes.set(**{f"{name}lim": of.limits})
+    if panel.plane:
+        axes.set_aspect("equal", adjustable="datalim")
+
+
+def _known(values: Places) -> list[Any]:
+    """Values as matplotlib has them: NaN where there is none."""
+    return [math.nan if value is None else value for value in values]

@@ -1,0 +1,109 @@
+"""The two lines that a section of the report opens with: what was run, and what came of it."""
+
+import math
+from collections import Counter
+from textwrap import shorten
+
+from pipeline.results import MetricTable, Result, metric_tables
+from pipeline.terminal import format_value
+
+# More estimators than these are counted, and more claims than these are in the table below alone.
+MOST_NAMED = 6
+MOST_CLAIMS = 2
+LONGEST_CLAIM = 45
+LEAST_SHARE = 0.995
+
+
+def verdict(result: Result) -> tuple[str, str]:
+    """What was run; then which claims hold, or which estimator is best and whether it is consistent."""
+    tables = metric_tables(result.metrics, result.bounds)
+    return _what_was_run(result, tables), _of_claims(result) if result.claims else _best(tables)
+
+
+def _what_was_run(result: Result, tables: list[MetricTable]) -> str:
+    settings = result.settings
+    estimators = list(settings.get("estimators") or (tables[0].estimators if tables else []))
+    if len(estimators) > MOST_NAMED:
+        named = f"{', '.join(estimators[:MOST_NAMED])} and {len(estimators) - MOST_NAMED} more"
+    else:
+        named = ", ".join(estimators) or result.experiment
+    source = settings.get("record", {}).get("scenario") or settings.get("import", {}).get("source")
+    runs = len(settings["logs"]) if "logs" in settings else settings.get("runs", 1)
+    over = f" over {runs} {'run' if runs == 1 else 'runs'}" + (f" of {source}" if source else "")
+    seed = f", seed {settings['seed']}" if "seed" in settings and "import" not in settings else ""
+    return f"{named}{over}{seed}."
+
+
+def _of_claims(result: Result) -> str:
+    """How many claims hold and how many do not, and the first of these."""
+    counts = Counter(claim.verdict for claim in result.claims)
+    said = [f"{counts['confirmed']} of {len(result.claims)} claims confirmed"]
+    refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
+    if refuted:
+        named = [f"“{shorten(each, LONGEST_CLAIM, placeholder=' …')}”" for each in refuted[:MOST_CLAIMS]]
+        more = f" and {len(refuted) - MOST_CLAIMS} more" if len(refuted) > MOST_CLAIMS else ""
+        said.append(f"{len(refuted)} refuted: {', '.join(named)}{more}")
+    if counts["not reproducible"]:
+        said.append(f"{counts['not reproducible']} not reproducible")
+    return "; ".join(said) + "."
+
+
+def _best(tables: list[MetricTable]) -> str:
+    """The estimator of the least error over all cases, and whether NEES calls it consistent."""
+    quantity = _main_quantity(tables)
+    errors = {
+        estimator: math.sqrt(sum(error**2 for error in of) / len(of))
+        for estimator in (tables[0].estimators if tables else [])
+        if (of := _values(tables, estimator, quantity)) is not None
+    }
+    if not errors:
+        return "No errors against a truth, and no claims."
+    best = min(errors, key=lambda estimator: errors[estimator])
+    least = f"{best} has the least {quantity}, {format_value(errors[best])}"
+    alone = f"{quantity} of {best} is {format_value(errors[best])}"
+    return "; ".join(filter(None, [least if len(errors) > 1 else alone, *_doubts(tables, best)])) + "."
+
+
+def _main_quantity(tables: list[MetricTable]) -> str:
+    """What estimators are compared by: position, else orientation, else the first RMSE there is."""
+    there = [quantity for table in tables for quantity in table.quantities if "rmse" in quantity]
+    preferred = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in there]
+    return next(iter([*preferred, *there]), "")
+
+
+def _values(tables: list[MetricTable], estimator: str, quantity: str) -> list[float] | None:
+    """An estimator's values over the cases; None where it lacks one that another estimator has."""
+    of = [table.quantities[quantity] for table in tables if quantity in table.quantities]
+    values = [each[estimator].value if estimator in each else None for each in of]
+    numbers = [value for value in values if isinstance(value, int | float)]
+    return numbers if numbers and len(numbers) == len(values) else None
+
+
+def _doubts(tables: list[MetricTable], estimator: str) -> list[str]:
+    """Whether an estimator is consistent, and what it did not estimate."""
+    said = []
+    where = []
+    for table in tables:
+        measured = table.quantities.get("nees", {}).get(estimator)
+        if measured is None or measured.bounds is None or not isinstance(measured.value, int | float):
+            continue
+        low, high = measured.bounds
+        where.append("above" if measured.value > high else "below" if measured.value < low else "within")
+        interval = f"the 95 % interval {format_value(low)} to {format_value(high)}"
+        sentence = f"its NEES of {format_value(measured.value)} lies {where[-1]} {interval}: "
+    meaning = {
+        "above": "its covariances are too small",
+        "below": "its covariances are too large",
+        "within": "it is consistent",
+    }
+    if len(where) == 1:
+        said.append(sentence + meaning[where[0]])
+    elif where:
+        said.append(f"by NEES it is consistent in {where.count('within')} of {len(where)} cases")
+    failed = sum(_values(tables, estimator, "failed_runs") or [])
+    if failed:
+        said.append(f"{failed:g} of its runs failed")
+    share = min(_values(tables, estimator, "estimated_share") or [1.0])
+    if share < LEAST_SHARE:
+        said.append(f"it estimated {100 * share:.1f} % of the span")
+    return said

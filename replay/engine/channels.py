@@ -1,0 +1,88 @@
+"""What the channels of a log state, and which of its topics are numbered: what estimators bind by."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Topic
+from recorders.parameters import Parameters, build
+
+
+def stated(
+    topics: Sequence[Topic],
+    name: str,
+    parameters: type[Parameters] | None = None,
+    *,
+    needed: bool = True,
+) -> float:
+    """The first number of this name that one of the channels states; NaN where none needs to.
+
+    Where it stands for a parameter, that is of the type `parameters`. Raises BadInput where none states
+    it though it is needed, it is no number, or the parameter does not take it.
+    """
+    for topic in topics:
+        if name in topic.metadata:
+            return _number(topic.name, name, topic.metadata[name], parameters)
+    if needed:
+        mend = "record it again, with it" if parameters is None else f"give it with --set {name}=..."
+        raise BadInput(f"topic {topics[0].name} does not state {name}; {mend}")
+    return np.nan
+
+
+@lru_cache(maxsize=256)
+def _number(topic: str, name: str, text: str, parameters: type[Parameters] | None) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise BadInput(f"topic {topic} states {name} = {text}, which is no number") from None
+    if parameters is not None:
+        build(parameters, {name: value}, f"topic {topic}")
+    return value
+
+
+def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
+    """A parameter; where it is None, what one of the channels states for it. Errors as `stated`."""
+    value = getattr(values, name)
+    return stated(topics, name, type(values)) if value is None else float(value)
+
+
+def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) -> dict[int, Topic]:
+    """The topics /STEM<N>/LEAF of a schema, by N in order."""
+    found = {}
+    for topic in topics.values():
+        number = topic.name.removeprefix(f"/{stem}").removesuffix(f"/{leaf}")
+        is_one = topic.name == f"/{stem}{number}/{leaf}" and topic.schema_name == schema.full_name
+        if is_one and number.isdigit():
+            found[int(number)] = topic
+    return dict(sorted(found.items()))
+
+
+def bindings(
+    topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
+) -> Iterator[tuple[str, dict[str, Topic]]]:
+    """Where a log has all the topics asked for, with their schemas: prefix, and topics as asked for.
+
+    Those that are optional may be absent.
+
+    A name with a slash in front, such as `/landmarks`, is a topic for all; others, such as `odometry`,
+    are looked for under every prefix: `/robot1/odometry`, `/robot2/odometry`.
+    """
+    own = [name for name in asked if not name.startswith("/") and name not in optional]
+    end = f"/{own[0]}" if own else ""
+    prefixes = [name.removesuffix(end) for name in topics if name.endswith(end)] if own else [""]
+    for prefix in prefixes:
+        found = {
+            name: topics[full]
+            for name, schema in asked.items()
+            if (full := resolved(name, prefix)) in topics
+            and topics[full].schema_name == schema.full_name
+        }
+        if set(asked) - set(optional) <= set(found):
+            yield prefix, found
+
+
+def resolved(name: str, prefix: str) -> str:
+    """A topic's full name under a prefix; one with a slash in front is the same for all."""
+    return name if name.startswith("/") or not name else f"{prefix}/{name}"
