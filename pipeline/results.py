@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
 from pipeline.charts import Chart, draw
@@ -93,6 +93,14 @@ class Measured(NamedTuple):
 
     value: MetricValue = None
     bounds: Bounds | None = None
+
+    @property
+    def place(self) -> Literal["below", "within", "above", ""]:
+        """Where the value lies; nowhere where there is none, or no bounds."""
+        if self.bounds is None or not isinstance(self.value, int | float):
+            return ""
+        low, high = self.bounds
+        return "below" if self.value < low else "above" if self.value > high else "within"
 
 
 @dataclass(frozen=True)

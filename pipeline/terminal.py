@@ -99,7 +99,7 @@ def print_metrics(metrics: Mapping[str, MetricValue], bounds: Mapping[str, Bound
 
 
 def _with_bounds(measured: Measured) -> object:
-    if measured.bounds is None or measured.value is None:
+    if not measured.bounds or not measured.place:
         return measured.value
     low, high = map(format_value, measured.bounds)
     return f"{format_value(measured.value)} ({low} to {high})"

@@ -31,7 +31,7 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
     lasts = [key[-1] for key in differing]
     said = [
         f"{key[-1] if lasts.count(key[-1]) == 1 else '.'.join(key)} "
-        + (format_value(own[key]) if key in own else "as usual")
+        + (format_value(own[key]) if key in own else "default")
         for key in differing
     ]
     return ": ".join(filter(None, [result.experiment, ", ".join(said)]))

@@ -6,12 +6,18 @@ from textwrap import shorten
 
 from pipeline.results import MetricTable, Result, metric_tables
 from pipeline.terminal import format_value
+from replay.judging.judge import LEAST_SHARE
 
 # More estimators than these are counted, and more claims than these are in the table below alone.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
 LONGEST_CLAIM = 45
-LEAST_SHARE = 0.995
+# What a mean NEES says, by where it lies.
+MEANING = {
+    "above": "its covariances are too small",
+    "below": "its covariances are too large",
+    "within": "it is consistent",
+}
 
 
 def verdict(result: Result) -> tuple[str, str]:
@@ -61,7 +67,7 @@ def _best(tables: list[MetricTable]) -> str:
     best = min(errors, key=lambda estimator: errors[estimator])
     least = f"{best} has the least {quantity}, {format_value(errors[best])}"
     alone = f"{quantity} of {best} is {format_value(errors[best])}"
-    return "; ".join(filter(None, [least if len(errors) > 1 else alone, *_doubts(tables, best)])) + "."
+    return "; ".join([least if len(errors) > 1 else alone, *_doubts(tables, best)]) + "."
 
 
 def _main_quantity(tables: list[MetricTable]) -> str:
@@ -82,24 +88,19 @@ def _values(tables: list[MetricTable], estimator: str, quantity: str) -> list[fl
 def _doubts(tables: list[MetricTable], estimator: str) -> list[str]:
     """Whether an estimator is consistent, and what it did not estimate."""
     said = []
-    where = []
-    for table in tables:
-        measured = table.quantities.get("nees", {}).get(estimator)
-        if measured is None or measured.bounds is None or not isinstance(measured.value, int | float):
-            continue
-        low, high = measured.bounds
-        where.append("above" if measured.value > high else "below" if measured.value < low else "within")
-        interval = f"the 95 % interval {format_value(low)} to {format_value(high)}"
-        sentence = f"its NEES of {format_value(measured.value)} lies {where[-1]} {interval}: "
-    meaning = {
-        "above": "its covariances are too small",
-        "below": "its covariances are too large",
-        "within": "it is consistent",
-    }
-    if len(where) == 1:
-        said.append(sentence + meaning[where[0]])
-    elif where:
-        said.append(f"by NEES it is consistent in {where.count('within')} of {len(where)} cases")
+    judged = [
+        measured
+        for table in tables
+        if (measured := table.quantities.get("nees", {}).get(estimator)) and measured.place
+    ]
+    if len(judged) == 1:
+        [measured] = judged
+        low, high = map(format_value, measured.bounds or ())
+        where = f"lies {measured.place} the 95 % interval {low} to {high}"
+        said.append(f"its NEES of {format_value(measured.value)} {where}: {MEANING[measured.place]}")
+    elif judged:
+        consistent = sum(measured.place == "within" for measured in judged)
+        said.append(f"by NEES it is consistent in {consistent} of {len(judged)} cases")
     failed = sum(_values(tables, estimator, "failed_runs") or [])
     if failed:
         said.append(f"{failed:g} of its runs failed")

@@ -148,12 +148,10 @@ def rmse_interval(
 
     Returns the lower and the upper bounds (n,); NaN where a covariance is zero or not finite.
     """
-    tail = 0.5 * (1 - probability)
+    quantiles = 0.5 - 0.5 * probability, 0.5 + 0.5 * probability
     with np.errstate(divide="ignore", invalid="ignore"):
         degrees = runs * trace**2 / squared
-        low, high = (
-            np.sqrt(trace * chi2.ppf(quantile, degrees) / degrees) for quantile in (tail, 1 - tail)
-        )
+        low, high = (np.sqrt(trace * chi2.ppf(each, degrees) / degrees) for each in quantiles)
     return low, high
 
 

@@ -192,8 +192,8 @@ def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) ->
     assert page.texts["h2"] == [
         "sweep: rate_hz 5",
         "sweep: rate_hz 10",
-        f"sweep: rate_hz as usual ({folders[2]})",
-        f"sweep: rate_hz as usual ({folders[3]})",
+        f"sweep: rate_hz default ({folders[2]})",
+        f"sweep: rate_hz default ({folders[3]})",
     ]
 
 
