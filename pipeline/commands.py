@@ -6,15 +6,14 @@ Rerun and matplotlib take long to import: only what draws imports them.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.ensemble import Part, hash_files, judge_logs, parts_of, replay_parts
+from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
-from pipeline.starting import Origin, from_estimates, from_truth
+from pipeline.starting import check_same_run, origins_of, span_of
 from pipeline.studies.localization import summarise
 from pipeline.terminal import (
     print_claims,
@@ -28,7 +27,7 @@ from pipeline.terminal import (
 )
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Log, open_log, read_span
+from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from recorders.parsing import parse_json
 from replay.engine.estimator import configure, find_estimator
@@ -70,15 +69,11 @@ def replay_logs(
     estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})
     order: Clock = "log_time" if arrival_order else "publish_time"
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
-    sources = [_span(source, start_s, end_s, order) for source in opened]
-    starts = _origins(sources, origins, sigmas, order, gap_limit_s)
+    sources = [span_of(source, start_s, end_s, order) for source in opened]
+    starts = origins_of(sources, origins, _sigmas(sigmas), order, gap_limit_s)
     estimates = list(zip(paths, logs, strict=True))
-    parts = [
-        Part(sources[now], now.start, len(sources[now]) == len(sources), estimates[now], starts[now])
-        for now in parts_of(len(sources))
-    ]
     done = replay_parts(
-        parts,
+        cut_in_parts(sources, estimates, starts),
         estimators,
         gap_limit_s=gap_limit_s,
         order=order,
@@ -143,52 +138,6 @@ def _settings_of_estimators(
     return chosen
 
 
-def _span(source: LogSource, start_s: float | None, end_s: float | None, order: Clock) -> LogSource:
-    """The part of a log between two times in seconds, by the clock that orders the replay."""
-    if start_s is not None and end_s is not None and start_s >= end_s:
-        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
-    if start_s is None and end_s is None:
-        return source
-    zero_ns = source.zero_ns(order)
-    start_ns, end_ns = (
-        None if time_s is None else zero_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
-    )
-    first_ns, last_ns = read_span(source.log, order)
-    if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
-        first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
-        raise BadInput(
-            f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
-        )
-    return LogSource(source.log, start_ns, end_ns)
-
-
-def _origins(
-    sources: Sequence[LogSource],
-    origins: Sequence[str],
-    sigmas: Sequence[str],
-    order: Clock,
-    gap_limit_s: float,
-) -> list[Origin]:
-    """What each run starts from; none where that is not stated."""
-    stated = _sigmas(sigmas)
-    if origins and sources[0].start_ns is None:
-        raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
-    if stated and tuple(origins) != ("truth",):
-        raise BadInput(f"--start-sigma {sigmas[0]}: is for --start-from truth")
-    if not origins:
-        return []
-    if tuple(origins) == ("truth",):
-        return [from_truth(source, order, gap_limit_s, stated) for source in sources]
-    if len(origins) != len(sources):
-        raise BadInput(
-            f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
-        )
-    opened = [open_log(origin) for origin in origins]
-    for estimates, source in zip(opened, sources, strict=True):
-        _check_same_run(estimates, source.log)
-    return [from_estimates(LogSource(estimates)) for estimates in opened]
-
-
 def _sigmas(texts: Sequence[str]) -> dict[str, float]:
     """Standard deviations by component, from COMPONENT=SIGMA."""
     sigmas: dict[str, float] = {}
@@ -234,7 +183,7 @@ def evaluate_logs(
         check_folder(out, {"input": [*estimates, *places]})
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
     for each, source in zip(opened, sources, strict=True):
-        _check_same_run(each, source.log)
+        check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
     estimators = _stated_estimators(opened[0])
     with result_folder(out) if out is not None else nullcontext() as folder:
@@ -283,16 +232,6 @@ def _stated_estimators(estimates: Log) -> dict[str, Any]:
     except ValueError:
         return {}
     return stated if isinstance(stated, dict) else {}
-
-
-def _check_same_run(estimates: Log, log: Log) -> None:
-    """Raise BadInput where estimates are of another run than the log's."""
-    of, run = estimates.run, log.run
-    if of and run and replace(of, notes={}) != replace(run, notes={}):
-        raise BadInput(
-            f"{estimates.path}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
-            f"{log.path} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
-        )
 
 
 def _print_outcome(

@@ -75,6 +75,18 @@ def parts_of(runs: int) -> Iterator[slice]:
         yield slice(first, min(first + RUNS_AT_ONCE, runs))
 
 
+def cut_in_parts(
+    sources: Sequence[Source],
+    estimates: Sequence[tuple[Path, Path]],
+    origins: Sequence[Origin] = (),
+) -> Iterator[Part]:
+    """The parts of runs that are all at hand; `estimates` and `origins` are of all of them."""
+    for now in parts_of(len(sources)):
+        yield Part(
+            sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
+        )
+
+
 @dataclass
 class Pass:
     """What a streamed pass leaves.
@@ -381,7 +393,7 @@ def estimates_metadata(source: Source, estimators: Settings, path: Path, log: Pa
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath(log.resolve(), path.resolve().parent)
-    settings = json.dumps({label: dict(values) for label, values in estimators.items()})
+    settings = json.dumps({label: dict(values) for label, values in estimators.items()}, default=str)
     return replace(run, notes={"log": place, "estimators": settings})
 
 

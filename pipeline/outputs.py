@@ -82,16 +82,23 @@ def _identity(path: Path) -> Hashable:
 
 def _run_of(path: Path) -> RunMetadata | None:
     """What run a log is of, if fuselog wrote it."""
+    with suppress(BadInput):
+        return open_log(path).run if _is_log(path) else None
+    return None
+
+
+def _is_log(path: Path) -> bool:
+    """Whether fuselog wrote a log, which is whole."""
     from mcap.reader import make_reader
 
     from recorders.log.container_writer import LIBRARY
 
     try:
-        run = open_log(path).run
+        open_log(path)
+        with path.open("rb") as file:
+            return make_reader(file).get_header().library == LIBRARY
     except (BadInput, OSError):
-        return None
-    with path.open("rb") as file:
-        return run if make_reader(file).get_header().library == LIBRARY else None
+        return False
 
 
 def _is_estimates(run: RunMetadata) -> bool:
@@ -149,6 +156,7 @@ def _is_report(path: Path) -> bool:
     return is_report(path)
 
 
+LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
 ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)
 TIMELINE = Kind(".rrd", "a timeline of fuselog", _is_timeline)

@@ -8,17 +8,18 @@ The estimator is handed a prior made of that, and need not know.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Stream, make_stream, schemas
+from recorders.log import Clock, Stream, make_stream, open_log, schemas
 from replay.engine.blocks import gather
 from replay.engine.components import match_components, match_tangent, stated_components
 from replay.engine.estimator import Bound
-from replay.engine.sources import Source
+from replay.engine.sources import LogSource, MemorySource, Source
 from replay.engine.tangent import tangent_components
 from replay.judging.evaluation import split_topic
 from replay.judging.truths import truth_at
@@ -26,6 +27,76 @@ from replay.judging.truths import truth_at
 Floats = NDArray[np.float64]
 # A run's prior at a time in ns, from an estimator's label and the log's own prior.
 Origin = Callable[[str, Stream, int], Stream]
+Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
+
+
+def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:
+    """The part of a run between two times in seconds, by the clock that orders the replay.
+
+    Raises BadInput where there is nothing in it.
+    """
+    if start_s is not None and end_s is not None and start_s >= end_s:
+        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
+    if start_s is None and end_s is None:
+        return source
+    zero_ns = source.zero_ns(order)
+    start_ns, end_ns = (
+        None if time_s is None else zero_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
+    )
+    first_ns, last_ns = source.extent(order)
+    if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
+        first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
+        raise BadInput(
+            f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
+        )
+    return replace(source, start_ns=start_ns, end_ns=end_ns)
+
+
+def origins_of(
+    sources: Sequence[Source],
+    origins: Sequence[str | Path],
+    sigmas: Mapping[str, float],
+    order: Clock,
+    gap_limit_s: float,
+) -> list[Origin]:
+    """What each run starts from; none where that is not stated.
+
+    Args:
+        sources: the runs.
+        origins: "truth", or the estimates log of an earlier replay of each run.
+        sigmas: standard deviations by component, for the truth; see `from_truth`.
+        order: the clock of the replay.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Raises BadInput where the replay begins with the runs, or an estimates log is of another run.
+    """
+    if origins and sources[0].start_ns is None:
+        raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
+    if sigmas and tuple(origins) != ("truth",):
+        name, sigma = next(iter(sigmas.items()))
+        raise BadInput(f"--start-sigma {name}={sigma:g}: is for --start-from truth")
+    if not origins:
+        return []
+    if tuple(origins) == ("truth",):
+        return [from_truth(source, order, gap_limit_s, sigmas) for source in sources]
+    if len(origins) != len(sources):
+        raise BadInput(
+            f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
+        )
+    opened = [LogSource(open_log(origin)) for origin in origins]
+    for estimates, source in zip(opened, sources, strict=True):
+        check_same_run(estimates, source)
+    return [from_estimates(estimates) for estimates in opened]
+
+
+def check_same_run(estimates: Source, source: Source) -> None:
+    """Raise BadInput where estimates are of another run than the log's."""
+    of, run = estimates.run, source.run
+    if of and run and replace(of, notes={}) != replace(run, notes={}):
+        raise BadInput(
+            f"{estimates.name}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
+            f"{source.name} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
+        )
 
 
 def start_from(

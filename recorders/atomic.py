@@ -80,7 +80,9 @@ def scratch_folder(name: str) -> Iterator[Path]:
     place = Path(tempfile.gettempdir()) / name
     _clear_leftovers(place)
     with _working_folder(place) as work:
-        yield work
+        new = work / _NEW
+        new.mkdir(mode=0o700)
+        yield new
 
 
 @contextmanager

@@ -11,6 +11,12 @@ class BadInput(Exception):
     """
 
 
+class UnknownName(BadInput, KeyError):
+    """A name that is asked of a mapping and is not there; `in` and `get` take it as any KeyError."""
+
+    __str__ = Exception.__str__  # the sentence, which KeyError would put in quotes
+
+
 def choices(name: str, known: Collection[str]) -> str:
     """The end of a sentence on an unknown name: the one that was probably meant, else all there are."""
     near = get_close_matches(name, known, n=1) or [each for each in known if name and name in each]

@@ -30,17 +30,24 @@ def summarise(judge: Judge) -> Outcome:
     outcome.metrics.update(judge.metrics)
     outcome.bounds.update(judge.bounds)
     outcome.tables["summary"] = summary_table(outcome.metrics)
-    steps = {topic: table for topic, table in judge.steps.items() if len(table)}
+    steps = [table for table in judge.steps.values() if len(table)]
     if steps:
-        outcome.tables["steps"] = pd.concat(steps.values())
+        outcome.tables["steps"] = pd.concat(steps)
         outcome.tables["runs"] = judge.runs_table
         outcome.tables["times"] = judge.times
-        judged = {topic: each for topic, each in judge.judged.items() if topic in steps}
-        for case in dict.fromkeys(errors.case for errors in judged.values()):
-            name = f"errors-{case}" if case else "errors"
-            shown = [(judged[topic], steps[topic]) for topic in judged if judged[topic].case == case]
-            outcome.figures[name] = error_chart(shown, case)
+        for case, chart in error_charts(judge).items():
+            outcome.figures[f"errors-{case}" if case else "errors"] = chart
     return outcome
+
+
+def error_charts(judge: Judge) -> dict[str, Chart]:
+    """The errors of each case over time, where there are any."""
+    steps = {topic: table for topic, table in judge.steps.items() if len(table)}
+    judged = {topic: each for topic, each in judge.judged.items() if topic in steps}
+    shown: dict[str, list[tuple[Errors, pd.DataFrame]]] = {}
+    for topic, errors in judged.items():
+        shown.setdefault(errors.case, []).append((errors, steps[topic]))
+    return {case: error_chart(each, case) for case, each in shown.items()}
 
 
 def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:

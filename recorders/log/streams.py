@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,10 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from recorders.errors import BadInput
 from recorders.log.schemas import NUMPY_TYPES, Kind, Schema
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+    import pyarrow as pa
+
 Clock = Literal["publish_time", "log_time"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Stream:
     """The messages of one topic: first axis = message.
 
@@ -28,6 +33,10 @@ class Stream:
     >>> of_first = seen.take(seen["target_id"] == 1)
     >>> of_first.publish_time_ns.tolist()
     [0, 20]
+    >>> of_first.pandas()[["publish_time_ns", "range_m"]]
+       publish_time_ns  range_m
+    0                0      5.0
+    1               20      4.0
     """
 
     topic: str
@@ -63,6 +72,48 @@ class Stream:
             columns={name: column[rows] for name, column in self.columns.items()},
             position=self.position[rows],
         )
+
+    def pandas(self) -> "pd.DataFrame":
+        """A row for every message: both stamps in ns, then the fields.
+
+        A vector has a column for every entry, such as `mean_x_m`; where its entries have no names they
+        have numbers, such as `covariance_0`.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(self._flat())
+
+    def arrow(self) -> "pa.Table":
+        """The same table for Arrow."""
+        import pyarrow as pa
+
+        return pa.table(self._flat())
+
+    def polars(self) -> "pl.DataFrame":
+        """The same table for polars; raises BadInput where that is not installed."""
+        try:
+            import polars as pl
+        except ImportError:
+            raise BadInput(
+                "polars is not installed: pip install polars, or take .pandas() or .arrow()"
+            ) from None
+        return pl.from_arrow(self.arrow())
+
+    def _flat(self) -> dict[str, NDArray]:
+        """Columns with one axis, by name."""
+        columns = {"publish_time_ns": self.publish_time_ns, "log_time_ns": self.log_time_ns}
+        for name, column in self.columns.items():
+            if column.ndim == 1:
+                columns[name] = column
+                continue
+            width = column.shape[1]
+            entries = self.components if len(self.components) == width else range(width)
+            columns |= {f"{name}_{entry}": column[:, index] for index, entry in enumerate(entries)}
+        return columns
+
+    def __repr__(self) -> str:
+        of = "1 message" if len(self) == 1 else f"{len(self)} messages"
+        return f"<Stream {self.topic}, {self.schema.full_name}, {of}: {', '.join(self._flat())}>"
 
 
 def make_stream(

@@ -87,6 +87,9 @@ class Estimator(Generic[ParametersType]):
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
 
+    def __str__(self) -> str:
+        return self.summary
+
 
 def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
     """The registered estimator of `name`, and the parameter that a `name:variant` sets.
@@ -106,14 +109,16 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     """The estimator of a label, and its parameters.
 
     `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
-    estimator can be replayed with several settings at once. The other settings are its parameters.
+    estimator can be replayed with several settings at once. A `kind` may be an `Estimator` too, which
+    needs no name. The other settings are its parameters.
 
     Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
     """
     if not re.fullmatch(r"[\w:=-]+", label):
         raise BadInput(f"estimator '{label}': a label is made of letters, digits and '-', '_', ':', '='")
     values = dict(settings)
-    estimator, variant = find_estimator(str(values.pop("kind", label)))
+    kind = values.pop("kind", label)
+    estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
     return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, Topic, make_stream, schemas
-from recorders.parameters import ParametersType
+from recorders.parameters import Parameters, ParametersType
 from replay.engine.blocks import Block, Ragged, gather, ragged_rows
 from replay.engine.channels import bindings, given_or_stated, resolved
 from replay.engine.compile import compile_over_runs, uncompiled_over_runs
@@ -181,7 +181,7 @@ class Told(NamedTuple):
     columns: Mapping[str, NDArray]
 
 
-class Innovations(NamedTuple):
+class Measured(NamedTuple):
     """Innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
 
     `target` (n,) is what each was about; 0 unless given.
@@ -207,7 +207,7 @@ class Estimates(NamedTuple):
     mean: Floats
     covariance: Floats
     solution: Solution | None = None
-    innovations: Innovations | None = None
+    innovations: Measured | None = None
     further: Mapping[str, Told] = MappingProxyType({})
 
 
@@ -221,7 +221,7 @@ class Solved(NamedTuple):
 def recursive(
     summary: str,
     *,
-    parameters: type[ParametersType],
+    parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
     streams: Mapping[str, Schema],
     whole: Mapping[str, Schema],
     components: Components,
@@ -240,7 +240,7 @@ def recursive(
 
     Args:
         summary: what it is, in one line.
-        parameters: their type.
+        parameters: their type; without one there are none.
         streams: the topics to follow, with their schemas; see `bindings` for their names.
         whole: the topics that `start` needs whole, such as a map or a prior. Gaussian estimates among
             them are priors: of the estimate's components, see `Given.prior`.
@@ -273,10 +273,8 @@ def recursive(
     ...         state.range_m[run, 0] = min(state.range_m[run, 0], messages.value[row, 1])
     ...         results.mean[row, 0] = state.range_m[run, 0]
     ...         results.covariance[row, 0, 0] = 0.01
-    >>> from recorders.parameters import Parameters
     >>> nearest = recursive(
     ...     "shortest range so far",
-    ...     parameters=Parameters,
     ...     streams={"/range": schemas.RANGE},
     ...     whole={},
     ...     components={"range_m": "linear"},
@@ -374,7 +372,7 @@ def _drawn_on(generators: Generators, messages: Messages, parameters: Any) -> Ge
 def batch(
     summary: str,
     *,
-    parameters: type[ParametersType],
+    parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
     streams: Mapping[str, Schema],
     whole: Mapping[str, Schema],
     components: Components,
@@ -397,10 +395,8 @@ def batch(
     ...     ranges = streams["/range"]
     ...     mean, covariance = ranges["range_m"].mean().reshape(1, 1), np.full((1, 1, 1), 0.01)
     ...     return Estimates(ranges.publish_time_ns[-1:], mean, covariance)
-    >>> from recorders.parameters import Parameters
     >>> average = batch(
     ...     "mean range",
-    ...     parameters=Parameters,
     ...     streams={"/range": schemas.RANGE},
     ...     whole={},
     ...     components={"range_m": "linear"},
@@ -641,9 +637,9 @@ class _Outputs:
                 columns: dict[str, Any] = dict(told.columns)
                 yield make_stream(f"{self.topic}/{name}", schema, told.time_ns, **columns)
 
-    def _innovations_of_run(self, told: Innovations | None) -> Stream:
+    def _innovations_of_run(self, told: Measured | None) -> Stream:
         m = len(self.measured)
-        told = told or Innovations(np.empty(0, np.int64), np.empty((0, m)), np.empty((0, m, m)))
+        told = told or Measured(np.empty(0, np.int64), np.empty((0, m)), np.empty((0, m, m)))
         time_ns, innovation, covariance = self._checked("innovations.", told[:3], ((), (m,), (m, m)))
         count = len(time_ns)
         weighted = np.linalg.solve(covariance, innovation[..., None])[..., 0]

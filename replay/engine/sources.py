@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import (
     Clock,
     Log,
@@ -73,9 +73,40 @@ def is_sensed(source: Source, topic: str) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class LogSource:
-    """A log file, read lazily."""
+class _Readable(Mapping[str, Stream]):
+    """A source as a person reads it: whole streams by topic.
+
+    A topic that is not there raises `UnknownName`.
+    """
+
+    def __getitem__(self: Source, topic: str) -> Stream:
+        if topic not in self.topics:
+            raise UnknownName(f"{self.name}: no topic {topic}; {choices(topic, self.topics)}")
+        return self.read([topic])[topic]
+
+    def __contains__(self: Source, topic: object) -> bool:
+        return topic in self.topics
+
+    def __iter__(self: Source) -> Iterator[str]:
+        return iter(self.topics)
+
+    def __len__(self: Source) -> int:
+        return len(self.topics)
+
+    def __repr__(self: Source) -> str:
+        run = self.run
+        of = f": {run.scenario}, seed {run.seed}, run {run.run}" if run else ""
+        width = max(map(len, self.topics), default=0)
+        rows = [
+            f"  {name:{width}} {topic.messages:9} {topic.schema_name}"
+            for name, topic in self.topics.items()
+        ]
+        return "\n".join([self.name + of, *rows])
+
+
+@dataclass(frozen=True, repr=False)
+class LogSource(_Readable):
+    """A log file, read lazily; it maps its topics to their streams."""
 
     log: Log
     start_ns: int | None = None
@@ -103,6 +134,10 @@ class LogSource:
         have nothing in common (simulated and wall time, say).
         """
         return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
+
+    def extent(self, clock: Clock) -> tuple[int, int]:
+        """The first and the last stamp in ns by one of the two clocks."""
+        return read_span(self.log, clock)
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -135,22 +170,30 @@ class LogSource:
         return LogSource(self.log)
 
 
-@dataclass(frozen=True)
-class MemorySource:
-    """A recording in memory: replayed as if it had been written and read back."""
+@dataclass(frozen=True, repr=False)
+class MemorySource(_Readable):
+    """A recording in memory: read and replayed as if it had been written and read back."""
 
     streams: Mapping[str, Stream]
     run: RunMetadata
     name: str
+    start_ns: int | None = None
+    end_ns: int | None = None
 
     @property
     def epoch_ns(self) -> int:
         """The run's time zero."""
         return self.run.epoch_ns
 
-    @property
-    def start_ns(self) -> None:
-        """A recording is replayed whole."""
+    def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
+        """What times in seconds count from: the epoch, by either clock."""
+        return self.epoch_ns
+
+    def extent(self, clock: Clock) -> tuple[int, int]:
+        """The first and the last stamp in ns by one of the two clocks; zeros where there are none."""
+        times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
+        first_ns = min((int(each.min()) for each in times), default=0)
+        return first_ns, max((int(each.max()) for each in times), default=0)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
@@ -174,14 +217,29 @@ class MemorySource:
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """One block, unless there is nothing: everything is in memory already."""
-        block = {topic: self.in_order(topic, order) for topic in topics if len(self.streams[topic])}
+        """The source's span in one block, unless there is nothing: everything is in memory already."""
+        spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
+        block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
             yield block
 
     def whole(self) -> "MemorySource":
-        """The recording itself."""
-        return self
+        """The whole recording."""
+        return replace(self, start_ns=None, end_ns=None)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there is no span."""
+        return self.start_ns is None and self.end_ns is None
+
+    def _within(self, stream: Stream, order: Clock) -> Stream:
+        """The messages of the source's span, of a stream in order."""
+        if self.is_whole:
+            return stream
+        times_ns = stream.times(order)
+        start = 0 if self.start_ns is None else np.searchsorted(times_ns, self.start_ns)
+        end = len(stream) if self.end_ns is None else np.searchsorted(times_ns, self.end_ns)
+        return stream.take(slice(int(start), int(end)))
 
     def in_order(self, topic: str, order: Clock) -> Stream:
         """A topic by one of the clocks; equal stamps as in the file."""
@@ -264,7 +322,7 @@ class Ensemble(list[SourceType]):
         """
         if not topics:
             return
-        if self._recordings:
+        if self._recordings and all(run.is_whole for run in self._recordings):
             block = self._laid_out(topics, order)
             if any(len(ragged) for ragged in block.values()):
                 yield block

@@ -71,7 +71,12 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 
 def modelled(model: Model, method: str) -> Estimator[Any]:
-    """The estimator that estimates the state of one model by one filter."""
+    """The estimator that estimates the state of one model by one filter.
+
+    Raises BadInput where there is no such filter, or the model lacks what it needs.
+    """
+    if method not in FILTERS:
+        raise BadInput(f"no filter '{method}'; {choices(method, FILTERS)}")
     chosen = FILTERS[method]
     lacking = chosen.lacks(model)
     if lacking:

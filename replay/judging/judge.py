@@ -290,12 +290,12 @@ class Judge:
     @property
     def runs_table(self) -> pd.DataFrame:
         """One row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
-        return _joined(run_table(each) for each in self._quantities.values())
+        return joined(run_table(each) for each in self._quantities.values())
 
     @property
     def times(self) -> pd.DataFrame:
         """The same for each run's spans of time; `until_s` is where a span ends, after the epoch."""
-        return _joined(time_table(each) for each in self._quantities.values())
+        return joined(time_table(each) for each in self._quantities.values())
 
     @property
     def judged(self) -> dict[str, Errors]:
@@ -303,7 +303,8 @@ class Judge:
         return {topic: each.errors for topic, each in self._quantities.items()}
 
 
-def _joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """The rows of all tables; what one of them has no column for is NaN there."""
     filled = [table for table in tables if len(table)]
     return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
 

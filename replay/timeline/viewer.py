@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+import rerun as rr
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from rerun.experimental import ViewerClient
@@ -91,6 +92,31 @@ def view(rrd: Path) -> None:
             process.wait()
         if process.returncode != 0:
             raise _why_ended(folder)
+
+
+def view_inline(rrd: Path) -> None:
+    """Show a timeline in a notebook's cell, by the widget of the package rerun-notebook.
+
+    Raises BadInput where that is not installed, or there is no such file.
+    """
+    _require_timeline(rrd)
+    try:
+        from IPython.display import display
+        from rerun_notebook import Viewer
+    except ImportError:
+        raise BadInput(
+            "to show a timeline in a notebook: pip install "
+            f"rerun-notebook=={rr.__version__}; or write it with save=FILE.rrd"
+        ) from None
+    widget = Viewer(width="auto", height="auto")
+    widget.send_rrd(rrd.read_bytes())
+    display(widget)
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
 @contextmanager

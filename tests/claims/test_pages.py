@@ -35,7 +35,8 @@ def test_every_experiment_has_its_result_and_every_claim_its_page() -> None:
     for name, result in pages.stored().items():
         _, experiment = load_experiment(name, {}, {})
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
-        assert result.settings == settings, f"make docs-claims NAMES={name}"
+        stated = {key: value for key, value in result.settings.items() if key != "parameters"}
+        assert stated == settings, f"make docs-claims NAMES={name}"
         assert templates.count(f"{{{name}.claims}}") == (result.verdicts != "0, 0, 0"), name
 
 

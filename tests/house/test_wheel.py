@@ -34,8 +34,10 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
         venv.create(bare, with_pip=True)
         scripts = Path(sysconfig.get_path("scripts", "venv", {"base": str(bare)}))
         run(scripts / "python", "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel)
-        place = run(scripts / "python", "-c", "import pipeline; print(pipeline.__file__)")
+        place = run(scripts / "python", "-c", "import fuselog; print(fuselog.__file__)")
         assert Path(place).is_relative_to(bare)
+        door = "import fuselog as fl; print(fl.replay(fl.record('landmarks', duration_s=2.0), 'ekf'))"
+        assert "position_rmse_m" in run(scripts / "python", "-c", door)
         told = run(scripts / "fuselog", "run", "landmarks", "--runs", "2", "--out", "demo", "--json")
         assert json.loads(told)["metrics"]["ekf.position_rmse_m.robot1"] < 1.0
         run(scripts / "fuselog", "report", "demo")

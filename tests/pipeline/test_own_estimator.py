@@ -19,12 +19,8 @@ PAGE = (Path(__file__).parents[2] / "docs" / "own-estimator.md").read_text()
 
 # More entry points, for what goes wrong in the code of others.
 BROKEN = """
-from recorders.recording import Simulator
-from replay.engine.plain import Estimates, batch, each_run
-from radio import LOCATE, BeaconsParameters, LocateParameters, SIGNAL_STRENGTH, locate, schemas, simulate
-from recorders.errors import BadInput
-from recorders.log import make_stream
-import numpy as np
+from fuselog import BadInput, Simulator, batch, each_run, schemas
+from radio import BeaconsParameters, LocateParameters, SIGNAL_STRENGTH, locate, simulate
 
 
 def make(solve):

@@ -205,11 +205,13 @@ def test_a_scratch_folder_of_a_killed_process_is_cleared(tmp_path, monkeypatch):
     program = (
         "import os, sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
         "from recorders.atomic import scratch_folder\n"
-        "with scratch_folder('work') as folder: os.kill(os.getpid(), 9)"
+        "with scratch_folder('work') as folder:\n"
+        "    (folder / 'half').touch()\n"
+        "    os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
     assert len(list(tmp_path.iterdir())) == 1
     with scratch_folder("work") as folder:
-        assert list(tmp_path.iterdir()) == [folder]
+        assert list(tmp_path.iterdir()) == [folder.parent]
         assert folder.stat().st_mode & 0o777 == 0o700
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,7 @@ from replay.engine.plain import (
     Estimates,
     Floats,
     Given,
-    Innovations,
+    Measured,
     Messages,
     OneRun,
     Results,
@@ -210,7 +210,7 @@ def solved(shape: tuple[int, ...]) -> Estimator[Any]:
             seen.publish_time_ns[-1:],
             mean[None],
             np.broadcast_to(covariance[0, 0], shape),
-            innovations=Innovations(seen.publish_time_ns, innovation, spread, seen["target_id"]),
+            innovations=Measured(seen.publish_time_ns, innovation, spread, seen["target_id"]),
             further={"detour": told},
         )
 

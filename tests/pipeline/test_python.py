@@ -1,0 +1,355 @@
+"""The public door: `import fuselog`, and its functions in place of the commands."""
+
+import ast
+import gc
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from rerun.chunk import RrdReader
+
+import fuselog as fl
+from pipeline.results import read_result
+from replay.engine.estimator import Estimator
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+LOCAL = (ROOT / "docs" / "own-estimator.md").read_text(encoding="utf-8")
+SHORT = {"duration_s": 4.0}
+POSE = "/estimates/ekf/robot1/pose"
+Fuselog = Callable[..., Any]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def recordings() -> list[fl.MemorySource]:
+    return [fl.record("landmarks", seed=3, run=run, **SHORT) for run in range(2)]
+
+
+def blocks_of(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+
+
+def python(code: str, *folders: Path) -> subprocess.CompletedProcess[str]:
+    """Run code in a process of its own, with folders in front of all others that are searched."""
+    paths = f"import sys; sys.path[:0] = {[*map(str, folders), str(ROOT)]}\n"
+    return subprocess.run([sys.executable, "-c", paths + code], capture_output=True, text=True)
+
+
+def test_the_page_works_as_written(capsys: pytest.CaptureFixture[str]) -> None:
+    """The study of 20 lines says what it should, and all that follows runs."""
+    study, *others = blocks_of(PAGE)
+    assert len([line for line in study.splitlines() if line]) <= 20
+    names: dict[str, Any] = {}
+    exec(study, names)
+    metrics = names["replay"].metrics.set_index(["estimator", "quantity"])["value"]
+    rmse = [metrics[label, "position_rmse_m"] for label in ("ekf", "ukf", "own")]
+    assert rmse[0] == pytest.approx(rmse[1], rel=0.01)
+    assert 0.1 < rmse[2] < 1.0 < 20 * rmse[0] + 1.0
+    assert metrics["own", "estimated_share"] == 1.0
+    assert Path("errors.png").stat().st_size > 10_000
+    assert len(RrdReader("timeline.rrd").recordings()) == 1
+    exec("\n".join(others), names)
+    assert names["late"].estimates[0][POSE].publish_time_ns[0] == names["log"].epoch_ns + 10 * 10**9
+    assert re.search(r"/robot1/odometry +600 fuselog.Odometry", capsys.readouterr().out)
+
+
+def test_importing_is_quick_and_brings_nothing_heavy() -> None:
+    done = python(
+        "import time; begin = time.process_time(); import fuselog; took = time.process_time() - begin\n"
+        "print(took, *{'numba', 'numpy', 'pandas', 'rerun', 'matplotlib'} & sys.modules.keys())"
+    )
+    took_s, *heavy = done.stdout.split()
+    assert (float(took_s) < 0.1, heavy) == (True, [])
+
+
+def test_every_name_of_the_stub_is_there() -> None:
+    stub = ast.parse((ROOT / "fuselog" / "__init__.pyi").read_text(encoding="utf-8"))
+    named = [each.name for node in stub.body if isinstance(node, ast.ImportFrom) for each in node.names]
+    assert sorted(named) == dir(fl) == sorted(fl.__all__)
+    assert all(getattr(fl, name) is not None for name in named)
+    with pytest.raises(AttributeError, match="no attribute 'replays'"):
+        _ = fl.replays  # type: ignore[attr-defined]
+
+
+def test_plug_ins_import_from_fuselog_alone() -> None:
+    pages = [LOCAL, PAGE, (ROOT / "README.md").read_text(encoding="utf-8")]
+    imported = {
+        line.split()[1]
+        for page in pages
+        for block in blocks_of(page)
+        for line in block.splitlines()
+        if re.match(r"(from|import) ", line)
+    }
+    assert imported == {"fuselog", "math", "numpy", "pydantic", "typing"}
+
+
+@pytest.mark.parametrize("name", ["pipeline/__init__.py", "replay.py", "recorders/log.py"])
+def test_a_package_of_the_same_name_is_told_of(name: str, tmp_path: Path) -> None:
+    other = tmp_path / "mine" / name
+    other.parent.mkdir(parents=True)
+    other.touch()
+    done = python("import fuselog", tmp_path / "mine")
+    last = done.stderr.splitlines()[-1:]
+    if name == "recorders/log.py":  # without an __init__ it stands behind every package
+        assert (done.returncode, last) == (0, [])
+        return
+    assert last[0].startswith(
+        f"ImportError: fuselog needs its own package '{Path(name).parts[0].removesuffix('.py')}'"
+    )
+    assert f"but Python finds {other}; rename that" in last[0]
+
+
+def test_streams_are_tables(monkeypatch: pytest.MonkeyPatch, recordings: list[fl.MemorySource]) -> None:
+    prior = recordings[0]["/robot1/prior"]
+    table = prior.pandas()
+    assert list(table) == [
+        *(
+            "publish_time_ns",
+            "log_time_ns",
+            "sensor_time_ns",
+            "mean_x_m",
+            "mean_y_m",
+            "mean_heading_rad",
+        ),
+        *(f"covariance_{entry}" for entry in range(9)),
+    ]
+    assert table["mean_y_m"].tolist() == prior["mean"][:, 1].tolist()
+    pd.testing.assert_frame_equal(prior.arrow().to_pandas(), table)
+    monkeypatch.setitem(
+        sys.modules, "polars", SimpleNamespace(from_arrow=lambda arrow: ("polars", arrow))
+    )
+    assert prior.polars() == ("polars", prior.arrow())
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(
+        fl.BadInput, match=r"polars is not installed: pip install polars, or take \.pandas"
+    ):
+        prior.polars()
+
+
+def test_logs_are_mappings(recordings: list[fl.MemorySource]) -> None:
+    fl.write("run.mcap", recordings[0])
+    log = fl.open("run.mcap")
+    assert "/robot1/truth" in log
+    assert log.get("/robot7/truth") is None
+    assert set(log) == set(recordings[0])
+    for topic, stream in log.items():
+        for name, column in stream.columns.items():
+            np.testing.assert_array_equal(column, recordings[0][topic][name])
+    with pytest.raises(
+        fl.BadInput, match=r"^run\.mcap: no topic /robot1/truht; did you mean '/robot1/truth'"
+    ):
+        log["/robot1/truht"]
+
+
+def test_a_recording_is_written_as_the_command_writes_it(fuselog: Fuselog) -> None:
+    recorded = fl.record("landmarks-adverse", seed=5, run=2, **SHORT)
+    fl.write("here.mcap", recorded)
+    fl.write("here.mcap", recorded)
+    fuselog(
+        *[
+            "record",
+            "landmarks-adverse",
+            "--seed",
+            "5",
+            "--run",
+            "2",
+            "--set",
+            "duration_s=4",
+            "-o",
+            "there.mcap",
+        ]
+    )
+    assert Path("here.mcap").read_bytes() == Path("there.mcap").read_bytes()
+    Path("mine.mcap").write_text("not a log")
+    with pytest.raises(fl.BadInput, match=r"mine\.mcap: exists and is not a log that fuselog wrote"):
+        fl.write("mine.mcap", recorded)
+
+
+def test_a_replay_says_what_the_command_says(
+    fuselog: Fuselog, recordings: list[fl.MemorySource]
+) -> None:
+    """Of logs and of recordings, whole and in part; its tables and estimates say so too."""
+    for run, recording in enumerate(recordings):
+        fl.write(f"{run}.mcap", recording)
+    logs, span = ["0.mcap", "1.mcap"], "--start 1 --end 3 --start-from truth --start-sigma x_m=0.5"
+    for options, given in {
+        "": {},
+        span: {"start_s": 1.0, "end_s": 3.0, "start_from": "truth", "start_sigma": {"x_m": 0.5}},
+        "--arrival-order": {"arrival_order": True},
+    }.items():
+        told = fuselog(
+            "replay", *logs, *["-e", "ekf", "-e", "dead-reckoning", "--json"], *options.split()
+        ).json
+        for form in (logs, recordings):
+            done = fl.replay(form, ["ekf", "dead-reckoning"], **given)
+            case = done.metrics["case"].map(lambda name: f".{name}" if name else "")
+            keys = done.metrics["estimator"] + "." + done.metrics["quantity"] + case
+            assert dict(zip(keys, done.metrics["value"], strict=True)) == told["metrics"]
+            for run, estimates in enumerate(done.estimates):
+                there = fl.open(f"{run}.estimates.mcap")
+                assert set(there) == set(estimates)
+                np.testing.assert_array_equal(there[POSE]["mean"], estimates[POSE]["mean"])
+            errors = done.errors[done.errors["estimator"] == "ekf"]
+            squares = errors["error_x_m"] ** 2 + errors["error_y_m"] ** 2
+            rmse = np.sqrt(squares.groupby(errors["run"]).mean())
+            expected = done.runs.set_index(["estimator", "run"]).loc["ekf", "position_rmse_m"]
+            np.testing.assert_allclose(rmse, expected, rtol=1e-12)
+            nis = done.innovations["nis"].sum() / done.innovations["degrees"].sum()
+            assert nis == pytest.approx(told["metrics"]["ekf.nis_per_component.robot1"])
+    assert (done.failures, done.losses, done.steps["runs"].max()) == ([], [], 2)
+    saved = done.save("result")
+    pd.testing.assert_frame_equal(saved.tables["runs"], done.runs)
+    assert fuselog("report", "result").code == 0
+
+
+def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -> None:
+    """A model with a method is what the registered estimator is, with settings too."""
+    from replay.estimators.landmarks import DEAD_RECKONING, ROBOT
+
+    assert isinstance(DEAD_RECKONING, Estimator)
+    mine, wide = fl.modelled(ROBOT, "ekf"), {"sigma_range_m": 0.4}
+    own = {"mine": mine, "wide": {"kind": mine, **wide}, "same": {"kind": "ekf", **wide}}
+    done = fl.replay(recordings, ["ekf", own, {"reckoned": DEAD_RECKONING}])
+    values = done.metrics.pivot_table("value", "quantity", "estimator")
+    assert values["mine"].equals(values["ekf"])
+    assert values["wide"].equals(values["same"])
+    assert not values["wide"].equals(values["ekf"])
+    stated = json.loads(done.estimates[0].run.notes["estimators"])  # type: ignore[union-attr]
+    assert stated["wide"] == {"kind": str(mine), **wide}
+    assert "reckoned" in repr(done)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda _: fl.open("nope.mcap"), "nope.mcap: cannot be read"),
+        (lambda _: fl.record("landmark"), "did you mean 'landmarks'"),
+        (
+            lambda _: fl.record("landmarks", duration=1.0),
+            "no parameter 'duration'; did you mean 'duration_s'",
+        ),
+        (lambda _: fl.import_("mrclam", "nope"), "nope: no such file or folder"),
+        (lambda _: fl.run("landmark"), "did you mean 'landmarks'"),
+        (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: no such entry"),
+        (lambda _: fl.write("a.mcap", [1]), "a.mcap: give streams"),
+        (lambda _: fl.estimators["ekff"], "no estimator 'ekff'; did you mean 'ekf'"),
+        (lambda _: fl.modelled(object(), "ekff"), "no filter 'ekff'"),
+        (lambda runs: fl.replay(runs, "ekff"), "no estimator 'ekff'; did you mean 'ekf'"),
+        (lambda runs: fl.replay(runs, {"ekf": {"sigma": 1}}), "estimator ekf: no parameter 'sigma'"),
+        (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),
+        (lambda runs: fl.replay(runs, [print]), "an estimator is builtin_function_or_method"),
+        (lambda runs: fl.replay(runs, ["ekf", {"ekf": {}}]), "estimator ekf is given twice"),
+        (lambda runs: fl.replay(runs, []), "no estimators to replay"),
+        (lambda _: fl.replay([], "ekf"), "no logs to replay"),
+        (lambda _: fl.replay([3], "ekf"), "a log to replay is int"),
+        (lambda runs: fl.replay(runs, "ekf", metrics="acuracy"), "did you mean 'accuracy'"),
+        (lambda runs: fl.replay(runs, "ekf", gap_limit_s=-1.0), "gap_limit_s is -1.0"),
+        (lambda runs: fl.replay(runs, "ekf", start_s=float("nan")), "start_s is nan"),
+        (
+            lambda runs: fl.replay(runs, "ekf", start_s=9.0),
+            "nothing in this span; the log goes from 0 to 4 s",
+        ),
+        (lambda runs: fl.replay(runs, "ekf", start_s=1.0), "--start-from truth"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(
+    call: Callable[[Any], object], words: str, recordings: list[fl.MemorySource]
+) -> None:
+    with pytest.raises(fl.BadInput) as raised:
+        call(recordings)
+    assert words in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert list(Path().iterdir()) == []
+
+
+def test_estimates_are_kept_as_long_as_the_replay(
+    recordings: list[fl.MemorySource], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two at once do not disturb each other, and neither leaves anything behind."""
+    first, second = (fl.replay(recordings[0], "ekf") for _ in range(2))
+    places = [done.estimates[0].log.path for done in (first, second)]
+    estimates = second.estimates[0]
+    del first
+    gc.collect()
+    assert [place.parent.exists() for place in places] == [False, True]
+    assert len(estimates[POSE])
+    del second
+    gc.collect()
+    assert not places[1].parent.parent.exists()
+    assert caplog.records == []
+
+
+def test_an_experiment_is_run_as_the_command_runs_it(fuselog: Fuselog) -> None:
+    done = fl.run("landmarks", runs=2, seed=4, set={"duration_s": 3.0, "ekf": {"gate_probability": 0.9}})
+    assert done.folder == Path("out/landmarks")
+    options = "--runs 2 --seed 4 --set duration_s=3.0 --set ekf.gate_probability=0.9 --out there"
+    assert fuselog("run", "landmarks", *options.split()).code == 0
+    there = read_result(Path("there"))
+    assert done.result.metrics == there.metrics
+    assert (
+        dict(zip(done.metrics.columns, done.metrics.iloc[0], strict=True))["estimator"]
+        == "dead-reckoning"
+    )
+    assert (len(done.tables["runs"]), len(done.claims)) == (6, 0)
+
+
+def test_the_timeline_in_a_notebook(
+    monkeypatch: pytest.MonkeyPatch, recordings: list[fl.MemorySource]
+) -> None:
+    """Its cell gets the timeline, or the sentence that says what to install."""
+    shown: list[Any] = []
+
+    class Viewer:
+        def __init__(self, **size: str) -> None:
+            self.size = size
+
+        def send_rrd(self, data: bytes) -> None:
+            Path("shown.rrd").write_bytes(data)
+
+    ipython, display, widgets = (
+        ModuleType(name) for name in ("IPython", "IPython.display", "rerun_notebook")
+    )
+    vars(ipython)["get_ipython"] = lambda: SimpleNamespace(kernel="a kernel")
+    vars(display)["display"] = shown.append
+    vars(widgets)["Viewer"] = Viewer
+    for module in (ipython, display):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    done = fl.replay(recordings, "ekf")
+    monkeypatch.setitem(sys.modules, "rerun_notebook", None)
+    with pytest.raises(fl.BadInput, match=r"pip install rerun-notebook==0\.\d+"):
+        done.view()
+    monkeypatch.setitem(sys.modules, "rerun_notebook", widgets)
+    done.view(run=1)
+    assert [type(each) for each in shown] == [Viewer]
+    assert len(RrdReader("shown.rrd").recordings()) == 1
+    with pytest.raises(fl.BadInput, match="no run 2 to show; the runs are 0 to 1"):
+        done.view(run=2)
+
+
+def test_a_figure_shows_a_case() -> None:
+    done = fl.replay(fl.record("landmarks", robots=2, **SHORT), "ekf")
+    assert done.figure("robot2").get_suptitle().startswith("robot2, 1 run")
+    assert done.figure().get_suptitle().startswith("robot1, 1 run")
+    with pytest.raises(fl.BadInput, match="nothing called 'robot3' was judged"):
+        done.figure("robot3")
+
+
+def test_lists_are_mappings_of_names() -> None:
+    assert "landmarks" in fl.scenarios
+    assert fl.models["robot"].what in repr(fl.models)
+    assert "accuracy" in fl.metrics
+    assert fl.experiments.get("no-such") is None
+    assert fl.experiments["landmarks"].facts["study"] == "localization"
