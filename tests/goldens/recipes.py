@@ -88,6 +88,13 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
         {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
+    "landmarks-smoothed": Recipe(
+        "landmarks",
+        parameters=SHORT,
+        estimators={
+            label: {"gate_probability": 0.999} for label in ("smoother:ekf", "smoother:ukf:lag=500ms")
+        },
+    ),
     "lcd-sampling": Recipe(
         "lcd-sampling",
         over={"options": {"sizes": [[2, 5], [2, 12], [4, 9]], "starts": 1, "contained": [2]}},

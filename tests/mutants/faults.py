@@ -559,7 +559,7 @@ FAULTS = [
         SPANS,
     ),
     Fault(
-        "pipeline/commands.py",
+        "pipeline/starting.py",
         "zero_ns = source.zero_ns(order)",
         'zero_ns = source.zero_ns("publish_time")',
         SPANS,
