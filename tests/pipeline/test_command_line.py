@@ -233,7 +233,8 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         }
         for row in fuselog("models", "--json").json
     }
-    assert listed["vehicle"] == dict.fromkeys(("ekf", "iekf", "ukf", "lrkf", "analytic"), "yes")
+    methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "smoother")
+    assert listed["vehicle"] == dict.fromkeys(methods, "yes")
     table = fuselog("models").out
     for name, cells in listed.items():
         (row,) = re.findall(rf"^ {name} +((?:yes|no:).*)$", table, re.MULTILINE)
