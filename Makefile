@@ -5,7 +5,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v pyth
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-fast test-studies test-papers lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast fast-lane studies-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -19,15 +19,17 @@ demo: .venv/with-fuselog
 
 # the fast tests and the long reproductions of papers, side by side
 test: lint
-	$(MAKE) -j3 test-fast test-studies test-papers
+	$(MAKE) -j3 fast-lane studies-lane papers-lane
 
-test-fast: .venv/with-test
+test-fast: lint fast-lane
+
+fast-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper"
 
-test-studies: .venv/with-test
+studies-lane: .venv/with-test
 	$(BIN)/pytest -m paper tests/pipeline
 
-test-papers: .venv/with-test
+papers-lane: .venv/with-test
 	$(BIN)/pytest -m paper --ignore=tests/pipeline
 
 lint: .venv/with-test

@@ -133,13 +133,13 @@ def replay_parts(
 
     Raises BadInput as `replay` does, for what no run of any part can be replayed by.
     """
+    found = find_metrics(metrics)
     reports: list[Report] = []
     passes: list[Pass] = []
 
     def replayed(part: Part) -> Iterator[None]:
         reports.append(report := Report())
         bound = bind_from(part.sources, estimators, part.origins, order)
-        found = find_metrics(metrics)
         judge = Judge(
             part.sources,
             found,

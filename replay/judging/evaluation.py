@@ -6,7 +6,7 @@ truth is interpolated at the estimate's stamps, never over a gap; errors are tho
 Tracking and Navigation, 5.4.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Stream, schemas
+from recorders.log import Stream
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import normalized_error_squared
@@ -286,12 +286,3 @@ def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
         np.isfinite(stream["innovation"]).sum(axis=1),
         stream.stream.columns.get("log_likelihood"),
     )
-
-
-def gaussian_estimates(outputs: Mapping[str, Ragged]) -> list[Ragged]:
-    """The Gaussian estimate streams among a replay's outputs."""
-    return [
-        ragged
-        for ragged in outputs.values()
-        if ragged.stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
-    ]

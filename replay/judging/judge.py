@@ -38,6 +38,7 @@ from replay.judging.metrics import (
     estimated_share,
     find_metrics,
     metric_key,
+    plus,
     step_bounds,
 )
 from replay.judging.set_errors import SetErrors, set_errors
@@ -92,6 +93,14 @@ class Told:
     speaking: set[int] | None = None
     skipped: Counter[str] = field(default_factory=Counter)
     covered: Sums = field(default_factory=dict)
+
+    def merge(self, other: "Told") -> None:
+        """Take in what was said of other runs."""
+        self.failed |= other.failed
+        self.skipped.update(other.skipped)
+        if other.speaking is not None:
+            self.speaking = other.speaking | (self.speaking or set())
+        self.covered = plus(self.covered, other.covered)
 
 
 class Judge:
@@ -195,8 +204,7 @@ class Judge:
         elif schema == SKIPPED:
             told.skipped.update(sentences_of(rows.stream))
         elif schema == COVERAGE:
-            sums = covered(Output("", "", "", rows, self._sources))
-            told.covered = {name: told.covered.get(name, 0.0) + value for name, value in sums.items()}
+            told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
 
     def merge(self, other: "Judge") -> None:
         """Take in what was judged of other runs."""
@@ -211,13 +219,7 @@ class Judge:
             else:
                 self._quantities[topic] = quantities
         for topic, theirs in other._told.items():
-            ours = self._told.setdefault(topic, Told())
-            ours.failed |= theirs.failed
-            ours.skipped.update(theirs.skipped)
-            if theirs.speaking is not None:
-                ours.speaking = theirs.speaking | (ours.speaking or set())
-            for name, value in theirs.covered.items():
-                ours.covered[name] = ours.covered.get(name, 0.0) + value
+            self._told.setdefault(topic, Told()).merge(theirs)
 
     @property
     def metrics(self) -> dict[str, float]:

@@ -94,10 +94,11 @@ def metric_of_sums(
     >>> near.finish(near.merge({"near": 1, "all": 2}, {"near": 3, "all": 6}))
     {'near_share': 0.5}
     """
-    return Metric(summary, judges, dict, lambda state, judged: _plus(state, sums(judged)), _plus, finish)
+    return Metric(summary, judges, dict, lambda state, judged: plus(state, sums(judged)), plus, finish)
 
 
-def _plus(first: Sums, second: Mapping[str, Any]) -> Sums:
+def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
+    """Sums of both by name: numbers and arrays add up, sets unite."""
     total = dict(first)
     for name, value in second.items():
         if name not in total:

@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from recorders.errors import BadInput, choices, printable
 from recorders.log import Stream
 from recorders.registry import available, load
-from replay.engine.blocks import Ragged, gather
+from replay.engine.blocks import Ragged
 from replay.engine.sources import Source
 from replay.judging.evaluation import Errors, errors_at
 from replay.timeline.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
@@ -84,9 +84,11 @@ class Drawing:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> bool | None:
-        if error is None:
+        if error is not None:
+            return self._stack.__exit__(kind, error, traceback)
+        with self._stack:
             self._finish()
-        return self._stack.__exit__(kind, error, traceback)
+        return None
 
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
         """Take in a block of the run's outputs, and the errors of its estimates."""
@@ -159,12 +161,6 @@ def show(
     own = [errors_at(each, each.run == run) for each in errors]
     with Drawing(source, identity=_identity(of_run), focus=focus, save=save, connect=connect) as drawing:
         drawing.add(of_run, own)
-
-
-def recorded_outputs(source: Source) -> dict[str, Ragged]:
-    """The estimates that a log itself holds, as a replay's outputs of one run."""
-    topics = [topic for topic in source.topics if topic.startswith("/estimates/")]
-    return {topic: gather([stream]) for topic, stream in source.read(topics).items()}
 
 
 def _canvas(

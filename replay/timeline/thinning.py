@@ -79,7 +79,8 @@ class Thinned(Generic[Rows]):
     @property
     def rows(self) -> Rows:
         """What is kept."""
-        self._thin()
+        if len(self._parts) > 1:
+            self._thin()
         return self._parts[0]
 
     def _thin(self) -> None:
@@ -234,12 +235,7 @@ class Sensed:
 
     def read_to(self, time_ns: int) -> Held:
         """What comes up to a stamp, and has not come yet, thinned to what is drawn; maps whole."""
-        while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
-            for topic, stream in block.items():
-                self._kept[topic].add(stream)
-                if self._is_live:
-                    self._fresh[topic].add(stream)
-                self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
+        self._advance(time_ns)
         streams = {
             topic: (self._kept if self._is_map(topic) else self._fresh)[topic].rows
             for topic in self._topics
@@ -247,10 +243,18 @@ class Sensed:
         self._fresh = self._empty(DRAWN_ROWS)
         return Held(self.source, streams)
 
+    def _advance(self, time_ns: int) -> None:
+        while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
+            for topic, stream in block.items():
+                self._kept[topic].add(stream)
+                if self._is_live:
+                    self._fresh[topic].add(stream)
+                self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
+
     def _is_map(self, topic: str) -> bool:
         return self.source.topics[topic].schema_name == schemas.LANDMARK.full_name
 
     def all(self) -> Held:
         """The whole run, thinned."""
-        self.read_to(np.iinfo(np.int64).max)
+        self._advance(np.iinfo(np.int64).max)
         return Held(self.source, {topic: kept.rows for topic, kept in self._kept.items()})

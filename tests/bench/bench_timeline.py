@@ -12,8 +12,7 @@ from recorders.recording import record_run
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
-from replay.judging.evaluation import errors_of, gaussian_estimates
-from replay.judging.truths import Truths
+from replay.judging.judge import Judge
 from replay.timeline.show import show
 
 SCENARIO = {"duration_s": 250.0, "range_bearing": {"rate_hz": 5.0, "outlier_probability": 0.02}}
@@ -24,7 +23,7 @@ def main() -> list[tuple[str, float, float, float]]:
     sources = [memory_source(*record_run("landmarks", SCENARIO, 0))]
     bound = [each for name in ("dead-reckoning", "ekf", "ukf") for each in bind(name, sources, {})]
     outputs = collect(replay(sources, bound))
-    errors = [errors_of(each, [*map(Truths, sources)]) for each in gaussian_estimates(outputs)]
+    errors = Judge(sources, {}, gap_limit_s=0.2).add(outputs).errors
     with tempfile.TemporaryDirectory() as folder:
         ours, theirs = Path(folder, "ours.rrd"), Path(folder, "theirs.rrd")
         seconds = []

@@ -9,7 +9,7 @@ from pipeline.command_line import main as fuselog
 from pipeline.experiment import load_experiment, shipped
 from recorders.errors import choices
 from tests.claims import pages
-from tests.goldens.recipes import DATA, unpack
+from tests.goldens.recipes import DATA, data_option, unpack
 
 
 @click.group()
@@ -19,13 +19,7 @@ def main() -> None:
 
 @main.command()
 @click.argument("names", nargs=-1)
-@click.option(
-    "--data",
-    type=click.Path(path_type=Path, exists=True),
-    envvar="FUSELOG_DATA",
-    required=True,
-    help="The folder of real data [default: FUSELOG_DATA of the environment].",
-)
+@data_option
 def run(names: tuple[str, ...], data: Path) -> None:
     """Run the experiments NAMES, or all; keep their results."""
     known = shipped("experiments")

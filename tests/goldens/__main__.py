@@ -7,18 +7,12 @@ import click
 
 from recorders.errors import choices
 from tests.goldens import store
-from tests.goldens.recipes import DATA, RECIPES, index, unpack
+from tests.goldens.recipes import DATA, RECIPES, data_option, index, unpack
 
 
 @click.command()
 @click.argument("names", nargs=-1)
-@click.option(
-    "--data",
-    type=click.Path(path_type=Path, exists=True),
-    envvar="FUSELOG_DATA",
-    required=True,
-    help="The folder of real data [default: FUSELOG_DATA of the environment].",
-)
+@data_option
 def main(names: tuple[str, ...], data: Path) -> None:
     """Make the goldens NAMES anew, or all; what is no longer as it was is printed.
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
 from pipeline.experiment import Experiment, load_experiment, load_scenario, shipped
@@ -116,6 +117,15 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     "vehicles-ctm2": Recipe("vehicles-ctm2", parameters=SHORT),
     "vehicles-ctm4": Recipe("vehicles-ctm4", parameters=SHORT),
 }
+
+
+data_option = click.option(
+    "--data",
+    type=click.Path(path_type=Path, exists=True),
+    envvar="FUSELOG_DATA",
+    required=True,
+    help="The folder of real data [default: FUSELOG_DATA of the environment].",
+)
 
 
 def unpack(data: Path, importers: Iterable[str], scratch: Path) -> dict[str, Path]:

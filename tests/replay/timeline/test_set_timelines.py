@@ -8,9 +8,8 @@ from recorders.recording import record_run
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import memory_source
-from replay.judging.evaluation import errors_of, gaussian_estimates
+from replay.judging.judge import Judge
 from replay.judging.set_evaluation import areas_of, frames_of
-from replay.judging.truths import Truths
 from replay.timeline.networks import ARRIVED, LOST
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read
@@ -19,7 +18,7 @@ from tests.replay.timeline.test_timeline import read
 def drawn(scenario, parameters, estimators, folder):
     source = memory_source(*record_run(scenario, parameters, 1))
     outputs = collect(replay([source], [b for name in estimators for b in bind(name, [source], {})]))
-    errors = [errors_of(each, [Truths(source)]) for each in gaussian_estimates(outputs)]
+    errors = Judge([source], {}, gap_limit_s=0.2).add(outputs).errors
     path = folder / "run.rrd"
     show(source, outputs, [each for each in errors if each is not None], save=path)
     return source, outputs, read(path)

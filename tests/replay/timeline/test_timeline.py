@@ -31,12 +31,12 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect
 from replay.engine.replaying import replay as replayed
 from replay.engine.sources import LogSource, MemorySource, memory_source
-from replay.judging.evaluation import Errors, chi_square_interval, errors_of, gaussian_estimates
-from replay.judging.truths import Truths
+from replay.judging.evaluation import Errors, chi_square_interval
+from replay.judging.judge import Judge
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
-from replay.timeline.show import recorded_outputs, show
+from replay.timeline.show import show
 from replay.timeline.sinks import open_recording
 from replay.timeline.viewer import Listener, listen, screenshot, view
 
@@ -58,7 +58,7 @@ def replay_landmarks(runs: int, duration_s: float) -> Replayed:
     sources = [memory_source(*record_run("landmarks", scenario, 3, run)) for run in range(runs)]
     bound = [each for name in ("dead-reckoning", "ekf") for each in bind(name, sources, {})]
     outputs = collect(replayed(sources, bound))
-    found = [errors_of(each, [*map(Truths, sources)]) for each in gaussian_estimates(outputs)]
+    found = Judge(sources, {}, gap_limit_s=0.2).add(outputs).errors
     return Replayed(sources, outputs, [each for each in found if each is not None])
 
 
@@ -356,7 +356,8 @@ def test_a_log_without_estimates_and_one_of_estimates_alone_are_shown(
     assert "/map/robot1/sights" in found
     streams = {topic: ragged.of_run(0) for topic, ragged in ensemble.outputs.items()}
     estimates = MemorySource(streams, source.run, "estimates")
-    show(estimates, recorded_outputs(estimates), [], save=tmp_path / "estimates.rrd")
+    outputs = {topic: gather([stream]) for topic, stream in estimates.items()}
+    show(estimates, outputs, [], save=tmp_path / "estimates.rrd")
     found = read(tmp_path / "estimates.rrd")
     pose = streams["/estimates/ekf/robot1/pose"]
     assert len(found["/map/robot1/ekf/pose"]["utc"]) == len(pose)
