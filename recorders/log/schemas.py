@@ -336,6 +336,11 @@ SOLUTION = _declare(
     _identifier("rank"),
     _real("cost"),
 )
+MODE_PROBABILITIES = _declare(
+    "ModeProbabilities",
+    "How probable each mode of motion is; the channel's metadata names the modes as components.",
+    _vector("probability"),
+)
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
     "Mean and covariance of one of several states, known by its number.",

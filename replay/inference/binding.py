@@ -22,6 +22,8 @@ from replay.inference.model import (
     check_motion,
     check_sensor,
     check_state,
+    check_switching,
+    switching_of,
 )
 from replay.inference.steps import Stage
 
@@ -171,7 +173,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     everything += [topic for _, topic in found.sensors]
     needed = _needed(f"estimator {label}", stage, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
-    return np.array(
+    settings = np.array(
         [
             [
                 stated([*first, *everything], name, model.parameters, needed=name in read)
@@ -182,6 +184,9 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
             for first, read in zip(own, needed, strict=True)
         ]
     )
+    if stage.modes:
+        switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
+    return settings
 
 
 @lru_cache(maxsize=64)
@@ -190,7 +195,10 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
     model, values = stage.model, dict(given)
     check_state(where, model)
     motion, *sensors = recorders = [_Recorder(values) for _ in range(1 + len(stage.sensors))]
-    check_motion(where, model, stage.motion, motion)
+    for each in stage.modes or (stage.motion,):
+        check_motion(where, model, each, motion)
+    if stage.modes:
+        check_switching(where, model, motion)
     for sensor, recorder in zip(stage.sensors, sensors, strict=True):
         check_sensor(where, model, sensor, recorder)
     return tuple(each.read for each in recorders)

@@ -26,7 +26,16 @@ from replay.inference.generate import (
     tangent_size,
     things,
 )
-from replay.inference.model import Model, Motion, Sensor, check_motion, check_sensor, check_state
+from replay.inference.model import (
+    Model,
+    Motion,
+    Sensor,
+    check_motion,
+    check_sensor,
+    check_state,
+    check_switching,
+    switching_of,
+)
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
@@ -89,6 +98,9 @@ def check_model(
         check_state("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
+        if model.modes and model.switching:
+            check_switching("check_model", model, numbers)
+            switching_of("check_model", model, numbers)
         for sensor in model.sensors:
             check_sensor("check_model", model, sensor, numbers)
     except BadInput as error:

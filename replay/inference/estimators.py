@@ -174,8 +174,9 @@ def bind_model(
     method = _made_for(label, method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
+    modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
     for found in topics_of(model, topics):
-        stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors))
+        stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, stage, found, parameters)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)

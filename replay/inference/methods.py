@@ -5,13 +5,15 @@ Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing bu
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
+from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
@@ -85,6 +87,7 @@ class Method:
         made_for: what the method is with these parameters, where they choose among several; raises
             BadInput where they name none.
         filtering: what goes through a log, where that is no `replay.inference.estimators.Filter`.
+        takes_all_modes: whether it takes all modes of a model, not one of its motions.
     """
 
     summary: str
@@ -95,6 +98,7 @@ class Method:
     variant: str | None = None
     made_for: Callable[[Any], "Method"] | None = None
     filtering: Callable[..., Any] | None = None
+    takes_all_modes: bool = False
 
 
 def _extended(stage: Stage) -> Steps:
@@ -326,3 +330,25 @@ FILTERS: Mapping[str, Method] = {
         lacks=_lacks_moments,
     ),
 }
+
+
+def check_filter(name: str, variant: str, method: str, use: str) -> None:
+    """Raise BadInput where there is no such filter for a method to rest on; `use` says what for."""
+    if name not in FILTERS:
+        raise BadInput(f"'{name}' is no filter {use}; {choices(name, FILTERS)}")
+    if variant and FILTERS[name].variant is None:
+        raise BadInput(f"filter {name} has no variants; give '{method}:{name}' without ':{variant}'")
+
+
+@lru_cache(maxsize=64)
+def filter_with(name: str, variant: str) -> Method:
+    """A filter whose variant is set, as in `lrkf:s2kf-50`."""
+    chosen = FILTERS[name]
+    sampling = chosen.sampling
+    if not variant or sampling is None:
+        return chosen
+
+    def sampling_of_variant(parameters: Any) -> Sampling:
+        return sampling(parameters.model_copy(update={chosen.variant: variant}))
+
+    return replace(chosen, sampling=sampling_of_variant)

@@ -112,6 +112,20 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
+class Switching:
+    """How a thing changes from mode to mode: a Markov chain in continuous time.
+
+    Attributes:
+        rates: (parameters) -> how often per second it changes from the first mode to each of the others,
+            in their order, then from the second one, and so on: M (M - 1) numbers of M modes.
+        initial: (parameters) -> the modes' probabilities at the prior's time; equal ones unless given.
+    """
+
+    rates: Function
+    initial: Function | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Sensor:
     """What a sensor measures of the state.
 
@@ -165,6 +179,7 @@ class Model:
         sensors: all it can use; any of them makes a log fit.
         motion: how the state moves.
         modes: other motions by name, for methods of several; `motion` is then one of them.
+        switching: how the thing changes between its modes.
         control: what drives it; a log without this topic does not fit.
         prior, truth: topics with the first Gaussian and the reference, under the prefix.
         output: the last part of the estimates' topic.
@@ -206,6 +221,7 @@ class Model:
     sensors: tuple[Sensor, ...]
     motion: Motion
     modes: Mapping[str, Motion] | None = None
+    switching: Switching | None = None
     control: Control | None = None
     prior: str = "prior"
     truth: str = "truth"
@@ -263,6 +279,43 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         _check(where, motion.noise, (state, 1.0, parameters), wanted)
     if motion.control_noise is not None:
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
+
+
+def check_switching(where: str, model: Model, parameters: Any) -> None:
+    """Call the functions of a model's switching once, uncompiled; see `check_motion`."""
+    assert model.modes
+    assert model.switching
+    modes, switching = len(model.modes), model.switching
+    _check(where, switching.rates, (parameters,), (modes * (modes - 1),))
+    if switching.initial is not None:
+        _check(where, switching.initial, (parameters,), (modes,))
+
+
+def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
+    """The rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
+
+    Raises BadInput where a rate is negative, or the probabilities are none.
+    """
+    assert model.modes
+    assert model.switching
+    names, switching = list(model.modes), model.switching
+    rates = np.array(switching.rates(parameters), float)
+    changes = [(begin, end) for begin in names for end in names if begin != end]
+    for (begin, end), rate in zip(changes, rates.tolist(), strict=True):
+        if not 0.0 <= rate < np.inf:
+            raise BadInput(
+                f"{where}: the rate from mode {begin} to {end} is {rate:g} per second; give zero or more"
+            )
+    initial = np.full(len(names), 1.0 / len(names))
+    if switching.initial is not None:
+        initial = np.array(switching.initial(parameters), float)
+    if not (np.all(initial >= 0.0) and abs(initial.sum() - 1.0) < 1e-9):
+        told = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
+        raise BadInput(
+            f"{where}: the modes' initial probabilities are {told}; give numbers of zero or more "
+            "whose sum is one"
+        )
+    return rates, initial
 
 
 def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:

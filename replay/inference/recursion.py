@@ -221,7 +221,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 and happenings.time_ns[event] >= start_ns
             ):
                 row = estimates.end[run]
-                estimate(run, carried.belief, estimates, row)
+                estimate(run, carried.belief, estimates, row, memory)
                 failure = fault_of(estimates.mean[row], estimates.covariance[row])
                 if failure == ALL_WELL:
                     estimates.time_ns[row] = happenings.time_ns[event]

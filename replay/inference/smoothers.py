@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.compile import compile_over_runs
@@ -33,6 +33,8 @@ from replay.inference.methods import (
     Method,
     RegressionParameters,
     UnscentedParameters,
+    check_filter,
+    filter_with,
 )
 from replay.inference.model import Model
 from replay.inference.recursion import Estimates, Happenings, Innovations
@@ -63,10 +65,7 @@ def parse_forward(text: str) -> Forward:
     """What `SmootherParameters.forward` says; raises BadInput where it says nothing."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     name, _, variant = before.removesuffix(":").partition(":")
-    if name not in FILTERS:
-        raise BadInput(f"'{name}' is no filter that a smoother goes back over; {choices(name, FILTERS)}")
-    if variant and FILTERS[name].variant is None:
-        raise BadInput(f"filter {name} has no variants; give 'smoother:{name}' without ':{variant}'")
+    check_filter(name, variant, "smoother", "that a smoother goes back over")
     if not has_lag:
         return Forward(name, variant, FOREVER_NS)
     found = re.fullmatch(rf"(\d+)({'|'.join(UNITS_NS)})", lag)
@@ -160,7 +159,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
             belief.predicted[run, row] = mean[row]
         return True
 
-    def estimate(run: int, belief: Chain, nodes: Nodes, row: int) -> None:
+    def estimate(run: int, belief: Chain, nodes: Nodes, row: int, memory: ForwardMemory) -> None:
         mean, covariance = belief.mean[run], belief.covariance[run]
         copy_gaussian(mean, covariance, nodes.mean[row], nodes.covariance[row])
         still = belief.predictions[run] == 0
@@ -464,25 +463,18 @@ def _rows_from(piece: Piece, begin: Integers) -> Piece:
 @lru_cache(maxsize=64)
 def _smoother_of(name: str, variant: str) -> Method:
     """The method that smooths what a filter estimates."""
-    inner = FILTERS[name]
+    inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:
         return smoothing_steps(stage, inner.steps(stage))
 
-    def sampling(parameters: Any) -> Any:
-        assert inner.sampling is not None
-        chosen = {inner.variant: variant} if variant else {}
-        return inner.sampling(parameters.model_copy(update=chosen))
-
     def lacks(model: Model) -> str:
         motions = (model.modes or {"": model.motion}).values()
-        if inner is FILTERS["analytic"] and not all(motion.linear for motion in motions):
+        if name == "analytic" and not all(motion.linear for motion in motions):
             return "exact moments of its motion with the state before it"
         return inner.lacks(model)
 
-    return replace(
-        SMOOTHING, steps=steps, sampling=sampling if inner.sampling else None, lacks=lacks, made_for=None
-    )
+    return replace(SMOOTHING, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
 
 
 def _made_for(parameters: SmootherParameters) -> Method:

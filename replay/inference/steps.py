@@ -47,11 +47,15 @@ NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 
 class Stage(NamedTuple):
-    """A model as a method takes it: one motion, and the sensors that the log has."""
+    """A model as a method takes it: its motion, and the sensors that the log has.
+
+    `modes` are the motions of all modes, in their order, for a method that takes all of them.
+    """
 
     model: Model
     motion: Motion
     sensors: tuple[Sensor, ...]
+    modes: tuple[Motion, ...] = ()
 
 
 class Gaussian(NamedTuple):
@@ -70,8 +74,8 @@ class Steps(NamedTuple):
             moves the belief in place. `use` numbers the sets of randomised samples.
         updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
             ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
-        estimate: (run, belief, estimates, row) fills a row of the results: its mean, its covariance, and
-            what the method keeps beside them.
+        estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
+            covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
     """
 
@@ -167,7 +171,7 @@ def gaussian_filter(
         mean, covariance = belief.mean[run], belief.covariance[run]
         return predict(mean, covariance, control, duration_s, parameters, use, work)
 
-    def estimate(run: int, belief: Gaussian, estimates: Any, row: int) -> None:
+    def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
         copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
 
