@@ -78,6 +78,17 @@ gap_option = click.option(
 )
 
 
+arrival_option = click.option(
+    "--arrival-order", is_flag=True, help="Go by log time, as the messages arrived."
+)
+late_option = click.option(
+    "--late",
+    metavar="drop|wait:SECONDS|rewind:SECONDS",
+    help="With --arrival-order: go by the stamps at which things were measured all the same, and leave "
+    "out what comes late, wait for it so long, or go back for it so far.",
+)
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
@@ -176,7 +187,8 @@ def _say_written(path: Path, messages: int) -> None:
     type=Seconds(0),
     help="Give estimates every so many seconds too, not at measurements alone.",
 )
-@click.option("--arrival-order", is_flag=True, help="Go by log time, as the messages arrived.")
+@arrival_option
+@late_option
 @click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
 @click.option(
     "--start-from",
@@ -252,6 +264,8 @@ def view(path: Path, **options: Any) -> None:
 @click.option(
     "--logs", type=COUNT, default=20, show_default=True, help="Write the logs of the first K runs."
 )
+@arrival_option
+@late_option
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
@@ -263,6 +277,8 @@ def run(
     labels: tuple[str, ...],
     runs: int | None,
     seed: int | None,
+    arrival_order: bool,
+    late: str | None,
     **options: Any,
 ) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
@@ -274,7 +290,8 @@ def run(
     """
     from pipeline.commands import run_named
 
-    over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
+    over = {key: value for key, value in stated.items() if value is not None}
     run_named(experiment, labels, over, **options)
 
 

@@ -13,7 +13,7 @@ from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
-from pipeline.starting import check_same_run, origins_of, span_of
+from pipeline.starting import check_same_run, order_of, origins_of, span_of
 from pipeline.studies.localization import summarise
 from pipeline.terminal import (
     print_claims,
@@ -27,7 +27,7 @@ from pipeline.terminal import (
 )
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, Log, open_log
+from recorders.log import Log, open_log
 from recorders.parameters import parse_settings
 from recorders.parsing import parse_json
 from replay.engine.estimator import find_estimator
@@ -47,6 +47,7 @@ def replay_logs(
     model: str | None,
     every_s: float | None,
     arrival_order: bool,
+    late: str | None,
     start_s: float | None,
     end_s: float | None,
     origins: Sequence[str],
@@ -67,7 +68,7 @@ def replay_logs(
     stated = {"model": model, "every_s": every_s}
     chosen = {key: value for key, value in stated.items() if value is not None}
     estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})
-    order: Clock = "log_time" if arrival_order else "publish_time"
+    order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
     starts = origins_of(sources, origins, _sigmas(sigmas), order, gap_limit_s)
@@ -77,6 +78,7 @@ def replay_logs(
         estimators,
         gap_limit_s=gap_limit_s,
         order=order,
+        late=policy,
         save=save,
         connect=connect,
         progress=progress,
@@ -332,9 +334,9 @@ def run_named(
     values = parse_settings(settings)
     files = [Path(each) for each in named if each.endswith(".mcap")]
     if files:
-        if len(files) < len(named) or over or data is not None:
+        if len(files) < len(named) or over.keys() & {"runs", "seed"} or data is not None:
             raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
-        experiment = experiment_of_logs(files, labels, values)
+        experiment = experiment_of_logs(files, labels, {**values, **over})
         label = experiment.title
     else:
         if len(named) > 1 or labels:

@@ -26,6 +26,7 @@ from recorders.log import Clock, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound, bind
+from replay.engine.late import Late
 from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
@@ -110,6 +111,7 @@ def replay_parts(
     gap_limit_s: float,
     metrics: Sequence[str] = (),
     order: Clock = "publish_time",
+    late: Late | None = None,
     save: Path | None = None,
     connect: str | None = None,
     on_errors: Callable[[Errors], None] | None = None,
@@ -126,6 +128,7 @@ def replay_parts(
         gap_limit_s: the truth is not interpolated over longer gaps.
         metrics: their names; none stands for all.
         order: the clock to go by.
+        late: what is done about messages that come late, in the order of log time.
         save: the file that the first run's timeline goes to.
         connect: the receiver that it goes to; see `Drawing`.
         on_errors: is handed the errors of every block.
@@ -165,6 +168,7 @@ def replay_parts(
                 bound,
                 report,
                 order=order,
+                late=late,
                 block_messages=block_messages,
                 is_part=not part.is_all,
             )
@@ -237,12 +241,19 @@ def replay_blocks(
     report: Report,
     *,
     order: Clock = "publish_time",
+    late: Late | None = None,
     block_messages: int = BLOCK_MESSAGES,
     is_part: bool = False,
 ) -> Iterator[dict[str, Ragged]]:
     """The outputs of a replay, block by block, by topic; the last block says what was covered."""
     for block in replay(
-        sources, bound, order=order, block_messages=block_messages, report=report, is_part=is_part
+        sources,
+        bound,
+        order=order,
+        late=late,
+        block_messages=block_messages,
+        report=report,
+        is_part=is_part,
     ):
         yield collect([block])
     yield collect([report.coverage])

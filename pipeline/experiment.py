@@ -18,6 +18,7 @@ from recorders.parsing import read_toml
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine.estimator import configure
+from replay.engine.late import parse_late
 from replay.judging.metrics import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
@@ -51,7 +52,8 @@ class Experiment(Parameters):
 
     The runs are recorded from a scenario, imported, or logs that are there. `estimators` maps a label to
     parameters; a parameter `kind` names the estimator where the label is not its name. `metrics` are all
-    registered ones where none is named. `options` are the study's own.
+    registered ones where none is named. `arrival_order` and `late` are as in `fuselog replay`. `options`
+    are the study's own.
     """
 
     title: str
@@ -64,6 +66,8 @@ class Experiment(Parameters):
     estimators: dict[str, dict[str, Any]] = {}
     metrics: list[str] = []
     gap_limit_s: NonNegativeFloat = 0.2
+    arrival_order: bool | None = None
+    late: str | None = None
     options: dict[str, Any] = {}
 
     @model_validator(mode="after")
@@ -72,6 +76,14 @@ class Experiment(Parameters):
             raise ValueError("give one of [record], [import] and [logs]")
         if (self.import_ or self.logs) and (self.runs, self.seed) != (1, 0):
             raise ValueError("recorded data have no seed, and as many runs as there are; leave out both")
+        return self
+
+    @model_validator(mode="after")
+    def _has_an_order(self) -> Self:
+        if self.late is not None:
+            parse_late(self.late, arrival_order=bool(self.arrival_order))
+        if self.arrival_order and self.study != "localization":
+            raise ValueError(f"study {self.study} goes by the stamps; leave out arrival_order and late")
         return self
 
     @property

@@ -22,11 +22,11 @@ from pipeline.door import ResultFolder
 from pipeline.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
 from pipeline.outputs import TIMELINE, check_files, check_folder
 from pipeline.results import in_order, result_folder, write_outcome
-from pipeline.starting import origins_of, span_of
+from pipeline.starting import order_of, origins_of, span_of
 from pipeline.studies.localization import error_charts, summarise, summary_table
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Clock, RunMetadata, open_log, schemas
+from recorders.log import RunMetadata, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.blocks import gather
 from replay.engine.estimator import Estimator
@@ -53,6 +53,7 @@ def replay(
     start_sigma: Mapping[str, float] | None = None,
     gap_limit_s: float = 0.2,
     arrival_order: bool = False,
+    late: str | None = None,
     metrics: str | Sequence[str] = (),
 ) -> "Replay":
     """Replay estimators over logs, and judge them where there is truth.
@@ -69,6 +70,8 @@ def replay(
         start_sigma: how well the truth is known, by component; by default as the log's prior has it.
         gap_limit_s: the truth is not interpolated over longer gaps.
         arrival_order: go by log time, as the messages arrived.
+        late: what is done about messages that then come late, by their stamps: "drop", "wait:0.5" (in
+            seconds), "rewind:0.5"; by default they count as measured when they arrived.
         metrics: which ones; none stands for all.
 
     Raises BadInput where no run can be replayed by one of the estimators.
@@ -81,12 +84,12 @@ def replay(
     for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
         if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
             raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
-    order: Clock = "log_time" if arrival_order else "publish_time"
+    from_ = [start_from] if isinstance(start_from, str | Path) else start_from
+    order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
     settings = _settings(estimators)
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
     sources = [span_of(_source(log), start_s, end_s, order) for log in _listed(logs)]
-    from_ = [start_from] if isinstance(start_from, str | Path) else start_from
     origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("fuselog-replay"))
@@ -98,6 +101,7 @@ def replay(
             gap_limit_s=gap_limit_s,
             metrics=wanted,
             order=order,
+            late=policy,
         )
         estimates = [LogSource(open_log(path)) for path, _ in places]
         made = Replay(sources, estimates, settings, done, gap_limit_s)

@@ -26,6 +26,7 @@ from pipeline.ensemble import (
 )
 from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.results import ErrorTables
+from pipeline.starting import order_of
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, open_log
 from recorders.parameters import merge
@@ -147,6 +148,7 @@ class Runner:
         Memory holds a part of the runs at a time.
         """
         experiment, setting = self.experiment, self.setting
+        order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         digest = hashlib.sha256()
 
         def parts() -> Iterator[Part]:
@@ -176,6 +178,8 @@ class Runner:
                 experiment.estimators,
                 gap_limit_s=experiment.gap_limit_s,
                 metrics=experiment.metrics,
+                order=order,
+                late=late,
                 save=setting.folder / "timeline.rrd",
                 on_errors=errors.add if errors else None,
                 progress=setting.progress,

@@ -19,6 +19,7 @@ from recorders.log import Clock, Stream, make_stream, open_log, schemas
 from replay.engine.blocks import gather
 from replay.engine.components import match_components, match_tangent, stated_components
 from replay.engine.estimator import Bound
+from replay.engine.late import Late, parse_late
 from replay.engine.sources import LogSource, MemorySource, Source
 from replay.engine.tangent import tangent_components
 from replay.judging.evaluation import split_topic
@@ -28,6 +29,22 @@ Floats = NDArray[np.float64]
 # A run's prior at a time in ns, from an estimator's label and the log's own prior.
 Origin = Callable[[str, Stream, int], Stream]
 Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
+
+
+def order_of(
+    *, arrival_order: bool, late: str | None, origins: Sequence[str | Path] = ()
+) -> tuple[Clock, Late | None]:
+    """The clock that orders a replay, and what is done about late messages.
+
+    Raises BadInput where `late` is none of the ways, or makes no sense with the others.
+    """
+    found = None if late is None else parse_late(late, arrival_order=arrival_order)
+    if found is not None and origins:
+        raise BadInput(
+            f"--late {late} --start-from {origins[0]}: a span in the order of arrival begins at no one "
+            "stamp, of which a state could be known; leave out one of the two"
+        )
+    return "log_time" if arrival_order else "publish_time", found
 
 
 def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:

@@ -322,6 +322,11 @@ SKIPPED = _declare(
     "A measurement was not used; the channel's metadata lists the reasons by number, as JSON.",
     _identifier("reason"),
 )
+REWOUND = _declare(
+    "Rewound",
+    "A late measurement was used after all; so many messages after it were used again.",
+    _identifier("repeated"),
+)
 COVERAGE = _declare(
     "Coverage",
     "For how much of a run, from this stamp to the end, there are estimates.",

@@ -55,10 +55,15 @@ CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 
 
 class Block(NamedTuple):
-    """What an estimator gets at once: a span of its topics, in all runs."""
+    """What an estimator gets at once: a span of its topics, in all runs.
+
+    `came` (n, 2) says of every event when it was taken and its place in the file, where that is not its
+    stamp's order alone; see `replay.engine.late`.
+    """
 
     streams: dict[str, Ragged]
     events: Events
+    came: NDArray[np.int64] | None = None
 
     def column(self, *names: str, missing: float = np.nan) -> NDArray:
         """One field of every event: the first of `names` that its topic has, else `missing`."""
@@ -145,10 +150,17 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
 def _in_order(ragged: Ragged, order: Clock) -> Events:
     """The messages of the only topic."""
     times_ns, offsets, count = ragged.stream.times(order), ragged.offsets, len(ragged)
-    is_last = np.empty(count, bool)
-    np.not_equal(times_ns[1:], times_ns[:-1], out=is_last[:-1])
-    is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
+    is_last = last_of_equals(offsets, times_ns)
     return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
+
+
+def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether a row (n,) is the last of its run, or the next one differs in one of the columns."""
+    is_last = np.zeros(len(columns[0]), bool)
+    for column in columns:
+        is_last[:-1] |= column[1:] != column[:-1]
+    is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
+    return is_last
 
 
 @lru_cache(maxsize=1)

@@ -40,6 +40,9 @@ class Recursive:
         finish: the state after the last block -> the outputs that waited for messages which did not
             come any more.
         parameters: those that it was bound with, defaults included.
+        rewinding: the same estimator for a block's messages in the order in which they came, whose
+            stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
+            where its parameters do not let it.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Recursive:
     given: Mapping[str, Ragged] = field(default_factory=dict)
     finish: Callable[[Any], list[Ragged]] | None = None
     parameters: Parameters | None = None
+    rewinding: "Callable[[int], Recursive] | None" = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from recorders.errors import BadInput
 from recorders.log import Clock
 from replay.engine.blocks import Block, Ragged, join, merge_events
 from replay.engine.estimator import Batch, Bound, Recursive, code_of
+from replay.engine.late import Late, taking_late
 from replay.engine.priors import start_of_runs
 from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
@@ -41,6 +42,7 @@ def replay(
     estimators: Sequence[Bound],
     *,
     order: Clock = "publish_time",
+    late: Late | None = None,
     block_messages: int = BLOCK_MESSAGES,
     report: Report | None = None,
     is_part: bool = False,
@@ -51,6 +53,8 @@ def replay(
         sources: the runs, holding the same topics; their schedules may differ.
         estimators: bound estimators with different names.
         order: the clock to go by, publish time or (as it arrived) log time.
+        late: in the order of log time, what is done about messages whose publish times go back; else
+            log time is taken for the time at which they were measured.
         block_messages: about how many messages of a run are in memory at once.
         report: filled with what there is to say when all is done.
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
@@ -58,16 +62,19 @@ def replay(
 
     A run that an estimator cannot follow fails alone, see `replay.engine.supervision`; the failures
     come last.
-    Raises BadInput where an estimator can follow no run, no run has a message for it, or a run's span
-    begins after the prior of an estimator (see `pipeline.starting`).
+    Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
+    begins after the prior of an estimator (see `pipeline.starting`), or it cannot do as `late` says.
     """
+    if late is not None:
+        estimators = [taking_late(bound, late) for bound in estimators]
     ensemble = ensemble_of(sources)
     read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
     wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
     for bound, whole in zip(estimators, wholes, strict=True):
         _refuse_old_priors(bound, ensemble, whole, order)
+    stamps: Clock = order if late is None else "publish_time"
     watches = [
-        Watch(bound.name, len(sources), order, is_batch=isinstance(bound, Batch), is_part=is_part)
+        Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
     states, refused = _start(estimators, watches, wholes)

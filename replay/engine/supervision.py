@@ -170,7 +170,8 @@ class Watch:
         for ragged in streams.values():
             runs = np.flatnonzero(np.diff(ragged.offsets))
             times = ragged.stream.times(self._order)
-            first, last = times[ragged.offsets[runs]], times[ragged.offsets[runs + 1] - 1]
+            begin = ragged.offsets[runs]
+            first, last = np.minimum.reduceat(times, begin), np.maximum.reduceat(times, begin)
             self._first_ns[runs] = np.minimum(self._first_ns[runs], first)
             self._last_ns[runs] = np.maximum(self._last_ns[runs], last)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
@@ -54,6 +54,7 @@ from replay.inference.recursion import (
     no_results,
     recursion,
 )
+from replay.inference.rewinding import Rewinding, issued
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
@@ -189,8 +190,19 @@ def bind_model(
         priors = {found.prior.name: model.state}
         start, run, finish = filtering.start, filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        bound.append(made)
+        bound.append(replace(made, rewinding=partial(_rewinding, made, filtering)))
     return bound
+
+
+def _rewinding(bound: Recursive, filtering: "Filter", window_ns: int) -> Recursive:
+    """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
+    reason = filtering.cannot_rewind
+    if reason:
+        raise BadInput(
+            f"estimator {bound.name}: --late rewind: {reason}; give --late drop or --late wait:SECONDS"
+        )
+    back = Rewinding(filtering, window_ns)
+    return replace(bound, start=back.start, run=back.run, finish=back.finish)
 
 
 def _made_for(label: str, method: Method, parameters: Any) -> Method:
@@ -225,7 +237,7 @@ class State(NamedTuple):
         points: of every map, by its topic.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
-        kept: what a smoother keeps for its way back.
+        kept: what a smoother keeps for its way back, or a filter for late messages.
         tick: (runs,) the number of the next extra estimate.
     """
 
@@ -340,10 +352,23 @@ class Filter:
         control = self.stage.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
+    @property
+    def cannot_rewind(self) -> str:
+        """Why it cannot go back for late messages; empty where it can."""
+        control = self.stage.model.control
+        if self.parameters.every_s is not None:
+            return "there are no estimates between messages (every_s, --every) then"
+        if control is not None and control.interpolated:
+            return f"{control.topic} is interpolated, so that messages wait for the next one of it"
+        if any(each.redrawn for each in self.samplers):
+            return "its samples are random, so that a message that is used again gets others"
+        return ""
+
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
         after, estimated, made = self.filtered(state, happenings)
-        return after, [self.states(*estimated), *made]
+        states = issued(self.states(*estimated), happenings, state.carried.time_ns)
+        return after, [states, *made]
 
     def filtered(
         self, state: State, happenings: Happenings

@@ -11,7 +11,7 @@ import numpy as np
 from recorders.errors import BadInput
 from recorders.log import Stream
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.blocks import Block, Ragged, ragged_rows
+from replay.engine.blocks import Block, Ragged, last_of_equals, ragged_rows
 from replay.engine.measurements import read_fixes, read_vectors
 from replay.inference.binding import Found, number_fields, reading_settings
 from replay.inference.model import Control, Map, Sensor
@@ -80,7 +80,8 @@ def happenings_of(
         column[0] if len(column) == 1 else np.concatenate(column)[events.source]
         for column in zip(*tables, strict=True)
     )
-    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target)
+    came = np.empty((len(source), 0), np.int64) if block.came is None else block.came
+    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target, came)
     if lacking.any():  # as if these had not come
         happenings = _of_rows(happenings, ~lacking)
         happenings = happenings._replace(is_due=last_of_stamps(happenings))
@@ -93,11 +94,8 @@ def happenings_of(
 
 
 def last_of_stamps(happenings: Happenings) -> Booleans:
-    """Whether no later event of the run has an event's stamp."""
-    is_last = np.append(np.diff(happenings.time_ns) != 0, True)[: len(happenings.time_ns)]
-    ends = happenings.offsets[1:]
-    is_last[ends[ends > happenings.offsets[:-1]] - 1] = True
-    return is_last
+    """Whether the next event of the run has another stamp, or was taken at another time."""
+    return last_of_equals(happenings.offsets, happenings.time_ns, *happenings.came.T[:1])
 
 
 class _Table(NamedTuple):
@@ -181,11 +179,13 @@ def times_alone(offsets: Integers, time_ns: Integers, width: int, *, is_due: boo
     """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
-    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), np.zeros(count, np.int64))
+    about, came = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
+    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), about, came)
 
 
 def joined(first: Happenings, second: Happenings) -> Happenings:
     """The events of both in time, run by run; at equal stamps those of the first go first."""
+    first, second = _came_alike(first, second), _came_alike(second, first)
     runs = len(first.offsets) - 1
     run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
     order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
@@ -193,6 +193,14 @@ def joined(first: Happenings, second: Happenings) -> Happenings:
         np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
     )
     return Happenings(first.offsets + second.offsets, *columns)
+
+
+def _came_alike(happenings: Happenings, other: Happenings) -> Happenings:
+    """Events that say when they came if others do: times alone come at their stamps."""
+    if happenings.came.shape[1] >= other.came.shape[1]:
+        return happenings
+    time_ns = happenings.time_ns
+    return happenings._replace(came=np.stack([time_ns, np.full(len(time_ns), -1)], axis=1))
 
 
 def _of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:

@@ -45,6 +45,8 @@ class Happenings(NamedTuple):
             interpolated.
         is_due: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
+        came: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the order
+            of the stamps.
     """
 
     offsets: Integers
@@ -53,6 +55,7 @@ class Happenings(NamedTuple):
     data: Floats
     is_due: NDArray[np.bool_]
     target_id: Integers
+    came: Integers
 
 
 class Carried(NamedTuple):
@@ -129,12 +132,9 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     return made(kept[1:], *(column[rows] for column in columns)), kept
 
 
-def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """The loop over the events of one run, for `replay.engine.compile.compile_over_runs`.
-
-    `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
-    """
-    predict, estimate = steps.predict, steps.estimate
+def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """What one event does to a run, `take_in(run, event, happenings, ...)`; see `recursion`."""
+    predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
     controls = stage.model.controls
@@ -198,6 +198,16 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 innovations.target_id[row] = happenings.target_id[event]
                 innovations.end[run] = row + 1
         return ALL_WELL
+
+    return take_in
+
+
+def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """The loop over the events of one run, for `replay.engine.compile.compile_over_runs`.
+
+    `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
+    """
+    take_in, estimate = taking_in(stage, steps, settings_of), steps.estimate
 
     def follow(
         run: int,

@@ -377,6 +377,11 @@ class Smoother(Filter):
         """How much later a message may be that an estimate uses."""
         return parse_forward(self.parameters.forward).lag_ns
 
+    @property
+    def cannot_rewind(self) -> str:
+        """A smoother has its estimates from what came later in any case."""
+        return "a smoother uses later messages in any case; replay it in the order of the stamps"
+
     def start(self, whole: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, see `Filter.start`."""
         state = super().start(whole)

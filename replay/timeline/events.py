@@ -1,4 +1,4 @@
-"""What happened in a run, as text: gated measurements, failures, and spans without a sensor."""
+"""What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -68,6 +68,16 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
             for target, square in zip(gated["target_id"].tolist(), squares, strict=True)
         ]
         yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.SKIPPED):
+        texts = [f"not used: {reason}" for reason in sentences_of(stream)]
+        yield Happened(estimator, "WARN", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.REWOUND):
+        late_s = (stream.log_time_ns - stream.publish_time_ns) * 1e-9
+        texts = [
+            f"came {delay:.3f} s late: went back and used {repeated} after it again"
+            for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
         texts = [f"failed: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)

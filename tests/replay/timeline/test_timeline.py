@@ -163,6 +163,34 @@ def test_the_map_holds_poses_paths_and_ellipses_in_true_coordinates(
     assert points["Points2D:labels"][0] == [str(number) for number in landmarks["landmark_id"]]
 
 
+def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
+    """What was left out, and what an estimator went back for, at their stamps."""
+    begin_ns = ensemble.sources[0].epoch_ns
+    told = [
+        make_stream(
+            "/estimates/ekf/robot1/skipped",
+            schemas.SKIPPED,
+            [begin_ns + 10**9],
+            metadata={"reasons": '["too late"]'},
+            reason=[0],
+        ),
+        make_stream(
+            "/estimates/ekf/robot1/rewound",
+            schemas.REWOUND,
+            [begin_ns + 2 * 10**9],
+            log_time_ns=[begin_ns + 2 * 10**9 + 250_000_000],
+            repeated=[3],
+        ),
+    ]
+    outputs = {each.topic: gather([each]) for each in told}
+    show(ensemble.sources[0], outputs, [], save=tmp_path / "late.rrd")
+    events = read(tmp_path / "late.rrd")["/events/robot1/ekf"]
+    assert dict(zip(events["utc"], events["TextLog:text"], strict=True)) == {
+        begin_ns + 10**9: ["ekf: not used: too late"],
+        begin_ns + 2 * 10**9: ["ekf: came 0.250 s late: went back and used 3 after it again"],
+    }
+
+
 def test_sight_lines_go_to_what_is_seen_and_vanish_with_it(rrd: Path, ensemble: Replayed) -> None:
     seen = ensemble.sources[RUN].streams["/robot1/range_bearing"]
     innovations = ensemble.outputs["/estimates/ekf/robot1/innovation"].of_run(RUN)

@@ -1,0 +1,75 @@
+"""`--late` from the command line, from an experiment and from Python: the same, and said."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from recorders.log import Stream, open_log, read_streams
+from replay.engine.failures import sentences_of
+
+Fuselog = Callable[..., Any]
+Streams = dict[str, Stream]
+LATE = """
+duration_s=8 odometry_latency_s=0.03 range_bearing.latency_s=0.2 range_bearing.latency_jitter_s=0.3
+bearing.rate_hz=10 bearing.latency_s=0.05 bearing.stamp_offset_s=-0.1
+"""
+POSE, INNOVATION, SKIPPED, REWOUND = (
+    f"/estimates/ekf/robot1/{name}" for name in ("pose", "innovation", "skipped", "rewound")
+)
+
+
+@pytest.fixture
+def log(fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A robot whose messages overtake one another, the control's among them."""
+    monkeypatch.chdir(tmp_path)
+    settings = [word for each in LATE.split() for word in ("--set", each)]
+    assert fuselog("record", "landmarks", "-o", "run.mcap", *settings).code == 0
+    return Path("run.mcap")
+
+
+def replayed(fuselog: Fuselog, out: str, *options: str) -> tuple[Streams, str]:
+    """The estimates log, and what the command said."""
+    said = fuselog("replay", "run.mcap", "-e", "ekf", "-o", out, *options)
+    assert said.code == 0, said.err
+    found = open_log(out)
+    return read_streams(found, list(found.topics)), said.out + said.err
+
+
+@pytest.mark.usefixtures("log")
+def test_going_back_ends_where_the_replay_in_order_does(fuselog: Fuselog) -> None:
+    """With a control that is late too, and messages of before the prior."""
+    in_order, _ = replayed(fuselog, "ordered.mcap")
+    back, _ = replayed(fuselog, "back.mcap", "--arrival-order", "--late", "rewind:3")
+    for name in ("mean", "covariance"):
+        np.testing.assert_array_equal(back[POSE][name][-1], in_order[POSE][name][-1])
+    for name, column in in_order[INNOVATION].columns.items():
+        np.testing.assert_array_equal(back[INNOVATION][name], column)
+    assert (len(back[SKIPPED]), len(back[REWOUND]) > 50) == (0, True)
+    issued = back[POSE]
+    assert (np.diff(issued.log_time_ns) >= 0).all()
+    assert (issued.log_time_ns > issued.publish_time_ns).all()
+
+
+def test_every_door_gives_the_same_and_says_what_is_left_out(log: Path, fuselog: Fuselog) -> None:
+    found, said = replayed(fuselog, "dropped.mcap", "--arrival-order", "--late", "drop")
+    reason = "topic /robot1/range_bearing: it is older than what was used before"
+    count = sentences_of(found[SKIPPED]).count(reason)
+    assert count > 10
+    assert f"ekf robot1: {count} not used: {reason}" in said
+    done = fl.replay(log, "ekf", arrival_order=True, late="drop")
+    assert any(f"{count} not used: {reason}" in sentence for sentence in done.losses)
+    options = ["--arrival-order", "--late", "drop", "--out", "optional"]
+    assert fuselog("run", log, "-e", "ekf", *options).code == 0
+    Path("late.toml").write_text(
+        'title = "late"\narrival_order = true\nlate = "drop"\n'
+        f'[logs]\nfiles = ["{log}"]\n[estimators.ekf]\n'
+    )
+    fl.run("late.toml", out="stated")
+    for place in ("optional", "stated"):
+        estimates = fl.open(Path(place, "estimates", "run-0000.mcap"))
+        np.testing.assert_array_equal(estimates[POSE]["mean"], found[POSE]["mean"])
+    np.testing.assert_array_equal(done.estimates[0][POSE]["mean"], found[POSE]["mean"])
