@@ -4,9 +4,14 @@ from collections.abc import Mapping
 
 from replay.inference.estimators import of_any_model
 from replay.inference.methods import FILTERS, Method
+from replay.inference.particles import BOOTSTRAP
 from replay.inference.smoothers import SMOOTHING
 
-METHODS: Mapping[str, Method] = {**FILTERS, "smoother": SMOOTHING}
+METHODS: Mapping[str, Method] = {
+    **FILTERS,
+    "smoother": SMOOTHING,
+    "particles": BOOTSTRAP,
+}
 
 EKF = of_any_model(METHODS["ekf"])
 IEKF = of_any_model(METHODS["iekf"])
@@ -14,3 +19,4 @@ UKF = of_any_model(METHODS["ukf"])
 LRKF = of_any_model(METHODS["lrkf"])
 ANALYTIC = of_any_model(METHODS["analytic"])
 SMOOTHER = of_any_model(METHODS["smoother"])
+PARTICLES = of_any_model(METHODS["particles"])
