@@ -9,7 +9,6 @@ import copy
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from hashlib import sha256
 from types import MappingProxyType
 from typing import Any, Generic, NamedTuple
 
@@ -26,6 +25,7 @@ from replay.engine.components import Components
 from replay.engine.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.failures import Failure, reason_of, reason_stream
 from replay.engine.measurements import Vectors, numbers_of
+from replay.engine.philox import run_key
 from replay.engine.priors import gaussians
 from replay.engine.results import failures_by_run, innovation_stream, state_stream, states_in
 from replay.engine.tangent import tangent_components
@@ -119,8 +119,7 @@ class OneRun(Mapping[str, Stream]):
 
 def _generator(parameters: Any, first: Iterable[NDArray]) -> np.random.Generator:
     """A counter-based generator (Philox), keyed by a seed and a run's first data."""
-    words = [str(getattr(parameters, "seed", 0)).encode(), *(part.tobytes() for part in first)]
-    key = np.frombuffer(sha256(b" ".join(words)).digest()[:16], np.uint64)
+    key = run_key(getattr(parameters, "seed", 0), first)
     return np.random.Generator(np.random.Philox(key=key))
 
 

@@ -20,8 +20,9 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic
 from recorders.models.vehicles import turn
 from recorders.parameters import Parameters
-from replay.engine.arrays import Floats, Integers
+from replay.engine.arrays import Floats
 from replay.engine.blocks import Block, Ragged
+from replay.engine.compile import compiled
 from replay.engine.estimator import Bound, Estimator
 from replay.estimators.vehicle_association import (
     all_maps,
@@ -51,6 +52,7 @@ from replay.estimators.vehicles import (
     update_by_scalar,
     weigh,
 )
+from replay.sampling.resampling import choose_systematically
 
 KINDS = {
     "set": "states, weighted by the exact likelihood of the unordered pairs (x, y)",
@@ -58,6 +60,7 @@ KINDS = {
     "associations": "associations, a Kalman filter each (Rao-Blackwellised)",
 }
 LEAST_EFFECTIVE_SHARE = 0.5
+_choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):
@@ -160,7 +163,8 @@ def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: in
     weight -= weight.max()
     share = np.exp(weight) / np.exp(weight).sum()
     if 1.0 / np.sum(share**2) < LEAST_EFFECTIVE_SHARE * method.particles:
-        chosen = _systematic(share, rng)
+        chosen = np.empty(method.particles, np.int64)
+        _choose(share, rng.uniform(), chosen)
         joint, weight = joint.of(chosen), np.zeros(method.particles)
     cloud.joint.mean[own], cloud.joint.covariance[own] = joint
     cloud.log_weight[run] = weight
@@ -237,14 +241,6 @@ def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tu
     added, variance = topology_moments(places, variance_m2)
     squared = (topology(seen) - added - topology(places)) ** 2 / variance
     return joint, -0.5 * (squared + np.log(variance))
-
-
-def _systematic(share: Floats, rng: np.random.Generator) -> Integers:
-    """Which particles go on, as often as their shares (particles,) say."""
-    count = len(share)
-    ends = np.cumsum(share)
-    points = (np.arange(count) + rng.uniform()) / count
-    return np.minimum(np.searchsorted(ends, points), count - 1)
 
 
 def _estimate(method: Method, cloud: Cloud, run: int) -> tuple[Floats, Floats]:

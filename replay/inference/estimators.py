@@ -367,8 +367,8 @@ class Filter:
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
         after, estimated, made = self.filtered(state, happenings)
-        states = issued(self.states(*estimated), happenings, state.carried.time_ns)
-        return after, [states, *made]
+        states, *others = self.told(*estimated)
+        return after, [issued(states, happenings, state.carried.time_ns), *others, *made]
 
     def filtered(
         self, state: State, happenings: Happenings
@@ -422,6 +422,10 @@ class Filter:
         """The topic that the estimates are compared with."""
         truth = self.stage.model.truth
         return truth if truth.startswith("/") else f"{self.found.prefix}/{truth}"
+
+    def told(self, estimates: Any, offsets: Integers) -> list[Ragged]:
+        """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
+        return [self.states(estimates, offsets)]
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
         """The stream of estimates; run r owns offsets[r]:offsets[r + 1]."""

@@ -54,6 +54,27 @@ def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
     return True
 
 
+def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
+    """The same of a positive semidefinite matrix: what is below a pivot of about zero is zero.
+
+    False where it is none (or NaN).
+    """
+    for column in range(size):
+        smallest = 1e-15 * size * matrix[column, column]
+        for row in range(column, size):
+            entry = matrix[row, column]
+            for k in range(column):
+                entry -= factor[row, k] * factor[column, k]
+            if row == column:
+                if not entry >= -smallest:
+                    return False
+                factor[row, row] = np.sqrt(entry) if entry > smallest else 0.0
+            else:
+                pivot = factor[column, column]
+                factor[row, column] = entry / pivot if pivot > 0.0 else 0.0
+    return True
+
+
 def wrap(difference: float, is_angle: bool) -> float:
     """The difference, in [-pi, pi) where it is one of angles."""
     if is_angle and not abs(difference) < np.pi:

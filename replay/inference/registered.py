@@ -5,9 +5,15 @@ from collections.abc import Mapping
 from replay.inference.estimators import of_any_model
 from replay.inference.imm import INTERACTING
 from replay.inference.methods import FILTERS, Method
+from replay.inference.particles import BOOTSTRAP
 from replay.inference.smoothers import SMOOTHING
 
-METHODS: Mapping[str, Method] = {**FILTERS, "smoother": SMOOTHING, "imm": INTERACTING}
+METHODS: Mapping[str, Method] = {
+    **FILTERS,
+    "smoother": SMOOTHING,
+    "imm": INTERACTING,
+    "particles": BOOTSTRAP,
+}
 
 EKF = of_any_model(METHODS["ekf"])
 IEKF = of_any_model(METHODS["iekf"])
@@ -16,3 +22,4 @@ LRKF = of_any_model(METHODS["lrkf"])
 ANALYTIC = of_any_model(METHODS["analytic"])
 SMOOTHER = of_any_model(METHODS["smoother"])
 IMM = of_any_model(METHODS["imm"])
+PARTICLES = of_any_model(METHODS["particles"])

@@ -6,6 +6,7 @@ vectors, and means are intrinsic: the weighted differences from them sum to zero
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,9 +102,7 @@ def regression(
     add, add_flat, subtract = retraction(kinds), sum_of(components), differencing(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
-    add_value, recentre, weighted_mean = retraction(outputs), recentring(outputs), weighted_mean_of(v)
-    flat_states, no_noise = is_flat(kinds), (0.0,) * noises
-    straight = set(outputs) <= {"linear"}
+    settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
 
     def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
         """Fill the offsets of all samples, and the function's values as differences from the centre."""
@@ -123,20 +122,6 @@ def regression(
             value = function(point, read_noise(away), arguments)
             subtract(value, centre, memory.values, index)
 
-    def settle(weights: Floats, memory: SampleMemory) -> None:
-        """Move the centre to the intrinsic mean; `shift` is what the values still are away from it."""
-        values, shift = memory.values, memory.shift
-        for _ in range(MEANS):
-            weighted_mean(weights, values, shift)
-            add_value(memory.centre, shift)
-            if straight:
-                return
-            again = recentre(values, shift)
-            for i in range(v):
-                shift[i] = 0.0
-            if not again:
-                return
-
     def regress(
         mean: Floats,
         covariance: Floats,
@@ -155,11 +140,36 @@ def regression(
         for k in range(noises):
             factor[t + k, t + k] = np.sqrt(memory.noise[k])
         evaluate(mean, memory.points[chosen], arguments, memory)
-        settle(weights, memory)
+        settle(weights, memory.values, memory.centre, memory.shift)
         moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
         return True
 
     return regress
+
+
+@lru_cache(maxsize=64)
+def settling(kinds: tuple[str, ...]) -> Function:
+    """`settle(weights, values, centre, shift)`: moves a centre to the intrinsic mean of values.
+
+    The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
+    afterwards.
+    """
+    v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
+    add, recentre, weighted_mean = retraction(kinds), recentring(kinds), weighted_mean_of(v)
+
+    def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
+        for _ in range(MEANS):
+            weighted_mean(weights, values, shift)
+            add(centre, shift)
+            if straight:
+                return
+            again = recentre(values, shift)
+            for i in range(v):
+                shift[i] = 0.0
+            if not again:
+                return
+
+    return settle
 
 
 def _no_variances(*_: Any) -> tuple[float, ...]:

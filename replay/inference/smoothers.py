@@ -26,7 +26,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.compile import compile_over_runs
 from replay.inference.estimators import Filter, State
-from replay.inference.gaussian import copy_gaussian, moved_covariance
+from replay.inference.gaussian import copy_gaussian, moved_covariance, semidefinite_cholesky
 from replay.inference.generate import differencing, is_flat, resetting, retraction
 from replay.inference.methods import (
     FILTERS,
@@ -227,19 +227,8 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
     is in the range of A. False where A is not positive semidefinite.
     """
     size, columns = len(matrix), right.shape[1]
-    for column in range(size):
-        smallest = 1e-15 * size * matrix[column, column]
-        for row in range(column, size):
-            entry = matrix[row, column]
-            for k in range(column):
-                entry -= factor[row, k] * factor[column, k]
-            if row == column:
-                if not entry >= -smallest:
-                    return False
-                factor[row, row] = np.sqrt(entry) if entry > smallest else 0.0
-            else:
-                pivot = factor[column, column]
-                factor[row, column] = entry / pivot if pivot > 0.0 else 0.0
+    if not semidefinite_cholesky(factor, matrix, size):
+        return False
     for row in range(size):
         scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
         for k in range(row):

@@ -41,8 +41,9 @@ from replay.inference.model import Model, Motion, Sensor
 FAILURES = (
     "the covariance is no longer positive definite",
     "the estimate is no longer finite",
+    "no particle explains what was measured",
 )
-NOT_POSITIVE_DEFINITE, NOT_FINITE = 0, 1  # indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED = 0, 1, 2  # indices of FAILURES
 NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 

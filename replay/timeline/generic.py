@@ -29,6 +29,7 @@ from replay.timeline.events import NOT_SENSED, draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
+    draw_clouds,
     draw_dots,
     draw_path,
     draw_points,
@@ -93,6 +94,7 @@ def _draw_plane(
     tracks = [("truth", Stroke(TRUTH, 2.0), stream, "state") for stream in scene.truths_of(case)]
     for name, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         tracks.append((name, Stroke(scene.colour(name)), stream, "mean"))
+    draw_clouds(canvas, scene, case, root)
     shown: list[Floats] = []
     paths: list[str] = []
     for name, stroke, stream, field in tracks:

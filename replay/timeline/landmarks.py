@@ -26,6 +26,7 @@ from replay.timeline.events import draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
+    draw_clouds,
     draw_ellipses,
     draw_lines,
     draw_path,
@@ -88,6 +89,7 @@ def _draw_robot(
         if track.covariances is not None:
             outline = (track.time_ns, track.poses[:, :2], track.covariances, track.stroke)
             draw_ellipses(canvas, f"{entity}/ellipse", *outline)
+    draw_clouds(canvas, scene, robot, root)
     _draw_sights(canvas, scene, robot, tracks, landmarks)
     _, areas = draw_sets(canvas, scene, robot, root)
     paths = [f"{root}/{track.name}/path" for track in tracks]

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.stats import chi2
 
+from recorders.log import schemas
+from replay.engine.measurements import PLANE
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
     Canvas,
     Colour,
+    Scene,
     Times,
     escaped,
     gap_limit_ns,
@@ -34,6 +37,9 @@ TRAIL_S = 60.0
 ELLIPSE_VERTICES = 24
 # The lines of a look stay for so many of the usual intervals between looks.
 SHOWN_INTERVALS = 1.5
+# Of clouds of particles so many are drawn, those of whole stamps; the area of each is its weight.
+CLOUD_POINTS = 100_000
+PARTICLE_PX = 1.5
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -86,6 +92,26 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     """A point (n, 2) at each time, such as a measurement."""
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
+def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
+    """The particles of estimators that say where they are, all of a stamp until those of the next."""
+    for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
+        if not set(PLANE) <= set(stream.components):
+            continue
+        stamps, counts = np.unique(stream.publish_time_ns, return_counts=True)
+        rows = thin(stamps, max(CLOUD_POINTS // int(counts.max()), 1))
+        drawn = np.isin(stream.publish_time_ns, stamps[rows])
+        columns = [stream.components.index(component) for component in PLANE]
+        size = len(stream.components)
+        places = stream["mean"][drawn].reshape(-1, size)[:, columns]
+        share = stream["weight"][drawn] * np.repeat(counts[rows], counts[rows])
+        points = rr.Points2D.columns(
+            positions=places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(share)
+        )
+        canvas.send(f"{root}/{name}/particles", stamps[rows], points.partition(counts[rows]))
+        colour = rr.Points2D.from_fields(colors=[(*scene.colour(name), 120)])
+        canvas.fix(f"{root}/{name}/particles", colour)
 
 
 def draw_polygons(

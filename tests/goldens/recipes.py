@@ -89,6 +89,9 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
         {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
+    "landmarks-particles": Recipe(
+        "landmarks", parameters={"duration_s": 10.0}, estimators={"particles:200": {}}
+    ),
     "landmarks-smoothed": Recipe(
         "landmarks",
         parameters=SHORT,

@@ -112,3 +112,18 @@ def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
             f"{name}: empty set: the pair {first}, {second} is to blame"
             for first, second in zip(faults["first_id"], faults["second_id"], strict=True)
         ]
+
+
+def test_particles_are_drawn_where_they_are_with_their_weights(tmp_path):
+    source = memory_source(*record_run("landmarks", {"duration_s": 2.0}, 1))
+    settings = {"kind": "particles:50", "model": "robot", "cloud": True}
+    outputs = collect(replay([source], bind("cloud", [source], settings)))
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    found = read(tmp_path / "run.rrd")["/map/robot1/cloud/particles"]
+    cloud = outputs["/estimates/cloud/robot1/particle"]
+    rows = found["Points2D:positions"]
+    assert [len(row) for row in rows] == [50] * len(np.unique(cloud.stream.publish_time_ns))
+    places = np.concatenate([np.array(list(row)) for row in rows])
+    np.testing.assert_allclose(places, cloud["mean"][:, :2], rtol=1e-5)
+    radii = np.concatenate([np.array(list(row)) for row in found["Points2D:radii"]])
+    np.testing.assert_allclose(radii**2, 1.5**2 * 50 * cloud["weight"], rtol=1e-4, atol=1e-9)

@@ -1,0 +1,124 @@
+"""Random numbers inside kernels: Philox, a generator whose state is a counter and a run's own key.
+
+A kernel that makes no arrays cannot hold a generator of NumPy; this one is a few words of a run's state.
+The words are those of `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as
+easy as 1, 2, 3", SC 2011: Philox4x64-10. Normals: Marsaglia and Tsang, "The ziggurat method for
+generating random variables", Journal of Statistical Software 5(8), 2000; Doornik 2005.
+"""
+
+from collections.abc import Iterable
+from hashlib import sha256
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from replay.engine.arrays import Floats
+
+Words = NDArray[np.uint64]
+
+WORDS = 4  # of a block
+_ROUNDS = 10
+_MULTIPLIERS = 0xD2E7470EE14C6C93, 0xCA5A826395121157
+_WEYL = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
+_UNIT = 2.0**-53
+_LAYERS, _TAIL = 256, 3.6541528853610088  # of the ziggurat, and where its tail begins
+
+
+def run_key(seed: int, first: Iterable[NDArray]) -> Words:
+    """A run's own key (2,): of a seed and its first data.
+
+    So its numbers are the same on any number of cores, and whatever other runs there are.
+    """
+    words = [str(seed).encode(), *(part.tobytes() for part in first)]
+    return np.frombuffer(sha256(b" ".join(words)).digest()[:16], np.uint64)
+
+
+def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
+    """The upper 64 bits of a product of 128."""
+    low, half = np.uint64(0xFFFFFFFF), np.uint64(32)
+    a_low, a_high, b_low, b_high = a & low, a >> half, b & low, b >> half
+    first = a_high * b_low + ((a_low * b_low) >> half)
+    second = a_low * b_high + (first & low)
+    return a_high * b_high + (first >> half) + (second >> half)
+
+
+def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
+    """The block of four words with this number."""
+    a, b, c, d = np.uint64(counter), np.uint64(0), np.uint64(0), np.uint64(0)
+    k0, k1 = key[0], key[1]
+    m0, m1 = np.uint64(_MULTIPLIERS[0]), np.uint64(_MULTIPLIERS[1])
+    for _ in range(_ROUNDS):
+        high_a, high_c = high_word(m0, a), high_word(m1, c)
+        a, b, c, d = high_c ^ b ^ k0, m1 * c, high_a ^ d ^ k1, m0 * a
+        k0, k1 = k0 + np.uint64(_WEYL[0]), k1 + np.uint64(_WEYL[1])
+    return a, b, c, d
+
+
+def unit(word: np.uint64) -> float:
+    """A number from the middles of 2^53 pieces of (0, 1): neither 0 nor 1."""
+    return (float(word >> np.uint64(11)) + 0.5) * _UNIT
+
+
+def _ziggurat() -> tuple[Floats, Floats, Floats]:
+    """Right ends (layers + 1,) of layers of one area under exp(-x^2 / 2), heights there, inner shares.
+
+    The lowest layer, number 0, has the tail with it: its end is that of a rectangle of the same area.
+    """
+    area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * erfc(_TAIL / np.sqrt(2.0))
+    ends = np.zeros(_LAYERS + 1)
+    ends[0], ends[1] = area / np.exp(-0.5 * _TAIL**2), _TAIL
+    for layer in range(2, _LAYERS):
+        height = np.exp(-0.5 * ends[layer - 1] ** 2) + area / ends[layer - 1]
+        ends[layer] = np.sqrt(-2.0 * np.log(height))
+    heights, shares = np.exp(-0.5 * ends**2), ends[1:] / ends[:-1]
+    for table in (ends, heights, shares):
+        table.flags.writeable = False
+    return ends, heights, shares
+
+
+_ENDS, _HEIGHTS, _SHARES = _ziggurat()
+
+
+def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int:
+    """Fill an array, whose size is a multiple of four, with draws of N(0, 1), by way of as many words.
+
+    The blocks after number `counter` are used, a word for each draw, and after these another block for
+    each of the few draws, one in 67, that a word does not settle. Returns the number of the last one.
+    """
+    blocks = len(words) // WORDS
+    for block in range(blocks):
+        at = WORDS * block
+        a, b, c, d = philox(counter + block + 1, key)
+        words[at], words[at + 1], words[at + 2], words[at + 3] = a, b, c, d
+    counter += blocks
+    for at in range(len(words)):
+        layer, share, sign = layer_of(words[at])
+        if share < _SHARES[layer]:
+            numbers[at] = sign * share * _ENDS[layer]
+        else:
+            numbers[at], counter = settled(layer, share, sign, key, counter)
+    return counter
+
+
+def layer_of(word: np.uint64) -> tuple[int, float, float]:
+    """A layer of the ziggurat, how far to its right end, and a sign."""
+    layer = int(word & np.uint64(_LAYERS - 1))
+    return layer, unit(word), 1.0 if word & np.uint64(_LAYERS) else -1.0
+
+
+def settled(layer: int, share: float, sign: float, key: Words, counter: int) -> tuple[float, int]:
+    """The draw of a layer beyond what lies inside for certain, and the counter after it."""
+    while True:
+        counter += 1
+        a, b, c, _ = philox(counter, key)
+        x = share * _ENDS[layer]
+        if share < _SHARES[layer]:
+            return sign * x, counter
+        if layer == 0:  # the tail; Marsaglia, Technometrics 6(1), 1964
+            beyond = -np.log(unit(a)) / _TAIL
+            if -2.0 * np.log(unit(b)) > beyond * beyond:
+                return sign * (_TAIL + beyond), counter
+        elif _HEIGHTS[layer] + unit(a) * (_HEIGHTS[layer + 1] - _HEIGHTS[layer]) < np.exp(-0.5 * x * x):
+            return sign * x, counter
+        layer, share, sign = layer_of(c)
