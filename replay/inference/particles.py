@@ -604,7 +604,7 @@ def summing_up(model: Model) -> Function:
     subtract, settle, moments = differencing(model.kinds), settling(model.kinds), moments_of(0, t)
     weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}
 
-    def estimate(run: int, cloud: Cloud, clouds: Clouds, row: int) -> None:
+    def estimate(run: int, cloud: Cloud, clouds: Clouds, row: int, _: ParticleMemory) -> None:
         states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]
         mean, covariance, shift = clouds.mean[row], clouds.covariance[row], cloud.shift[run]
         if straight:

@@ -274,7 +274,7 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
                     break
             if failure == ALL_WELL and happenings.is_due[event]:
                 row, result = newest_estimated(last, kept), estimates.end[run]
-                estimate(row, kept.after.belief, estimates, result)
+                estimate(row, kept.after.belief, estimates, result, memory)
                 failure = fault_of(estimates.mean[result], estimates.covariance[result])
                 if failure == ALL_WELL:
                     estimates.time_ns[result] = kept.time_ns[row]

@@ -1,6 +1,6 @@
 """Interacting multiple models against the reference sheets, single filters, and their own formulas."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,13 +26,18 @@ from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_recursion import assert_equal, in_blocks
 from tests.replay.inference.vehicle_a import VEHICLE_A
+from tests.replay.inference.vehicle_a import noise as vehicle_noise
 
 EXACT = 1e-9
 
 
 @pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Plain Python, and no loop of it is left to the next test."""
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    estimators._compiled.cache_clear()
+    yield
+    estimators._compiled.cache_clear()
 
 
 # The sheet's problem: a vehicle whose turn rate is steady, or changes fast
@@ -48,19 +53,19 @@ class SwitchingParameters(vehicle_a.VehicleParameters):
 
 def noise_times(factor: float) -> Any:
     def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
-        *others, turn = vehicle_a.noise(state, duration_s, parameters)
+        *others, turn = vehicle_noise(state, duration_s, parameters)
         return (*others, turn * factor)
 
     return noise
 
 
 def steady_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
-    a, b, c, d, turn = vehicle_a.noise(state, duration_s, parameters)
+    a, b, c, d, turn = vehicle_noise(state, duration_s, parameters)
     return a, b, c, d, 0.02 * turn
 
 
 def agile_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
-    a, b, c, d, turn = vehicle_a.noise(state, duration_s, parameters)
+    a, b, c, d, turn = vehicle_noise(state, duration_s, parameters)
     return a, b, c, d, 4.0 * turn
 
 
@@ -142,12 +147,11 @@ def test_the_sheets_states_and_smoothed_modes(uncompiled: None) -> None:
 
 @pytest.mark.paper
 @pytest.mark.parametrize("name", ["ekf", "iekf", "ukf", "lrkf:s2kf-50"])
-def test_compiled_loops_do_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_loops_do_the_same(name: str, request: pytest.FixtureRequest) -> None:
     source = vehicle_a.source(vehicle_a.simulate(8)[0])
     settings = {"filter": name, "smoothed_modes": True, "gate_probability": 0.99}
     compiled = outputs(SWITCHING_A, "imm", [source], **settings)
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    estimators._compiled.cache_clear()
+    request.getfixturevalue("uncompiled")
     plain = outputs(SWITCHING_A, "imm", [source], **settings)
     for topic, field in (("state", "mean"), ("innovation", "covariance"), ("modes", "probability")):
         assert_allclose(compiled[topic][field], plain[topic][field], rtol=1e-7, atol=1e-10)
