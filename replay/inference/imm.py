@@ -7,8 +7,8 @@ later stamp the modes' Gaussians are mixed,
 
 each mode predicts its own mixture, and every message makes mu_j proportional to mu_j N(v_j; 0, S_j).
 Mixtures lie in the tangent space of the likeliest mode; covariances are carried there, and from there to
-that of the mixture's mean, by the right Jacobian. Probabilities are kept as logarithms: those of a mode
-that fits badly lie below the smallest number.
+that of the mixture's mean, by the right Jacobian. Probabilities are kept as logarithms too: those of a
+mode that fits badly lie below the smallest number.
 
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
 """
@@ -50,6 +50,7 @@ from replay.inference.model import Model, switching_of
 from replay.inference.recursion import Happenings, Innovations
 from replay.inference.steps import Gaussian, Note, Stage, Steps, noting, slots_of
 
+TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
 
 
@@ -77,11 +78,12 @@ class Belief(NamedTuple):
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
-        log_probability: (runs, M), of the modes.
+        probability, log_probability: (runs, M), of the modes.
     """
 
     mean: Floats
     covariance: Floats
+    probability: Floats
     log_probability: Floats
 
 
@@ -102,7 +104,7 @@ class Memory(NamedTuple):
         filters: the memory of every mode's filter.
         rates, transition: (M (M - 1),), and Pi (M, M).
         weights: (M, M), row j those of all modes in the mixture of mode j.
-        probability: (M,), of the modes.
+        predicted: (M,), the logarithms of c.
         centre: (n,), the mean in whose tangent space mixtures are made.
         away, carried: (M, t), (M, t, t), the modes' Gaussians there.
         shift: (t,), of a mixture.
@@ -114,7 +116,7 @@ class Memory(NamedTuple):
     rates: Floats
     transition: Floats
     weights: Floats
-    probability: Floats
+    predicted: Floats
     centre: Floats
     away: Floats
     carried: Floats
@@ -144,13 +146,13 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         memory: Memory,
     ) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        log_probability, weights = belief.log_probability[run], memory.weights
+        probability, log_probability = belief.probability[run], belief.log_probability[run]
         fill_rates(memory.rates, rates_of(parameters))
         change(memory.rates, duration_s, memory.transition)
-        gather(mean, covariance, log_probability, memory)
-        weigh(log_probability, memory)
+        gather(mean, covariance, probability, memory)
+        weigh(probability, log_probability, memory)
         for mode in range(modes):
-            mix(weights[mode], memory, mean[mode], covariance[mode])
+            mix(memory.weights[mode], memory, mean[mode], covariance[mode])
         return predict_modes(
             Gaussian(mean, covariance), control, duration_s, parameters, use, memory.filters
         )
@@ -158,8 +160,8 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     def estimate(run: int, belief: Belief, mixtures: Mixtures, row: int, memory: Memory) -> None:
         probability = mixtures.probability[row]
         for mode in range(modes):
-            probability[mode] = np.exp(belief.log_probability[run, mode])
-        gather(belief.mean[run], belief.covariance[run], belief.log_probability[run], memory)
+            probability[mode] = belief.probability[run, mode]
+        gather(belief.mean[run], belief.covariance[run], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> Memory:
@@ -171,7 +173,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             rates=np.empty(modes * (modes - 1)),
             transition=np.empty((modes, modes)),
             weights=np.empty((modes, modes)),
-            probability=np.empty(modes),
+            predicted=np.empty(modes),
             centre=np.empty(n),
             away=np.empty((modes, t)),
             carried=np.empty((modes, t, t)),
@@ -211,13 +213,9 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
     angular = tuple(kind == "angle" for kind in measured.values())
     m, tell = len(measured), noting(stage, number)
 
-    def blend(memory: Memory, note: Note) -> float:
+    def blend(probability: Floats, memory: Memory, note: Note) -> float:
         """Note the innovation of the mixture of all modes; returns its NIS."""
-        innovation, notes, probability = (
-            memory.filters[0].innovations[number],
-            memory.notes,
-            memory.probability,
-        )
+        innovation, notes = memory.filters[0].innovations[number], memory.notes
         difference, covariance, _ = innovation
         for i in range(m):
             first = notes.difference[0, places[i]]
@@ -247,9 +245,8 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
         note: Note,
     ) -> int:
         gaussians = Gaussian(belief.mean[run], belief.covariance[run])
-        log_probability, numbers, taken = belief.log_probability[run], memory.notes.numbers, 0
+        probability, numbers, taken = belief.probability[run], memory.notes.numbers, 0
         for mode in range(modes):
-            memory.probability[mode] = np.exp(log_probability[mode])
             numbers[mode, 2] = 0.0
         for bounds in (gate, memory.open_gate):
             for mode in range(modes):
@@ -265,24 +262,26 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
                     taken += int(numbers[mode, 2])
             if taken == 0:
                 break
-        note.numbers[0] = blend(memory, note)
+        note.numbers[0] = blend(probability, memory, note)
         note.numbers[1] = 0.0
         note.numbers[2] = 1.0 if taken else 0.0
         if taken:
-            note.numbers[1] = weigh_by(log_probability, numbers)
+            note.numbers[1] = weigh(probability, belief.log_probability[run], numbers)
         return ALL_WELL
 
-    def weigh_by(log_probability: Floats, numbers: Floats) -> float:
+    def weigh(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
         """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
         highest, total = -np.inf, 0.0
         for mode in range(modes):
             log_probability[mode] += numbers[mode, 1]
             highest = max(highest, log_probability[mode])
         for mode in range(modes):
-            total += np.exp(log_probability[mode] - highest)
+            probability[mode] = np.exp(log_probability[mode] - highest)
+            total += probability[mode]
         likelihood = highest + np.log(total)
         for mode in range(modes):
             log_probability[mode] -= likelihood
+            probability[mode] /= total
         return likelihood
 
     return update
@@ -336,38 +335,52 @@ def changing(modes: int) -> Function:
 
 
 def weighing(modes: int) -> Function:
-    """`weigh(log_probability, memory)`: row j of the weights becomes mu_(i|j), the probabilities c.
+    """`weigh(probability, log_probability, memory)`: the probabilities become c.
 
-    A mode that none with any probability leads to keeps its own Gaussian.
+    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
+    it; a mode that none with any probability leads to keeps its own Gaussian.
     """
 
-    def weigh(log_probability: Floats, memory: Memory) -> None:
-        predicted, weights, transition = memory.probability, memory.weights, memory.transition
+    def weigh_by_logarithms(end: int, log_probability: Floats, memory: Memory) -> float:
+        weights, transition = memory.weights, memory.transition
+        highest, total = -np.inf, 0.0
+        for begin in range(modes):
+            weights[end, begin] = 1.0 if begin == end else 0.0
+            if transition[begin, end] > 0.0:
+                highest = max(highest, log_probability[begin])
+        if highest == -np.inf:
+            return highest
+        for begin in range(modes):
+            weights[end, begin] = transition[begin, end]
+            if transition[begin, end] > 0.0:
+                weights[end, begin] *= np.exp(log_probability[begin] - highest)
+            total += weights[end, begin]
+        for begin in range(modes):
+            weights[end, begin] /= total
+        return highest + np.log(total)
+
+    def weigh(probability: Floats, log_probability: Floats, memory: Memory) -> None:
+        weights, predicted = memory.weights, memory.predicted
         for end in range(modes):
-            highest, total = -np.inf, 0.0
+            total = 0.0
             for begin in range(modes):
-                weights[end, begin] = 1.0 if begin == end else 0.0
-                if transition[begin, end] > 0.0:
-                    highest = max(highest, log_probability[begin])
-            predicted[end] = highest
-            if highest == -np.inf:
-                continue
-            for begin in range(modes):
-                weights[end, begin] = transition[begin, end]
-                if transition[begin, end] > 0.0:
-                    weights[end, begin] *= np.exp(log_probability[begin] - highest)
+                weights[end, begin] = probability[begin] * memory.transition[begin, end]
                 total += weights[end, begin]
-            predicted[end] += np.log(total)
+            if total < TINY:
+                predicted[end] = weigh_by_logarithms(end, log_probability, memory)
+                continue
+            predicted[end] = np.log(total)
             for begin in range(modes):
                 weights[end, begin] /= total
         for mode in range(modes):
             log_probability[mode] = predicted[mode]
+            probability[mode] = np.exp(predicted[mode])
 
     return weigh
 
 
 def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
-    """`gather(mean, covariance, log_probability, memory)` and `mix(weights, memory, mean, covariance)`.
+    """`gather(mean, covariance, probability, memory)` and `mix(weights, memory, mean, covariance)`.
 
     The first carries the Gaussians of all modes to the tangent space of the likeliest; the second fills
     mean and covariance of a mixture of them.
@@ -376,10 +389,10 @@ def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
     reset, reset_back = resetting(kinds), resetting(kinds, back=True)
     n, t = len(kinds), tangent_size(kinds)
 
-    def gather(mean: Floats, covariance: Floats, log_probability: Floats, memory: Memory) -> None:
+    def gather(mean: Floats, covariance: Floats, probability: Floats, memory: Memory) -> None:
         likeliest = 0
         for mode in range(1, modes):
-            if log_probability[mode] > log_probability[likeliest]:
+            if probability[mode] > probability[likeliest]:
                 likeliest = mode
         centre, away = memory.centre, memory.away
         for row in range(n):
@@ -486,9 +499,9 @@ class Interacting(Filter):
         mean, covariance = (
             np.repeat(each[:, None], len(initial), axis=1) for each in state.carried.belief
         )
+        probability = np.tile(initial, (len(mean), 1))
         with np.errstate(divide="ignore"):
-            log_probability = np.tile(np.log(initial), (len(mean), 1))
-        belief = Belief(mean, covariance, log_probability)
+            belief = Belief(mean, covariance, probability, np.log(probability))
         return state._replace(carried=state.carried._replace(belief=belief), kept=())
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:

@@ -42,6 +42,7 @@ from replay.timeline.plots import (
     POINTS,
     draw_components,
     draw_curve,
+    draw_modes,
     draw_quality,
     plot_view,
     shown_unit,
@@ -77,6 +78,9 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
     components = draw_components(canvas, scene, case)
     if components:
         boards.append(_titled("state", components))
+    modes = draw_modes(canvas, scene, case)
+    if modes:
+        boards.append(_titled("modes", modes))
     events = draw_events(canvas, scene, case)
     board = rrb.Vertical(rrb.Tabs(*boards), events, row_shares=[4, 1])
     return beside(board if boards else rrb.Vertical(events), draw_quality(canvas, scene, case), case)

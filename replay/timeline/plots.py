@@ -6,6 +6,7 @@ which draws one standard deviation: a band of k sigma is sent with k^2 times the
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from replay.engine.blocks import gather
 from replay.judging.evaluation import Errors, Floats, chi_square_interval, innovations_of
 from replay.timeline.canvas import (
     MUTED,
+    PALETTE,
     TRUTH,
     Canvas,
     Colour,
@@ -148,6 +150,21 @@ def _draw_squares(
             draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
         title = f"{name} of {degrees} component{'s' * (degrees != 1)}"
         views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
+    return views
+
+
+def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """The probabilities of all modes, a plot for each estimator and for those given all data."""
+    views = []
+    for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
+        name = stream.topic.rpartition("/")[2]
+        plot = entity_path("plots", case, name, estimator)
+        curves = zip(stream.components, stream["probability"].T, cycle(PALETTE), strict=False)
+        for mode, probability, colour in curves:
+            draw_curve(canvas, plot, mode, colour, stream.publish_time_ns, probability, LINE)
+        views.append(
+            plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, 1.05))
+        )
     return views
 
 

@@ -39,7 +39,7 @@ from replay.timeline.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.plots import LINE, draw_curve, draw_nees, plot_view
+from replay.timeline.plots import LINE, draw_curve, draw_modes, draw_nees, plot_view
 
 CLOSE = f"{ROOT}/close"
 SENSOR = f"{ROOT}/sensor"
@@ -97,7 +97,10 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         close,
         row_shares=[3, 2],
     )
-    quality = rrb.Tabs(*(view for case in scene.cases for view in _nees(canvas, scene, case)))
+    quality = rrb.Tabs(
+        *(view for case in scene.cases for view in _nees(canvas, scene, case)),
+        *(view for case in scene.cases for view in _modes(canvas, scene, case)),
+    )
     plots = rrb.Vertical(*_draw_errors(canvas, scene, vehicles, tracks), quality)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 
@@ -107,6 +110,14 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     views = draw_nees(canvas, scene, case)
     for view in views:
         view.name = f"NEES of {case}"
+    return views
+
+
+def _modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """Mode probabilities of a case, named by it."""
+    views = draw_modes(canvas, scene, case)
+    for view in views:
+        view.name = f"{view.name}, {case}"
     return views
 
 

@@ -1,4 +1,4 @@
-"""What exact derivatives cost beside Jacobians by hand, and what a first use of a model costs.
+"""What exact derivatives cost beside Jacobians by hand, modes beside one motion, and a first use.
 
 The loops of the filters alone, on columns that are ready; CPU time of all cores together, medians of
 turns. Compiling is measured in a process of its own with an empty cache, loading in a second one. Run it
@@ -10,19 +10,22 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from os import environ
 from typing import Any
 
 import numpy as np
 
 from pipeline.ensemble import record_ensemble
+from recorders.parameters import build
 from replay.engine.estimator import Bound, bind
 from replay.engine.sources import MemorySource
 from replay.estimators.landmarks import ROBOT
+from replay.estimators.vehicle_kalman import VEHICLE
 from replay.inference.estimators import bind_model, combined
-from replay.inference.model import Model
+from replay.inference.model import Model, Switching
 from replay.inference.registered import METHODS
-from tests.bench.loops import calls_of, first_use_s
+from tests.bench.loops import Call, calls_of, first_use_s
 from tests.bench.reference.landmarks import fill_motion_jacobians, fill_sensor_jacobian
 from tests.bench.timing import cpu_seconds
 
@@ -41,7 +44,12 @@ USED: tuple[tuple[str, Mapping[str, Any], str], ...] = (
 
 def main() -> list[Row]:
     """Microseconds per step with jets and by hand, and CPU seconds of first uses."""
-    return [*derivatives({"duration_s": 300.0}, 1), *derivatives({"duration_s": 20.0}, 1000), *uses()]
+    return [
+        *derivatives({"duration_s": 300.0}, 1),
+        *derivatives({"duration_s": 20.0}, 1000),
+        *interacting(),
+        *uses(),
+    ]
 
 
 def by_hand(model: Model) -> Model:
@@ -80,6 +88,39 @@ def derivatives(parameters: Mapping[str, Any], runs: int) -> list[Row]:
     return [
         (what, *(f"{each:.3g} us" for each in us.values()), f"{us['jets'] / us['by hand']:.2f} times")
     ]
+
+
+def hardly_ever(parameters: Any) -> Any:
+    """Rates between two modes."""
+    return 0.1, 0.5
+
+
+def interacting() -> list[Row]:
+    """Filters of a vehicle and of a robot, and interacting multiple models of two such modes."""
+    rows = []
+    for scenario, model in (("vehicles", VEHICLE), ("landmarks", ROBOT)):
+        sources = record_ensemble(scenario, {"duration_s": 100.0}, 1, 100)
+        modes = {"one": model.motion, "other": model.motion}
+        double = replace(model, modes=modes, switching=Switching(hardly_ever))
+        for filtered in ("ekf", "ukf"):
+            calls: dict[str, list[Call]] = {}
+            for name, settings in ((filtered, {}), ("imm", {"filter": filtered})):
+                method = METHODS[name]
+                parameters = build(combined(double, method), settings, "bench")
+                bound = bind_model(name, sources[0].topics, parameters, model=double, method=method)
+                calls[name] = calls_of(bound, sources)
+            ways = {name: partial(_repeated, each) for name, each in calls.items()}
+            means = {name: way() for name, way in ways.items()}
+            np.testing.assert_allclose(means["imm"], means[filtered], rtol=1e-9, atol=1e-9)
+            us = {name: 1e6 * s / len(means["imm"]) for name, s in cpu_seconds(ways).items()}
+            what = f"imm:{filtered} of two modes of a {scenario.rstrip('s')}; {filtered}; target 3 times"
+            ratio = us["imm"] / us[filtered]
+            rows.append((what, f"{us['imm']:.3g} us", f"{us[filtered]:.3g} us", f"{ratio:.2f} times"))
+    return rows
+
+
+def _repeated(calls: list[Call]) -> Any:
+    return np.concatenate([call() for call in calls])
 
 
 def uses() -> list[Row]:

@@ -21,11 +21,13 @@ from replay.engine.tangent import rotation_vector
 from replay.inference import estimators
 from replay.inference.imm import Memory, changing, mixing
 from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switching
+from replay.inference.registered import METHODS
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_recursion import assert_equal, in_blocks
 from tests.replay.inference.vehicle_a import VEHICLE_A
+from tests.replay.inference.vehicle_a import move as move_vehicle
 from tests.replay.inference.vehicle_a import noise as vehicle_noise
 
 EXACT = 1e-9
@@ -51,14 +53,6 @@ class SwitchingParameters(vehicle_a.VehicleParameters):
     steady_at_start: float = 0.9
 
 
-def noise_times(factor: float) -> Any:
-    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
-        *others, turn = vehicle_noise(state, duration_s, parameters)
-        return (*others, turn * factor)
-
-    return noise
-
-
 def steady_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     a, b, c, d, turn = vehicle_noise(state, duration_s, parameters)
     return a, b, c, d, 0.02 * turn
@@ -78,8 +72,8 @@ def initial(parameters: Any) -> Any:
 
 
 MODES = {
-    "steady": Motion(vehicle_a.move, steady_noise),
-    "agile": Motion(vehicle_a.move, agile_noise),
+    "steady": Motion(move_vehicle, steady_noise),
+    "agile": Motion(move_vehicle, agile_noise),
 }
 SWITCHING_A = replace(
     VEHICLE_A, parameters=SwitchingParameters, modes=MODES, switching=Switching(rates, initial)
@@ -372,7 +366,7 @@ def test_a_mixture_of_rotations_has_the_moments_of_its_samples() -> None:
     gather, mix = mixing(kinds, 2)
     memory = memory_of(5, 4, 2)
     found, spread = np.empty(5), np.empty((4, 4))
-    gather(mean, covariance, np.log(weights), memory)
+    gather(mean, covariance, weights, memory)
     mix(weights, memory, found, spread)
     assert_allclose(spread, spread.T, rtol=1e-14)
 
@@ -486,8 +480,6 @@ def test_what_is_no_imm_is_one_sentence(name: str) -> None:
 
 
 def test_a_model_says_what_it_lacks_for_it() -> None:
-    from replay.inference.registered import METHODS
-
     lacks = METHODS["imm"].lacks
     assert lacks(SWITCHING_A) == ""
     assert lacks(VEHICLE_A) == "several modes"

@@ -137,6 +137,19 @@ def test_plots_hold_the_errors_of_the_run_with_their_bands_and_bounds(
     assert np.array_equal(nis, innovations["normalised_innovation_squared"])
 
 
+def test_mode_probabilities_are_plots(tmp_path: Path) -> None:
+    """A curve for every mode, by the filter and given all data; drawn by the timeline of any log."""
+    source = memory_source(*record_run("manoeuvres", {"duration_s": 20.0}, 3, 0))
+    outputs = collect(replayed([source], bind("imm", [source], {"smoothed_modes": True})))
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    found = read(tmp_path / "run.rrd")
+    for topic in ("modes", "smoothed_modes"):
+        probability = outputs[f"/estimates/imm/vehicle1/{topic}"]["probability"]
+        for column, mode in enumerate(("drive", "manoeuvre", "stand")):
+            curve = found[f"/plots/vehicle1/{topic}/imm/{mode}"]
+            assert np.array_equal(np.ravel(curve["Scalars:scalars"]), probability[:, column])
+
+
 def test_the_map_holds_poses_paths_and_ellipses_in_true_coordinates(
     rrd: Path, ensemble: Replayed
 ) -> None:

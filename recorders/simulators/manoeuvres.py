@@ -1,0 +1,131 @@
+"""A vehicle that drives straight on, turns, brakes, stands and starts again, and tells where it is.
+
+It drives at one speed between manoeuvres; a turn is an arc at that speed, and stops are on the straight.
+How long it drives and stands is drawn anew each time.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from recorders.log import make_stream, schemas
+from recorders.models.planar import drive
+from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.parameters import Parameters
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
+
+Floats = NDArray[np.float64]
+
+
+class ManoeuvresParameters(Parameters):
+    """The scenario.
+
+    Straights and stands have lengths of an exponential distribution with these means; a turn is by a
+    sixth to five twelfths of a circle, either way. `acceleration_sigma_mps2` is what the prior's channel
+    states of driving straight on; the truth has none of it.
+    """
+
+    duration_s: PositiveFloat = 120.0
+    speed_mps: PositiveFloat = 10.0
+    straight_s: PositiveFloat = 8.0
+    turn_radps: PositiveFloat = 0.3
+    brake_mps2: PositiveFloat = 2.5
+    start_mps2: PositiveFloat = 2.0
+    standing_s: PositiveFloat = 8.0
+    acceleration_sigma_mps2: NonNegativeFloat = 0.2
+    fix_rate_hz: PositiveFloat = 2.0
+    fix_sigma_m: PositiveFloat = 1.0
+    prior_sigma_m: PositiveFloat = 2.0
+    prior_sigma_mps: PositiveFloat = 1.0
+
+
+class Part(NamedTuple):
+    """A part of a drive: how long, and its turn rate and acceleration along the track."""
+
+    duration_s: float
+    turn_radps: float
+    acceleration_mps2: float
+
+
+def simulate(parameters: ManoeuvresParameters, rng: np.random.Generator) -> Recording:
+    """Record one run."""
+    drive_rng, fix_rng, prior_rng = rng.spawn(3)
+    count = int(parameters.duration_s * parameters.fix_rate_hz + 1e-9)
+    times_s = np.arange(count + 1) / parameters.fix_rate_hz
+    states = _states(parameters, times_s, drive_rng)
+    stamps_ns = simulation_stamps_ns(times_s)
+    sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_mps] * 2)
+    fixes = states[1:, 0::2] + parameters.fix_sigma_m * fix_rng.normal(size=(count, 2))
+    covariance = parameters.fix_sigma_m**2 * np.eye(2).reshape(1, 4)
+    motion = {
+        "turn_rate_radps": "0.0",
+        "acceleration_sigma_mps2": repr(parameters.acceleration_sigma_mps2),
+    }
+    metadata = state_metadata(PLANE_MOTION)
+    return Recording(
+        [
+            make_stream(
+                "/vehicle1/prior",
+                schemas.GAUSSIAN_ESTIMATE,
+                stamps_ns[:1],
+                metadata=metadata | motion,
+                mean=states[:1] + sigma * prior_rng.normal(size=4),
+                covariance=np.diag(sigma**2).reshape(1, 16),
+            ),
+            make_stream(
+                "/vehicle1/truth", schemas.TRUTH_STATE, stamps_ns, metadata=metadata, state=states
+            ),
+            make_stream(
+                "/vehicle1/fix",
+                schemas.POSITION_FIX,
+                stamps_ns[1:],
+                position_m=fixes,
+                covariance_m2=np.repeat(covariance, count, axis=0),
+            ),
+        ]
+    )
+
+
+def _states(parameters: ManoeuvresParameters, times_s: Floats, rng: np.random.Generator) -> Floats:
+    """The true states (n, 4), x, vx, y, vy, at times within the drive."""
+    states, begin_s = np.empty((len(times_s), 4)), 0.0
+    pose, speed = (0.0, 0.0, rng.uniform(-np.pi, np.pi)), parameters.speed_mps
+
+    def after(part: Part, span_s: Floats) -> tuple[Floats, ...]:
+        """Poses and speeds so long after a part's beginning."""
+        mean_mps = speed + 0.5 * part.acceleration_mps2 * span_s
+        moved = drive(pose, (mean_mps, part.turn_radps), span_s)
+        return *moved, speed + part.acceleration_mps2 * span_s
+
+    while begin_s <= times_s[-1]:
+        for part in _parts(parameters, rng):
+            span_s = times_s - begin_s
+            own = (span_s >= 0.0) & (span_s < part.duration_s)
+            x, y, heading, along = after(part, span_s[own])
+            states[own] = np.stack([x, along * np.cos(heading), y, along * np.sin(heading)], axis=1)
+            *place, end_mps = (float(each) for each in after(part, np.array(part.duration_s)))
+            pose, speed = (place[0], place[1], place[2]), max(end_mps, 0.0)
+            begin_s += part.duration_s
+    return states
+
+
+def _parts(parameters: ManoeuvresParameters, rng: np.random.Generator) -> list[Part]:
+    """A straight and what follows it: a turn, or a stop and a start."""
+    straight = Part(rng.exponential(parameters.straight_s), 0.0, 0.0)
+    if rng.uniform() < 0.5:
+        way, angle = rng.choice([-1.0, 1.0]), rng.uniform(np.pi / 3, 5 * np.pi / 6)
+        return [straight, Part(angle / parameters.turn_radps, way * parameters.turn_radps, 0.0)]
+    brake_mps2, start_mps2 = parameters.brake_mps2, parameters.start_mps2
+    return [
+        straight,
+        Part(parameters.speed_mps / brake_mps2, 0.0, -brake_mps2),
+        Part(rng.exponential(parameters.standing_s), 0.0, 0.0),
+        Part(parameters.speed_mps / start_mps2, 0.0, start_mps2),
+    ]
+
+
+MANOEUVRES = Simulator(
+    "a vehicle drives straight on, turns, stops and starts; its fixes", ManoeuvresParameters, simulate
+)
