@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from replay.inference.bound import POSTERIOR_BOUND
 from replay.inference.estimators import of_any_model
 from replay.inference.methods import FILTERS, Method
 from replay.inference.particles import BOOTSTRAP
@@ -11,6 +12,7 @@ METHODS: Mapping[str, Method] = {
     **FILTERS,
     "smoother": SMOOTHING,
     "particles": BOOTSTRAP,
+    "bound": POSTERIOR_BOUND,
 }
 
 EKF = of_any_model(METHODS["ekf"])
@@ -20,3 +22,4 @@ LRKF = of_any_model(METHODS["lrkf"])
 ANALYTIC = of_any_model(METHODS["analytic"])
 SMOOTHER = of_any_model(METHODS["smoother"])
 PARTICLES = of_any_model(METHODS["particles"])
+BOUND = of_any_model(METHODS["bound"])
