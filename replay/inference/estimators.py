@@ -407,7 +407,7 @@ class Filter:
         truth = self.stage.model.truth
         return truth if truth.startswith("/") else f"{self.found.prefix}/{truth}"
 
-    def told(self, estimates: Any, offsets: Integers) -> list[Ragged]:
+    def told(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
         """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 
