@@ -21,9 +21,8 @@ from replay.engine.components import match_components, match_tangent, stated_com
 from replay.engine.estimator import Bound
 from replay.engine.late import Late, parse_late
 from replay.engine.sources import LogSource, MemorySource, Source
-from replay.engine.tangent import tangent_components
+from replay.engine.tangent import tangent_components, truth_at
 from replay.judging.evaluation import split_topic
-from replay.judging.truths import truth_at
 
 Floats = NDArray[np.float64]
 # A run's prior at a time in ns, from an estimator's label and the log's own prior.

@@ -61,6 +61,7 @@ def _best(tables: list[MetricTable]) -> str:
         estimator: math.sqrt(sum(error**2 for error in of) / len(of))
         for estimator in (tables[0].estimators if tables else [])
         if (of := _values(tables, estimator, quantity)) is not None
+        and _values(tables, estimator, "over_ensemble") is None  # a bound, which estimates nothing
     }
     if not errors:
         return "No errors against a truth, and no claims."

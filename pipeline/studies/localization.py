@@ -66,8 +66,10 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     for errors, of_all in judged:
         steps = of_all.iloc[thinned(len(of_all))]
         label, time_s, quantity = errors.estimator, steps["elapsed_s"], errors.main.rmse
-        rmse.bands.append(band(label, time_s, steps[f"{quantity}_low"], steps[f"{quantity}_high"]))
         rmse.series.append(curve(label, time_s, steps[quantity]))
+        if errors.is_bound:
+            continue
+        rmse.bands.append(band(label, time_s, steps[f"{quantity}_low"], steps[f"{quantity}_high"]))
         nees.series.append(curve(label, time_s, steps["nees"]))
         consistent = f"95 % if consistent ({len(errors.components)} components)"
         if consistent not in {each.label for each in nees.bands}:

@@ -346,6 +346,13 @@ MODE_PROBABILITIES = _declare(
     "How probable each mode of motion is; the channel's metadata names the modes as components.",
     _vector("probability"),
 )
+BOUND_STEP = _declare(
+    "BoundStep",
+    "How the true state came from that of the message before, and what was measured of it; row-major.",
+    _vector("transition"),
+    _vector("noise"),
+    _vector("information", may_be_nan=True),
+)
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
     "Mean and covariance of one of several states, known by its number.",

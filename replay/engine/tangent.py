@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.log import Stream
 from recorders.models.orientation import compose, conjugate
 from recorders.models.planar import wrap_angle
 
@@ -83,6 +84,27 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
             if kind in ("axis", "quaternion")
             else here + weight[:, None] * difference(there, here, [kind])
         )
+    return value
+
+
+def truth_at(
+    truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
+) -> Floats:
+    """The truth's state (n, d) at any stamps, the shortest way between; NaN over gaps above the limit.
+
+    A stamp that the truth has exactly needs no neighbour.
+    """
+    times = truth.publish_time_ns
+    state = truth["state"]
+    if len(times) == 0:
+        return np.full((len(time_ns), len(kinds)), np.nan)
+    right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
+    left = np.where(times[right] > time_ns, right - 1, right).clip(0)
+    span = times[right] - times[left]
+    weight = (time_ns - times[left]) / np.maximum(span, 1)
+    value = between(state[left], state[right], weight, kinds)
+    inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
+    value[~inside] = np.nan
     return value
 
 

@@ -142,6 +142,12 @@ def reading_settings(names: tuple[str, ...]) -> Function:
     return function_of(text, Settings=settings_type(names))
 
 
+def trial_parameters(model: Model) -> Any:
+    """Parameters to try functions with: every number is one."""
+    names = number_fields(model.parameters)
+    return settings_type(names)(*(1.0,) * len(names))
+
+
 class _Recorder:
     """Parameters that remember which of them were read; what is unset reads as one."""
 

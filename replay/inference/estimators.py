@@ -183,10 +183,9 @@ def bind_model(
         samplers = _samplers_of(stage, method, parameters)
         made_of = (name, found, stage, method, parameters, numbers, samplers)
         filtering = (method.filtering or Filter)(*made_of)
-        maps = {sensor.about.topic: sensor.about for sensor in stage.sensors if sensor.about}
         control = [found.control.name] if found.control else []
         streams = (*control, *(topic.name for _, topic in found.sensors))
-        whole = (found.prior.name, *maps)
+        whole = filtering.whole(topics)
         priors = {found.prior.name: model.state}
         start, run, finish = filtering.start, filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
@@ -285,6 +284,11 @@ class Filter:
     parameters: Any
     settings: Floats
     samplers: tuple[Sampler, ...]
+
+    def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
+        """The topics of a log that it starts from: the prior and the maps."""
+        maps = (sensor.about.topic for sensor in self.stage.sensors if sensor.about)
+        return tuple(dict.fromkeys((self.found.prior.name, *maps)))
 
     def start(self, whole: Mapping[str, Ragged]) -> State:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
@@ -388,7 +392,7 @@ class Filter:
         generators = state.generators
         if any(each.redrawn for each in self.samplers):
             generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
-        for part, sets in _sets(self.samplers, generators, happenings.offsets):
+        for part, sets in self.sets(generators, happenings):
             loop(
                 part.stop - part.start,
                 happenings._replace(offsets=happenings.offsets[part.start : part.stop + 1]),
@@ -405,6 +409,12 @@ class Filter:
             made.append(failures_of(f"/estimates/{self.name}", *failures))
         after = state._replace(carried=carried, generators=generators)
         return after, filled(estimates, due), made
+
+    def sets(
+        self, generators: tuple[Any, ...], happenings: Happenings
+    ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
+        """Runs, and what the steps get for them: the samples of all functions."""
+        return _sets(self.samplers, generators, happenings.offsets)
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
         """Estimates and innovations to be filled in, see `recursion.no_results`."""
@@ -423,7 +433,7 @@ class Filter:
         truth = self.stage.model.truth
         return truth if truth.startswith("/") else f"{self.found.prefix}/{truth}"
 
-    def told(self, estimates: Any, offsets: Integers) -> list[Ragged]:
+    def told(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
         """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 

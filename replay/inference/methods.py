@@ -17,7 +17,7 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
-from replay.inference.binding import number_fields, settings_type
+from replay.inference.binding import trial_parameters
 from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
 from replay.inference.generate import is_flat, resetting, retraction, tuple_of
 from replay.inference.model import Model, trial_state
@@ -283,8 +283,7 @@ def _lacks_slopes(model: Model) -> str:
 
     As those of a point and its square do: the innovation covariance is then singular.
     """
-    names = number_fields(model.parameters)
-    parameters = settings_type(names)(*(1.0,) * len(names))
+    parameters = trial_parameters(model)
     for sensor in model.sensors:
         if sensor.noises and sensor.jacobian is None:
             m, about = len(sensor.measured), (0.7,) * (sensor.about.size if sensor.about else 0)

@@ -20,7 +20,7 @@ from replay.engine.blocks import Ragged
 from replay.engine.compile import compiled
 from replay.engine.philox import WORDS, Words, fill_normals, philox, run_key, unit
 from replay.engine.results import ALL_WELL, named
-from replay.inference.binding import number_fields, settings_type
+from replay.inference.binding import trial_parameters
 from replay.inference.estimators import Filter, State
 from replay.inference.gaussian import (
     LOG_TWO_PI,
@@ -677,6 +677,8 @@ class ParticleFilter(Filter):
 
     def begun(self, state: State, seeds: Mapping[int, list[Any]]) -> State:
         """The state with particles drawn from the priors of some runs, each seeded by its data."""
+        if not seeds:
+            return state
         carried = state.carried
         cloud = carried.belief._replace(
             states=carried.belief.states.copy(),
@@ -698,9 +700,8 @@ class ParticleFilter(Filter):
         weight = np.empty((rows, particles))
         return Clouds(end, times, mean, covariance, states, weight), innovations
 
-    def told(self, estimates: Clouds, offsets: Integers) -> list[Ragged]:
+    def told(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
         """The stream of estimates, and where they are wanted the particles."""
-        clouds = estimates
         model, (rows, particles) = self.stage.model, clouds.weight.shape
         made = [self.states(Estimates(*clouds[:4]), offsets)]
         if self.parameters.cloud:
@@ -759,8 +760,7 @@ def _no_steps(stage: Stage) -> Steps:
 
 def _lacks_likelihood(model: Model) -> str:
     """A sensor whose noise enters other than linearly, and which states no likelihood."""
-    names = number_fields(model.parameters)
-    parameters = settings_type(names)(*(1.0,) * len(names))
+    parameters = trial_parameters(model)
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
             continue

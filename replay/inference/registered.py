@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from replay.inference.bound import POSTERIOR_BOUND
 from replay.inference.estimators import of_any_model
 from replay.inference.imm import INTERACTING
 from replay.inference.methods import FILTERS, Method
@@ -13,6 +14,7 @@ METHODS: Mapping[str, Method] = {
     "smoother": SMOOTHING,
     "imm": INTERACTING,
     "particles": BOOTSTRAP,
+    "bound": POSTERIOR_BOUND,
 }
 
 EKF = of_any_model(METHODS["ekf"])
@@ -23,3 +25,4 @@ ANALYTIC = of_any_model(METHODS["analytic"])
 SMOOTHER = of_any_model(METHODS["smoother"])
 IMM = of_any_model(METHODS["imm"])
 PARTICLES = of_any_model(METHODS["particles"])
+BOUND = of_any_model(METHODS["bound"])

@@ -42,8 +42,9 @@ FAILURES = (
     "the covariance is no longer positive definite",
     "the estimate is no longer finite",
     "no particle explains what was measured",
+    "the truth is not known here",
 )
-NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED = 0, 1, 2  # indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH = 0, 1, 2, 3  # indices of FAILURES
 NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 

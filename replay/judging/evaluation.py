@@ -20,11 +20,19 @@ from replay.engine.blocks import Ragged
 from replay.engine.components import Components, match_components, match_tangent, stated_components
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import Source
-from replay.engine.tangent import WIDTHS, are_kinds, difference, tangent_components, things
-from replay.judging.truths import Truths, truth_at
+from replay.engine.tangent import (
+    WIDTHS,
+    are_kinds,
+    difference,
+    tangent_components,
+    things,
+    truth_at,
+)
+from replay.judging.truths import Truths
 
 Floats = NDArray[np.float64]
 POSITION = ("x_m", "y_m", "z_m")
+BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator gets below
 
 
 class Quantity(NamedTuple):
@@ -52,6 +60,8 @@ class Errors:
             definite.
         without_truth: how many estimates had no truth within the gap limit.
         unjudged: the estimate's components that the truth lacks, of which nothing is known here.
+        is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
+            are then what the squares of errors are at least.
     """
 
     estimator: str
@@ -67,6 +77,12 @@ class Errors:
     nees: Floats
     without_truth: int
     unjudged: tuple[str, ...] = ()
+    is_bound: bool = False
+
+    @property
+    def squared(self) -> Floats:
+        """(n, d) the squares of the errors, of a bound what they are at least."""
+        return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
     @property
     def position(self) -> list[int]:
@@ -207,6 +223,8 @@ def errors_of(
     epochs = np.array([source.epoch_ns for source in sources])
     rows = match_tangent(stream.metadata, judged, where)
     covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
+    is_bound = BOUND in stream.metadata
+    nees = normalized_error_squared(error[known], covariance)
     return Errors(
         *split_topic(stream.topic),
         tuple(name for name, _ in tangent),
@@ -217,9 +235,10 @@ def errors_of(
         (stream.publish_time_ns - epochs[run])[known] * 1e-9,
         error[known],
         covariance,
-        normalized_error_squared(error[known], covariance),
+        np.full(len(nees), np.nan) if is_bound else nees,
         int((~known).sum()),
         lacking,
+        is_bound,
     )
 
 

@@ -17,6 +17,7 @@ from recorders.log import schemas
 from replay.engine.blocks import Ragged
 from replay.engine.failures import sentences_of
 from replay.engine.sources import Source
+from replay.judging.bounds import Bounds
 from replay.judging.evaluation import (
     Errors,
     Floats,
@@ -46,6 +47,7 @@ from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
+BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
 COVERAGE = schemas.COVERAGE.full_name
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
@@ -139,6 +141,7 @@ class Judge:
         self._told: dict[str, Told] = {}
         self._unjudged: dict[str, str] = {}
         self._degrees: Counter[str] = Counter()
+        self._bounds: dict[tuple[str, str], Bounds] = {}
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
@@ -154,7 +157,10 @@ class Judge:
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
-            self._measured.add(topic, Output(*named, rows, self._sources, self._first_run))
+            output = Output(*named, rows, self._sources, self._first_run)
+            if schema == BOUND_STEP:
+                self._bounds.setdefault(split_topic(topic), Bounds()).add(output)
+            self._measured.add(topic, output)
         found = set_errors(
             outputs, self._truths, gap_limit_s=self._gap_limit_s, first_run=self._first_run
         )
@@ -218,6 +224,8 @@ class Judge:
                 self._quantities[topic].merge(quantities)
             else:
                 self._quantities[topic] = quantities
+        for what, bounds in other._bounds.items():
+            self._bounds.setdefault(what, Bounds()).merge(bounds)
         for topic, theirs in other._told.items():
             self._told.setdefault(topic, Told()).merge(theirs)
 
@@ -282,12 +290,19 @@ class Judge:
                 said.append(f"{_what(topic)}: {percent}; its figures are of that")
             for reason, count in told.skipped.items():
                 said.append(f"{_what(topic)}: {count} not used: {reason}")
+        for what, bounds in self._bounds.items():
+            if bounds.complaint:
+                name = " ".join(filter(None, what))
+                said.append(f"{name}: averaged along the true trajectories, since {bounds.complaint}")
         return said
 
     @property
     def steps(self) -> dict[str, pd.DataFrame]:
         """For every estimate stream with truth, by topic, a row per step: see `step_table`."""
-        return {topic: step_table(each) for topic, each in self._quantities.items()}
+        return {
+            topic: step_table(each, self._bounds.get(split_topic(topic)))
+            for topic, each in self._quantities.items()
+        }
 
     @property
     def runs_table(self) -> pd.DataFrame:
@@ -326,7 +341,7 @@ def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
 
 def _columns_of(errors: Errors) -> Floats:
     """Rows (n, 6 + d) of what is summed; see `Quantities`."""
-    squared = errors.error**2
+    squared = errors.squared
     main = errors.main.columns
     covariance = errors.covariance[:, main][:, :, main]
     return np.column_stack(
@@ -355,13 +370,19 @@ def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
     return {**columns, "nees": mean[:, -1]}
 
 
-def step_table(quantities: Quantities) -> pd.DataFrame:
+def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
     """One row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
-    Where there are more than `STEPS` steps, a row is of several; `step` is the first of them.
+    Where there are more than `STEPS` steps, a row is of several; `step` is the first of them. Of a bound
+    there is what it is over the ensemble, if there is that.
     """
     errors, by_step = quantities.errors, quantities.by_step
     cells, count, sums = by_step.filled()
+    covariances = bounds.covariances() if bounds else None
+    if covariances is not None and by_step.width == 1 and len(cells) == len(covariances):
+        squared = np.diagonal(covariances, axis1=1, axis2=2)
+        groups = (squared[:, errors.position].sum(axis=1), squared[:, errors.rotation].sum(axis=1))
+        sums[:, 1:-3] = count[:, None] * np.column_stack([*groups, squared])
     runs = np.ceil(count / by_step.width)
     low, high = step_bounds(runs, len(errors.components))
     rmse, _, scale = errors.main

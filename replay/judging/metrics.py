@@ -16,7 +16,7 @@ from recorders.registry import available, foreign_code, load
 from replay.engine.blocks import Ragged
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, Floats, Innovations, chi_square_interval
+from replay.judging.evaluation import POSITION, Errors, Floats, Innovations, chi_square_interval
 from replay.judging.sums import BinnedSums
 
 
@@ -184,15 +184,24 @@ def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> d
 def squares(errors: Errors) -> Sums:
     """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
-    squared = np.sum(errors.error**2, axis=0)
-    if errors.position:
-        found["position_rmse_m"] = float(squared[errors.position].sum())
-    if errors.rotation:
-        found["orientation_rmse_deg"] = np.degrees(np.degrees(squared[errors.rotation].sum()))
-    for column, name in enumerate(errors.components):
-        if column not in errors.position:
-            found[_rmse_of(name)] = float(squared[column])
+    found |= squares_by_name(errors.squared, errors.components, errors.kinds)
     return found | {_rmse_of(name): np.nan for name in errors.unjudged}
+
+
+def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
+    """Sums of squares (n, d) by the name of their RMSE, see `squares`."""
+    found: Sums = {}
+    totals = np.sum(squared, axis=0)
+    position = [index for index, name in enumerate(components) if name in POSITION]
+    rotation = [index for index, kind in enumerate(kinds) if kind == "rotation"]
+    if position:
+        found["position_rmse_m"] = float(totals[position].sum())
+    if rotation:
+        found["orientation_rmse_deg"] = np.degrees(np.degrees(totals[rotation].sum()))
+    for column, name in enumerate(components):
+        if column not in position:
+            found[_rmse_of(name)] = float(totals[column])
+    return found
 
 
 def accuracy(sums: Sums) -> dict[str, float]:
@@ -243,6 +252,8 @@ def _no_nees() -> Consistent:
 
 
 def _add_nees(state: Consistent, errors: Errors) -> Consistent:
+    if errors.is_bound:
+        return state
     finite = np.isfinite(errors.nees)
     state.count += int(finite.sum())
     state.total += float(errors.nees[finite].sum())

@@ -1,6 +1,6 @@
 """The truth at the stamps of estimates, read along with them: memory holds what they are at."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from recorders.log import Stream, schemas
 from recorders.log.streams import concatenate
 from replay.engine.sources import Source
-from replay.engine.tangent import between
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 BLOCK_MESSAGES = 1 << 16
@@ -78,22 +76,3 @@ class Truths:
             return held
         self._forgotten.add(topic)
         return held.take(slice(first, None))
-
-
-def truth_at(truth: Stream, time_ns: Integers, kinds: Sequence[str], gap_limit_s: float) -> Floats:
-    """The truth's state (n, d) at any stamps, the shortest way between; NaN over gaps above the limit.
-
-    A stamp that the truth has exactly needs no neighbour.
-    """
-    times = truth.publish_time_ns
-    state = truth["state"]
-    if len(times) == 0:
-        return np.full((len(time_ns), len(kinds)), np.nan)
-    right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)
-    left = np.where(times[right] > time_ns, right - 1, right).clip(0)
-    span = times[right] - times[left]
-    weight = (time_ns - times[left]) / np.maximum(span, 1)
-    value = between(state[left], state[right], weight, kinds)
-    inside = (times[left] <= time_ns) & (time_ns <= times[right]) & (span <= gap_limit_s * 1e9)
-    value[~inside] = np.nan
-    return value

@@ -107,6 +107,7 @@ def draw_nees(
     found = [
         Squares(len(errors.components), errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
+        if not errors.is_bound
     ]
     return _draw_squares(canvas, scene, case, "NEES", found, LINE, legend=legend)
 

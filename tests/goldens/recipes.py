@@ -90,7 +90,9 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
     "landmarks-particles": Recipe(
-        "landmarks", parameters={"duration_s": 10.0}, estimators={"particles:200": {}}
+        "landmarks",
+        parameters={"duration_s": 10.0},
+        estimators={label: {} for label in ("particles:200", "bound", "bound:smoother")},
     ),
     "landmarks-smoothed": Recipe(
         "landmarks",

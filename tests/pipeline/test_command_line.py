@@ -233,7 +233,7 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         }
         for row in fuselog("models", "--json").json
     }
-    methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "smoother", "imm", "particles")
+    methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "smoother", "imm", "particles", "bound")
     assert listed["vehicle"] == dict.fromkeys(methods, "yes")
     table = fuselog("models").out
     for name, cells in listed.items():

@@ -239,6 +239,11 @@ def test_the_verdict_names_the_best_estimator_and_whether_it_is_consistent(
     assert best == f"b has the least position_rmse_m, 0.25; {said}."
 
 
+def test_the_verdict_calls_no_bound_the_best() -> None:
+    metrics = {"a.position_rmse_m": 0.5, "bound.position_rmse_m": 0.25, "bound.over_ensemble": 1.0}
+    assert verdict(_result(metrics, []))[1] == "position_rmse_m of a is 0.5."
+
+
 def test_the_verdict_prefers_none_that_lacks_a_case_and_says_what_the_best_lacks() -> None:
     """Over two cases errors are averaged; an estimator without a number in one is not compared."""
     metrics = {

@@ -1,6 +1,6 @@
 """The reference sheet's "model A": a vehicle among three beacons, with a speedometer."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -161,10 +161,11 @@ def source(
     told: list[tuple[float, str, int, Floats]],
     mean: Floats = MEAN,
     covariance: Floats = COVARIANCE,
+    truth: list[tuple[float, Floats]] | None = None,
 ) -> MemorySource:
     """The messages as a log in memory, and the prior; equal stamps keep the order of the streams."""
 
-    def stamps(chosen: list[Any]) -> Any:
+    def stamps(chosen: Sequence[tuple[Any, ...]]) -> Any:
         return EPOCH_NS + np.rint(np.array([each[0] for each in chosen]) * 1e9).astype(np.int64)
 
     sights = [each for each in told if each[1] == "rb"]
@@ -196,5 +197,10 @@ def source(
             value=np.array([each[3] for each in speeds]).reshape(-1, 1),
         ),
     ]
+    if truth is not None:
+        states = np.array([state for _, state in truth])
+        streams.append(
+            make_stream("/truth", schemas.TRUTH_STATE, stamps(truth), metadata=metadata, state=states)
+        )
     run = RunMetadata(scenario="vehicle-a", parameters={}, seed=0, run=0, epoch_ns=EPOCH_NS)
     return memory_source(Recording(streams), run)

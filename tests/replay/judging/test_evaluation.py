@@ -26,10 +26,11 @@ from recorders.recording import Recording
 from replay.engine.blocks import Ragged, gather
 from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import MemorySource, memory_source
+from replay.engine.tangent import truth_at
 from replay.judging.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
 from replay.judging.judge import Judge, error_table
 from replay.judging.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
-from replay.judging.truths import Truths, truth_at
+from replay.judging.truths import Truths
 
 SECOND = 1_000_000_000
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}

@@ -127,3 +127,16 @@ def test_particles_are_drawn_where_they_are_with_their_weights(tmp_path):
     np.testing.assert_allclose(places, cloud["mean"][:, :2], rtol=1e-5)
     radii = np.concatenate([np.array(list(row)) for row in found["Points2D:radii"]])
     np.testing.assert_allclose(radii**2, 1.5**2 * 50 * cloud["weight"], rtol=1e-4, atol=1e-9)
+
+
+def test_the_bound_is_a_band_about_no_error_and_has_no_nees(tmp_path):
+    _, outputs, found = drawn("landmarks", {"duration_s": 2.0}, ["ekf", "bound"], tmp_path)
+    sigma = np.sqrt(outputs["/estimates/bound/robot1/pose"]["covariance"][:, 0])
+    band = found["/plots/robot1/error_x_m/bound"]
+    pairs = np.array([list(row) for row in band["Measurements:variances"]])
+    np.testing.assert_allclose(pairs[:, 1], (2 * sigma) ** 2, rtol=1e-6)
+    values = np.array([list(row) for row in band["Measurements:values"]])
+    assert np.abs(values).max() < 1e-12
+    drawn_of = {entity.rpartition("/")[2] for entity in found if "nees" in entity.lower()}
+    assert "ekf" in drawn_of
+    assert "bound" not in drawn_of
