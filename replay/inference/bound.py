@@ -123,7 +123,7 @@ def bound_steps(stage: Stage) -> Steps:
             mean[i] = memory.truth[event, i]
         return True
 
-    def estimate(run: int, along: Along, nodes: Nodes, row: int) -> None:
+    def estimate(run: int, along: Along, nodes: Nodes, row: int, _: Any) -> None:
         for i in range(n):
             nodes.mean[row, i] = along.mean[run, i]
         for i in range(t):
