@@ -336,6 +336,14 @@ SOLUTION = _declare(
     _identifier("rank"),
     _real("cost"),
 )
+ITERATION = _declare(
+    "Iteration",
+    "One step of an iterated solution: the cost before it, how it was damped, how far it went.",
+    _identifier("iteration"),
+    _real("cost"),
+    _real("damping"),
+    _real("largest_step"),
+)
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
     "Mean and covariance of one of several states, known by its number.",

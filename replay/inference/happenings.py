@@ -82,7 +82,7 @@ def happenings_of(
     )
     happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target)
     if lacking.any():  # as if these had not come
-        happenings = _of_rows(happenings, ~lacking)
+        happenings = of_rows(happenings, ~lacking)
         happenings = happenings._replace(is_due=last_of_stamps(happenings))
     if first and not (control is not None and control.estimates) and found.sensors:
         stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
@@ -195,7 +195,8 @@ def joined(first: Happenings, second: Happenings) -> Happenings:
     return Happenings(first.offsets + second.offsets, *columns)
 
 
-def _of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
+def of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
+    """The chosen ones of all events."""
     columns: Any = (column[chosen] for column in happenings[1:])
     return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
 
@@ -220,7 +221,7 @@ def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Hap
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
         ready[inside], waiting[begin : at[-1]] = True, False
     again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
-    return _of_rows(happenings._replace(data=data), ready), _of_rows(again, waiting)
+    return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
 
 
 def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from replay.inference.estimators import of_any_model
+from replay.inference.iterated import SMOOTHING
 from replay.inference.methods import FILTERS, Method
-from replay.inference.smoothers import SMOOTHING
 
 METHODS: Mapping[str, Method] = {**FILTERS, "smoother": SMOOTHING}
 

@@ -414,25 +414,37 @@ class Smoother(Filter):
 
     def smoothed(self, pieces: Sequence[Piece], stop: Integers | None = None) -> Ragged:
         """The estimates at the nodes of all pieces, or of one those before row stop[run]."""
+        return self.states(*self.gone_back(pieces, stop))
+
+    def gone_back(
+        self, pieces: Sequence[Piece], stop: Integers | None = None
+    ) -> tuple[Estimates, Integers]:
+        """The estimates of `smoothed`; run r owns offsets[r]:offsets[r + 1]."""
         model, runs = self.stage.model, len(pieces[0].offsets) - 1 if pieces else 0
         counts = [(piece.offsets[1:] if stop is None else stop) - piece.offsets[:-1] for piece in pieces]
         offsets = np.append(0, np.cumsum(sum(counts, np.zeros(runs, np.int64))))
         count, (n, t) = offsets[-1], (model.size, model.tangent)
         times, means = np.empty(count, np.int64), np.empty((count, n))
         smoothed = Estimates(offsets[:-1], times, means, np.empty((count, t, t)))
-        wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t, t), (t, t)))
-        later = Later(np.zeros(runs, bool), *wide)
+        later = no_later(runs, n, t)
         start = offsets[1:].copy()
         for piece, of_piece in zip(reversed(pieces), reversed(counts), strict=True):
             start -= of_piece
             end = piece.offsets[:-1] + of_piece
-            memory = partial(_back_memory, n, t)
+            memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
             _way_back(model.kinds)(runs, *arguments, scratch=memory)
-        return self.states(smoothed, offsets)
+        return smoothed, offsets
 
 
-def _back_memory(n: int, t: int) -> BackMemory:
+def no_later(runs: int, n: int, t: int) -> Later:
+    """Where nothing lies behind a piece, for so many runs of states with n components; see `Later`."""
+    wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t, t), (t, t)))
+    return Later(np.zeros(runs, bool), *wide)
+
+
+def back_memory(n: int, t: int) -> BackMemory:
+    """Memory for the way back of states with n components, and t in the tangent space."""
     shapes = ((n,), (t, t), (t, t), (1, t), (t,))
     return BackMemory(*(np.empty(shape) for shape in shapes))
 
