@@ -353,6 +353,14 @@ BOUND_STEP = _declare(
     _vector("noise"),
     _vector("information", may_be_nan=True),
 )
+ITERATION = _declare(
+    "Iteration",
+    "One step of an iterated solution: the cost before it, how it was damped, how far it went.",
+    _identifier("iteration"),
+    _real("cost"),
+    _real("damping"),
+    _real("largest_step"),
+)
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
     "Mean and covariance of one of several states, known by its number.",

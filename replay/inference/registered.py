@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from replay.inference.bound import POSTERIOR_BOUND
 from replay.inference.estimators import of_any_model
 from replay.inference.imm import INTERACTING
+from replay.inference.iterated import SMOOTHING
 from replay.inference.methods import FILTERS, Method
 from replay.inference.particles import BOOTSTRAP
-from replay.inference.smoothers import SMOOTHING
 
 METHODS: Mapping[str, Method] = {
     **FILTERS,

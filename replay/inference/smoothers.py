@@ -10,6 +10,11 @@ with the derivative's D for extended filters and that of the samples for the oth
 between two nodes are one such step: their G multiply. On a manifold covariances are carried from the
 tangent space of one mean to that of another by the right Jacobian.
 
+A fixed lag is a window of such steps that slides: as they compose, whatever brackets are put, a queue
+made of two stacks has the composition of all its steps at hand, at two compositions a node however many
+nodes the lag has. Where the means of a manifold have a part in the steps they do not compose, and each
+estimate comes back over the whole lag.
+
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
 
@@ -23,7 +28,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.blocks import Ragged
+from replay.engine.blocks import Ragged, copied
 from replay.engine.compile import compile_over_runs
 from replay.inference.estimators import Filter, State
 from replay.inference.gaussian import copy_gaussian, moved_covariance, semidefinite_cholesky
@@ -264,13 +269,15 @@ class Later(NamedTuple):
 
 
 class BackMemory(NamedTuple):
-    """What the way back of one core works in: a Gaussian, and what carries it."""
+    """What the way back of one core works in: a Gaussian, what carries it, and a step's matrices."""
 
     mean: Floats
     covariance: Floats
     product: Floats
     change: Floats
     step: Floats
+    rest: Floats
+    turned: Floats
 
 
 @lru_cache(maxsize=64)
@@ -348,6 +355,124 @@ def way_back(kinds: tuple[str, ...]) -> Function:
     return smooth
 
 
+# A lag behind
+
+
+class Window(NamedTuple):
+    """The steps within the lag of the first node that is not smoothed yet, as two stacks.
+
+    Of the steps to the nodes up to `turned`, each node's row holds the composition of its own and all
+    behind it, up to there; those from there up to `through` are composed here. First axis = run; nodes
+    count from the first that is kept. A step is (G, b, A): deviations from the filter's means go back by
+    d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
+    """
+
+    turned: Integers
+    through: Integers
+    gain: Floats
+    shift: Floats
+    rest: Floats
+
+
+@lru_cache(maxsize=64)
+def _sliding(kinds: tuple[str, ...]) -> Function:
+    return compile_over_runs(sliding(kinds), allocates=False)
+
+
+def sliding(kinds: tuple[str, ...]) -> Function:
+    """The loop over the nodes of one run in flat space, from its first to its last, a lag behind."""
+    add, subtract = retraction(kinds), differencing(kinds)
+
+    def take_in(
+        row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
+    ) -> None:
+        """The step to a node behind those of the window: its row gets b in place of the prediction."""
+        shift, change = nodes.predicted[row], work.change[0]
+        subtract(nodes.mean[row], shift, work.change, 0)
+        for i in range(len(shift)):
+            entry = 0.0
+            for k in range(len(shift)):
+                entry += nodes.gain[row, i, k] * change[k]
+            shift[i] = entry
+        gain, rest = window.gain[run], window.rest[run]
+        if is_first:
+            copy_gaussian(shift, nodes.gain[row], window.shift[run], gain)
+            copy_gaussian(shift, nodes.rest[row], window.shift[run], rest)
+        else:
+            extend(gain, window.shift[run], rest, nodes.gain[row], shift, nodes.rest[row], work)
+
+    def go_back(gain: Floats, shift: Floats, rest: Floats, work: BackMemory) -> None:
+        """Take deviation and covariance of `work` by a step."""
+        step, deviation = work.step, work.mean
+        for row in range(len(step)):
+            step[row] = shift[row]
+            for k in range(len(step)):
+                step[row] += gain[row, k] * deviation[k]
+        moved_covariance(work.covariance, gain, work.product)
+        for row in range(len(step)):
+            deviation[row] = step[row]
+            for column in range(len(step)):
+                work.covariance[row, column] += rest[row, column]
+
+    def slide(
+        run: int,
+        nodes: Nodes,
+        offsets: Integers,
+        stop: Integers,
+        lag_ns: int,
+        window: Window,
+        start: Integers,
+        smoothed: Estimates,
+        work: BackMemory,
+    ) -> None:
+        """Smooth the nodes before row stop[run] into the rows from start[run] on."""
+        begin, last = offsets[run], offsets[run + 1] - 1
+        turned, through = begin + window.turned[run], begin + window.through[run]
+        for row in range(begin, stop[run]):
+            if through < row:
+                turned = through = row
+            while through < last and nodes.time_ns[through + 1] - nodes.time_ns[row] <= lag_ns:
+                through += 1
+                take_in(through, through == turned + 1, nodes, window, run, work)
+            if turned <= row:
+                for k in range(through - 1, row, -1):
+                    gain, shift, rest = nodes.gain[k + 1], nodes.predicted[k + 1], nodes.rest[k + 1]
+                    extend(nodes.gain[k], nodes.predicted[k], nodes.rest[k], gain, shift, rest, work)
+                turned = through
+            work.mean[:] = 0.0
+            copy_gaussian(work.mean, nodes.covariance[through], work.mean, work.covariance)
+            if through > turned:
+                go_back(window.gain[run], window.shift[run], window.rest[run], work)
+            if turned > row:
+                go_back(nodes.gain[row + 1], nodes.predicted[row + 1], nodes.rest[row + 1], work)
+            place = start[run] + row - begin
+            smoothed.time_ns[place] = nodes.time_ns[row]
+            mean = smoothed.mean[place]
+            copy_gaussian(nodes.mean[row], work.covariance, mean, smoothed.covariance[place])
+            add(mean, work.mean)
+        window.turned[run], window.through[run] = turned - stop[run], through - stop[run]
+
+    return slide
+
+
+def extend(
+    gain: Floats,
+    shift: Floats,
+    rest: Floats,
+    next_gain: Floats,
+    next_shift: Floats,
+    next_rest: Floats,
+    work: BackMemory,
+) -> None:
+    """Make one step of a step and the next, in place of the first."""
+    for row in range(len(shift)):
+        for column in range(len(shift)):
+            shift[row] += gain[row, column] * next_shift[column]
+            work.turned[column, row] = next_gain[row, column]
+            work.rest[row, column] = next_rest[row, column]
+    lengthen(gain, rest, 1, work.rest, work.turned, work.product)
+
+
 # As an estimator
 
 
@@ -356,6 +481,13 @@ class Piece(NamedTuple):
 
     nodes: Nodes
     offsets: Integers
+
+
+class Waiting(NamedTuple):
+    """The nodes within the lag, and the steps between them."""
+
+    piece: Piece
+    window: Window
 
 
 class Smoother(Filter):
@@ -389,44 +521,90 @@ class Smoother(Filter):
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
         after, (nodes, offsets), made = self.filtered(state, happenings)
-        pieces = (*state.kept, Piece(nodes, offsets))
+        new = Piece(nodes, offsets)
         if self.lag_ns == FOREVER_NS:  # nothing yet
-            return after._replace(kept=pieces), [self.smoothed(pieces[-1:], offsets[:-1]), *made]
-        piece = _joined(pieces)
+            nothing = self.states(*self.gone_back([new], offsets[:-1]))
+            return after._replace(kept=(*state.kept, new)), [nothing, *made]
+        piece, window = new, self._no_window(len(offsets) - 1)
+        if state.kept:
+            piece, window = _joined([state.kept.piece, new]), copied(state.kept.window)
         begin, end = piece.offsets[:-1], piece.offsets[1:]
         run = np.repeat(np.arange(len(begin)), end - begin)
         newest_ns = np.append(piece.nodes.time_ns, 0)[end - 1]
         is_ready = newest_ns[run] - piece.nodes.time_ns > self.lag_ns
         stop = begin + np.bincount(run, is_ready, len(begin)).astype(np.int64)
-        return after._replace(kept=(_rows_from(piece, stop),)), [self.smoothed([piece], stop), *made]
+        smoothed = self.states(*self.lagging(piece, window, stop))
+        return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
     def finish(self, state: State) -> list[Ragged]:
         """What waited for later messages, and what those say of all before them."""
         state, made = self.ended(state)
-        return [*made, self.smoothed(state.kept)]
+        if self.lag_ns == FOREVER_NS:
+            return [*made, self.states(*self.gone_back(state.kept))]
+        if not state.kept:
+            return made
+        piece, window = copied(state.kept)
+        return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
-    def smoothed(self, pieces: Sequence[Piece], stop: Integers | None = None) -> Ragged:
-        """The estimates at the nodes of all pieces, or of one those before row stop[run]."""
+    def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[Estimates, Integers]:
+        """The estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
+
+        Changes the nodes, and the window, which then begins at row stop[run].
+        """
+        model = self.stage.model
+        if not is_flat(model.kinds):
+            return self.gone_back([piece], stop)
+        offsets = np.append(0, np.cumsum(stop - piece.offsets[:-1]))
+        smoothed = _no_estimates(offsets, model.size, model.tangent)
+        memory = partial(back_memory, model.size, model.tangent)
+        arguments = (piece.nodes, piece.offsets, stop, self.lag_ns, window, offsets, smoothed)
+        _sliding(model.kinds)(len(stop), *arguments, scratch=memory)
+        return smoothed, offsets
+
+    def _no_window(self, runs: int) -> Window:
+        t = self.stage.model.tangent
+        gain, rest = (np.empty((runs, t, t)) for _ in range(2))
+        turned, through = (np.zeros(runs, np.int64) for _ in range(2))
+        return Window(turned, through, gain, np.empty((runs, t)), rest)
+
+    def gone_back(
+        self, pieces: Sequence[Piece], stop: Integers | None = None
+    ) -> tuple[Estimates, Integers]:
+        """The estimates at the nodes of all pieces, or of one those before row stop[run].
+
+        Run r owns offsets[r]:offsets[r + 1].
+        """
         model, runs = self.stage.model, len(pieces[0].offsets) - 1 if pieces else 0
         counts = [(piece.offsets[1:] if stop is None else stop) - piece.offsets[:-1] for piece in pieces]
         offsets = np.append(0, np.cumsum(sum(counts, np.zeros(runs, np.int64))))
-        count, (n, t) = offsets[-1], (model.size, model.tangent)
-        times, means = np.empty(count, np.int64), np.empty((count, n))
-        smoothed = Estimates(offsets[:-1], times, means, np.empty((count, t, t)))
-        wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t, t), (t, t)))
-        later = Later(np.zeros(runs, bool), *wide)
+        n, t = model.size, model.tangent
+        smoothed = _no_estimates(offsets, n, t)
+        later = no_later(runs, n, t)
         start = offsets[1:].copy()
         for piece, of_piece in zip(reversed(pieces), reversed(counts), strict=True):
             start -= of_piece
             end = piece.offsets[:-1] + of_piece
-            memory = partial(_back_memory, n, t)
+            memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
             _way_back(model.kinds)(runs, *arguments, scratch=memory)
-        return self.states(smoothed, offsets)
+        return smoothed, offsets
 
 
-def _back_memory(n: int, t: int) -> BackMemory:
-    shapes = ((n,), (t, t), (t, t), (1, t), (t,))
+def _no_estimates(offsets: Integers, n: int, t: int) -> Estimates:
+    count = offsets[-1]
+    times, means = np.empty(count, np.int64), np.empty((count, n))
+    return Estimates(offsets[:-1], times, means, np.empty((count, t, t)))
+
+
+def no_later(runs: int, n: int, t: int) -> Later:
+    """Where nothing lies behind a piece, for so many runs of states with n components; see `Later`."""
+    wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t, t), (t, t)))
+    return Later(np.zeros(runs, bool), *wide)
+
+
+def back_memory(n: int, t: int) -> BackMemory:
+    """Memory for the way back of states with n components, and t in the tangent space."""
+    shapes = ((n,), (t, t), (t, t), (1, t), (t,), (t, t), (t, t))
     return BackMemory(*(np.empty(shape) for shape in shapes))
 
 

@@ -379,6 +379,9 @@ def estimated_share(sums: Sums) -> float | None:
 
 
 def _solved(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name == schemas.ITERATION.full_name:
+        starts = output.rows["iteration"] == 0
+        return {"starts": int(starts.sum()), "start_cost": float(output.rows["cost"][starts].sum())}
     if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name:
         return {}
     converged = output.rows["converged"] != 0
@@ -386,16 +389,23 @@ def _solved(output: Output) -> Sums:
         "solutions": len(converged),
         "converged": int(converged.sum()),
         "iterations": set(output.rows["iterations"][converged].tolist()),
+        "cost": float(output.rows["cost"].sum()),
     }
 
 
 def solution(sums: Sums) -> dict[str, float]:
-    """How the batch solutions ended: the share that converged, and the most iterations of one."""
+    """How the batch solutions ended: the share that converged, and the most iterations of one.
+
+    Where every iteration is told, also the mean costs at the start and at the end.
+    """
     if not sums.get("solutions"):
         return {}
     values = {"converged_share": sums["converged"] / sums["solutions"]}
     if sums["iterations"]:
         values["most_iterations"] = float(max(sums["iterations"]))
+    if sums.get("starts"):
+        values["start_cost"] = sums["start_cost"] / sums["starts"]
+        values["cost"] = sums["cost"] / sums["solutions"]
     return values
 
 

@@ -98,7 +98,8 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         "landmarks",
         parameters=SHORT,
         estimators={
-            label: {"gate_probability": 0.999} for label in ("smoother:ekf", "smoother:ukf:lag=500ms")
+            label: {"gate_probability": 0.999}
+            for label in ("smoother:ekf", "smoother:ukf:lag=500ms", "smoother:iterated")
         },
     ),
     "lcd-sampling": Recipe(

@@ -17,6 +17,7 @@ from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording, import_run
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference import smoothers
 from replay.inference.generate import resetting
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 from replay.inference.smoothers import solve_semidefinite
@@ -133,7 +134,25 @@ def test_a_fixed_lag_is_the_smoothed_log_that_ends_there(uncompiled: None) -> No
         cut = [each for each in told if each[0] <= until_s + 1e-9]
         whole = outputs(VEHICLE_A, "smoother", [vehicle_a.source(cut)])["state"]
         for name in ("mean", "covariance"):
-            assert_array_equal(found[name][row], whole[name][row])
+            assert_allclose(found[name][row], whole[name][row], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("lag", ["60ms", "400ms", "2s", "100s"])
+def test_the_window_of_steps_gives_what_the_direct_way_gives(
+    lag: str, uncompiled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lags of no node, of some and of all, across a gap; to the last bit whatever the blocks."""
+    told = [each for each in vehicle_a.simulate(8)[0][:90] if not 2.5 < each[0] < 3.8]
+    source, forward = vehicle_a.source(told), f"ekf:lag={lag}"
+    slid = outputs(VEHICLE_A, "smoother", [source], forward=forward)["state"]
+    for found in in_blocks(
+        source, tmp_path, lambda log, size: outputs(VEHICLE_A, "smoother", [log], size, forward=forward)
+    ):
+        assert_equal(found["state"].of_run(0), slid.of_run(0))
+    monkeypatch.setattr(smoothers, "is_flat", lambda _: False)
+    direct = outputs(VEHICLE_A, "smoother", [source], forward=forward)["state"]
+    for name in ("mean", "covariance"):
+        assert_allclose(slid[name], direct[name], rtol=1e-10, atol=1e-12)
 
 
 # Linear models: the dense solution
