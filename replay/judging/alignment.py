@@ -5,7 +5,8 @@ Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the
 Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry", IROS 2018.
 """
 
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Clock, Stream
 from recorders.models.orientation import compose
 from recorders.models.planar import wrap_angle
 from recorders.trajectories import Trajectory
 from replay.engine.components import stated_components
+from replay.engine.sources import LogSource
 from replay.engine.tangent import tangent_components, things
 
 Floats = NDArray[np.float64]
@@ -28,8 +30,8 @@ VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "
 HEADING = "heading_rad"
 # Of the two largest extents of a path, squared: rounding alone makes straight lines as wide as this.
 LEAST_WIDTH = 1e-10
-# Sines of angles below this are rounding.
-LEAST_TILT = 1e-9
+# The cosine of an angle that is none but for rounding: 1e-6 rad.
+LEAST_COSINE = 1 - 1e-12
 
 
 class Alignment(NamedTuple):
@@ -73,7 +75,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
         )
         raise BadInput(
             f"{where}: {len(estimate_m)} poses do not tell the {align} alignment; it needs {needed}, or "
-            "give another --align"
+            "give another alignment"
         )
     scale = 1.0
     if align == "sim3":  # (42): trace(D S) is the sum of the truth along the turned estimate
@@ -108,23 +110,27 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
     tangent = [name for name, _ in tangent_components(names, kinds)]
     mean = estimates["mean"].copy()
     jacobian = np.eye(len(tangent))
+    is_flat = False
     for vector in VECTORS:
         there = [axis for axis, name in enumerate(vector) if name in components]
         if not there:
             continue
-        lacking = [axis for axis in range(3) if axis not in there]
-        _require_plane(estimates, alignment.rotation[np.ix_(there, lacking)])
         turn = alignment.scale * alignment.rotation[np.ix_(there, there)]
+        is_flat |= len(there) < 3
         columns = [names.index(vector[axis]) for axis in there]
         rows = [tangent.index(vector[axis]) for axis in there]
         shift = alignment.translation_m[there] if vector == VECTORS[0] else 0.0
         mean[:, columns] = mean[:, columns] @ turn.T + shift
         jacobian[np.ix_(rows, rows)] = turn
     if components.get(HEADING) == "angle":
-        _require_plane(estimates, alignment.rotation[:2, 2:])
+        is_flat = True
         yaw_rad = np.arctan2(alignment.rotation[1, 0], alignment.rotation[0, 0])
         column = names.index(HEADING)
         mean[:, column] = wrap_angle(mean[:, column] + yaw_rad)
+    if is_flat and alignment.rotation[2, 2] < LEAST_COSINE:
+        raise BadInput(
+            f"topic {estimates.topic}: is planar, and the alignment turns it out of its plane; take se2"
+        )
     quaternion = Rotation.from_matrix(alignment.rotation).as_quat(scalar_first=True)
     for kind, columns_of in things(kinds):
         if kind == "quaternion":
@@ -135,9 +141,20 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
     return replace(estimates, columns={**estimates.columns, **changed})
 
 
-def _require_plane(estimates: Stream, tilt: Floats) -> None:
-    if np.any(np.abs(tilt) > LEAST_TILT):
-        raise BadInput(
-            f"topic {estimates.topic}: the alignment turns it out of its plane, for which it has no "
-            "component; give --align se2"
-        )
+@dataclass(frozen=True, repr=False)
+class AlignedEstimates(LogSource):
+    """A log whose estimates of some topics are in the truth's frame."""
+
+    alignments: Mapping[str, Alignment] = field(default_factory=dict)
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Blocks of the log, estimates aligned."""
+        for block in super().blocks(topics, order, block_messages):
+            yield {
+                topic: aligned_estimates(stream, self.alignments[topic])
+                if topic in self.alignments
+                else stream
+                for topic, stream in block.items()
+            }

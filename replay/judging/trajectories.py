@@ -6,7 +6,7 @@ IROS 2012; conventions and names are those of evo (https://github.com/MichaelGru
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, choices
 from recorders.log import Stream
 from recorders.trajectories import Trajectory
 from replay.engine.components import stated_components
@@ -58,6 +58,11 @@ class Comparison:
     time_offset_s: float | Literal["estimate"] = 0.0
 
     def __post_init__(self) -> None:
+        known = {"align": Align, "delta_unit": DeltaUnit, "association": Association}
+        for name, kind in known.items():
+            value, names = getattr(self, name), get_args(kind)
+            if value not in names:
+                raise BadInput(f"{name} is '{value}'; {choices(str(value), names)}")
         if not 0 < self.delta < np.inf:
             raise BadInput(f"delta is {self.delta:g}; give a positive number, such as 10 with unit m")
         if self.delta_unit == "frames" and self.delta != round(self.delta):
@@ -65,6 +70,9 @@ class Comparison:
         for name in ("max_difference_s", "gap_limit_s"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise BadInput(f"{name} is {getattr(self, name):g}; give seconds, such as 0.01")
+        offset_s = self.time_offset_s
+        if offset_s != "estimate" and not (isinstance(offset_s, int | float) and abs(offset_s) <= 1e9):
+            raise BadInput(f"time_offset_s is {offset_s}; give seconds, or 'estimate'")
 
 
 class Compared(NamedTuple):
@@ -294,9 +302,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
                 f"{trajectory.name}: its speed never changes, which tells no time offset; give it in s"
             )
         speeds.append(speed - speed.mean())
-    lags = correlation_lags(*map(len, reversed(speeds)))
-    lag = lags[np.argmax(correlate(speeds[1], speeds[0]))]
-    first_s = times[1][0] - times[0][0] + lag * step_s
+    first_s = times[1][0] - times[0][0] + _best_lag(*speeds) * step_s
 
     def rmse_m(offset_s: float) -> float:
         at_s = times[0] + offset_s
@@ -310,6 +316,23 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 
     around = first_s - 2 * step_s, first_s + 2 * step_s
     return float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
+
+
+def _best_lag(estimate: Floats, truth: Floats) -> int:
+    """How many places later the first signal correlates most with the other.
+
+    Pearson's correlation of what overlaps, which is half of the shorter one at least.
+    """
+    everywhere = np.ones_like(estimate), np.ones_like(truth)
+    count = np.rint(correlate(everywhere[1], everywhere[0]))
+    sums = correlate(everywhere[1], estimate), correlate(truth, everywhere[0])
+    squares = correlate(everywhere[1], estimate**2), correlate(truth**2, everywhere[0])
+    variances = [count * square - each**2 for each, square in zip(sums, squares, strict=True)]
+    least = [1e-9 * variance.max() for variance in variances]
+    product = np.maximum(variances[0], least[0]) * np.maximum(variances[1], least[1])
+    correlation = (count * correlate(truth, estimate) - sums[0] * sums[1]) / np.sqrt(product)
+    correlation[2 * count < min(len(estimate), len(truth))] = -np.inf
+    return int(correlation_lags(len(truth), len(estimate))[np.argmax(correlation)])
 
 
 def _positions_at(trajectory: Trajectory, time_s: Floats, at_s: Floats) -> Floats:
@@ -338,5 +361,5 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
     if len(turns) == 1:
         rotation = Rotation.from_quat(state[:, turns[0]], scalar_first=True).as_matrix()
     elif components.get(HEADING) == "angle":
-        rotation = Rotation.from_euler("z", state[:, names.index(HEADING)]).as_matrix()
+        rotation = Rotation.from_euler("z", state[:, [names.index(HEADING)]]).as_matrix()
     return Trajectory(stream.topic, position_m, rotation, stamps)
