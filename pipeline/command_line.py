@@ -304,6 +304,34 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV or Parquet files.")
+@click.argument("path", type=ANY_PATH)
+@click.option(
+    "--to", type=click.Choice(["tum", "kitti", "csv", "parquet"]), required=True, help="The format."
+)
+@click.option(
+    "-o",
+    "--out",
+    type=ANY_PATH,
+    help="The folder to write, or with one --topic the file [default: named after PATH].",
+)
+@click.option("--topic", "topics", multiple=True, help="A topic (repeatable) [default: all that fit].")
+@recover_option
+def export(path: Path, to: Any, **options: Any) -> None:
+    """Write streams of PATH, a log or an estimates log, for other tools.
+
+    To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
+    parquet any stream, as a table.
+    """
+    from pipeline.exporting import export as export_log
+
+    done = export_log(path, to=to, **options)
+    for note in done.notes:
+        click.echo(printable(f"fuselog: {note}"), err=True)
+    for topic, file in done.files.items():
+        click.echo(printable(f"{file}: {topic}"))
+
+
 @fuselog.command(short_help="Open a log, estimates or a result in the Rerun viewer.")
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
