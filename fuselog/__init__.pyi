@@ -21,10 +21,13 @@ from pipeline.door import write as write
 from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
+from pipeline.exporting import export as export
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome
 from pipeline.runner import Runner as Runner
+from pipeline.trajectories import Evaluation as Evaluation
+from pipeline.trajectories import evaluate as evaluate
 from recorders.errors import BadInput as BadInput
 from recorders.errors import UnknownName as UnknownName
 from recorders.log import Field as Field
@@ -41,6 +44,8 @@ from recorders.recording import Recorder as Recorder
 from recorders.recording import Recording as Recording
 from recorders.recording import Simulator as Simulator
 from recorders.recording import simulation_stamps_ns as simulation_stamps_ns
+from recorders.trajectories import Trajectory as Trajectory
+from recorders.trajectories import read_trajectory as read_trajectory
 from replay.engine.blocks import Block as Block
 from replay.engine.blocks import Ragged as Ragged
 from replay.engine.compile import compiled as compiled

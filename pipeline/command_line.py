@@ -50,10 +50,19 @@ class Seconds(click.FloatRange):
         return seconds
 
 
+class TimeOffset(Seconds):
+    """A time in seconds, or the word that asks to find it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number or the word."""
+        return value if value == "estimate" else super().convert(value, param, ctx)
+
+
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = OutputFile()
 ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
+FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
@@ -227,17 +236,112 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @fuselog.command(short_help="Judge estimates against the truth.")
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where ESTIMATES is one as a file.")
+@click.option("--format", type=FORMAT, help="Of a trajectory file [default: its content tells].")
+@click.option("--truth-format", type=FORMAT, help="Of the true one [default: its content tells].")
+@click.option(
+    "--align",
+    type=click.Choice(["none", "yaw", "se2", "se3", "sim3"]),
+    help="Bring estimates nearest to the truth first: yaw turns about the vertical and shifts, se2 too "
+    "but for the height, se3 turns and shifts, sim3 scales as well [default: none].",
+)
+@click.option("--delta", type=float, help="What way relative pose errors are over [default: 1].")
+@click.option(
+    "--delta-unit", type=click.Choice(["m", "frames", "s"]), help="Its unit [default: frames]."
+)
+@click.option(
+    "--association",
+    type=click.Choice(["nearest", "interpolated"]),
+    help="Which true pose belongs to an estimated one: the nearest in time, or one between two "
+    "[default: nearest for files, interpolated for logs].",
+)
+@click.option(
+    "--max-difference",
+    "max_difference_s",
+    type=Seconds(0),
+    help="Seconds up to which the nearest belong together [default: 0.01].",
+)
+@click.option(
+    "--time-offset",
+    "time_offset_s",
+    type=TimeOffset(),
+    metavar="SECONDS|estimate",
+    help="Add this to the stamps of the estimated trajectory, or find it [default: 0].",
+)
 @click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
 @click.option("--out", type=FOLDER, help="Write a result folder, as fuselog run does.")
 @errors_option
 @recover_option
 @gap_option
 @json_option
-def evaluate(estimates: tuple[Path, ...], logs: tuple[Path, ...], **options: Any) -> None:
-    """Judge ESTIMATES logs against the truth of the logs they were replayed from."""
-    from pipeline.commands import evaluate_logs
+def evaluate(
+    estimates: tuple[Path, ...],
+    logs: tuple[Path, ...],
+    truth: Path | None,
+    format: str | None,  # noqa: A002
+    truth_format: str | None,
+    align: str | None,
+    delta: float | None,
+    delta_unit: str | None,
+    association: str | None,
+    max_difference_s: float | None,
+    time_offset_s: float | str | None,
+    **options: Any,
+) -> None:
+    """Judge ESTIMATES logs against the truth of the logs they were replayed from.
 
-    evaluate_logs(list(estimates), list(logs), **options)
+    With --truth, ESTIMATES is a trajectory file (TUM, KITTI or EuRoC) that is judged against another:
+    absolute and relative pose errors, APE and RPE, as evo has them. With --align or --delta, so are
+    estimated positions of logs; all other metrics are then of the aligned estimates.
+    """
+    from pipeline.commands import evaluate_logs, evaluate_trajectory
+
+    given = {
+        "align": align,
+        "delta": delta,
+        "delta_unit": delta_unit,
+        "association": association,
+        "max_difference_s": max_difference_s,
+        "time_offset_s": time_offset_s,
+    }
+    comparison = {name: value for name, value in given.items() if value is not None}
+    formats = {"format": format, "truth_format": truth_format}
+    if truth is not None:
+        evaluate_trajectory(list(estimates), truth, formats, comparison, logs=logs, **options)
+        return
+    if any(formats.values()):
+        raise BadInput(
+            "--format and --truth-format: are for trajectory files; give the true one, --truth"
+        )
+    evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
+
+
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV or Parquet files.")
+@click.argument("path", type=ANY_PATH)
+@click.option(
+    "--to", type=click.Choice(["tum", "kitti", "csv", "parquet"]), required=True, help="The format."
+)
+@click.option(
+    "-o",
+    "--out",
+    type=ANY_PATH,
+    help="The folder to write, or with one --topic the file [default: named after PATH].",
+)
+@click.option("--topic", "topics", multiple=True, help="A topic (repeatable) [default: all that fit].")
+@recover_option
+def export(path: Path, to: Any, **options: Any) -> None:
+    """Write streams of PATH, a log or an estimates log, for other tools.
+
+    To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
+    parquet any stream, as a table.
+    """
+    from pipeline.exporting import export as export_log
+
+    done = export_log(path, to=to, **options)
+    for note in done.notes:
+        click.echo(printable(f"fuselog: {note}"), err=True)
+    for topic, file in done.files.items():
+        click.echo(printable(f"{file}: {topic}"))
 
 
 @fuselog.command(short_help="Open a log, estimates or a result in the Rerun viewer.")

@@ -14,17 +14,19 @@ from pipeline.experiment import experiment_of_logs, load_experiment, run_experim
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
 from pipeline.starting import check_same_run, order_of, origins_of, span_of
-from pipeline.studies.localization import summarise
+from pipeline.studies.localization import summarise, summary_table
 from pipeline.terminal import (
     print_claims,
     print_json,
     print_metrics,
     print_parameters,
+    print_pose_errors,
     print_table,
     progress,
     say,
     warn,
 )
+from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Log, open_log
@@ -34,6 +36,7 @@ from replay.engine.estimator import find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
 from replay.judging.metrics import find_metrics
+from replay.judging.trajectories import Comparison
 
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
@@ -162,6 +165,7 @@ def evaluate_logs(
     estimates: list[Path],
     logs: list[Path],
     *,
+    comparison: Mapping[str, Any],
     out: Path | None,
     metrics: Sequence[str],
     errors: bool,
@@ -169,7 +173,11 @@ def evaluate_logs(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge estimates logs; the truth is in the logs given, else in those they were replayed from."""
+    """Judge estimates logs; the truth is in the logs given, else in those they were replayed from.
+
+    Where there are entries of a `Comparison`, positions are compared as trajectories too, and estimates
+    are judged in their alignment with the truth.
+    """
     if errors and out is None:
         raise BadInput("--errors: goes into a result folder; give it with --out")
     if logs and len(logs) != len(estimates):
@@ -186,10 +194,18 @@ def evaluate_logs(
         check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
     estimators = _stated_estimators(opened[0])
+    compared = ComparedLogs([LogSource(each) for each in opened], {})
+    if comparison:
+        if "time_offset_s" in comparison:
+            raise BadInput("--time-offset: is for trajectory files; a log has one clock for all of it")
+        how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
+        compared = compare_logs([LogSource(each) for each in opened], sources, how)
+        if not compared.compared:
+            raise BadInput(f"{estimates[0]}: no estimated positions with truth, so none to align")
     with result_folder(out) if out is not None else nullcontext() as folder:
         with ErrorTables(folder) if folder and errors else nullcontext() as kept:
             judge = judge_logs(
-                [LogSource(each) for each in opened],
+                compared.estimates,
                 sources,
                 wanted,
                 gap_limit_s=gap_limit_s,
@@ -205,12 +221,58 @@ def evaluate_logs(
                 "estimators": estimators,
                 "gap_limit_s": gap_limit_s,
                 "metrics": list(metrics),
+                **comparison,
             }
             outcome = summarise(judge)
+            outcome.metrics.update(compared.metrics)
+            outcome.tables["summary"] = summary_table(outcome.metrics)
+            outcome.figures.update(compared.figures)
             outcome.input_sha256 = hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
     _state_losses([*opened, *(source.log for source in sources)])
-    _print_outcome(judge, estimators, as_json=as_json, written=[out] if out else [])
+    written = [out] if out else []
+    _print_outcome(judge, estimators, as_json=as_json, written=written, more=compared.metrics)
+
+
+def evaluate_trajectory(
+    estimates: Sequence[Path],
+    truth: Path,
+    formats: Mapping[str, Any],
+    comparison: Mapping[str, Any],
+    *,
+    logs: Sequence[Path],
+    out: Path | None,
+    metrics: Sequence[str],
+    errors: bool,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+) -> None:
+    """Judge a trajectory file against another."""
+    if len(estimates) > 1:
+        raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
+    if logs or metrics or errors or recover:
+        raise BadInput("--log, --metric, --errors and --recover: are for logs; --truth is for files")
+    if out is not None:
+        check_folder(out, {"input": [estimates[0], truth]})
+    done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
+    written = [] if out is None else [done.save(out).folder]
+    for sentence in done.notes:
+        warn(sentence)
+    if as_json:
+        print_json(
+            {
+                "metrics": done.metrics,
+                "alignment": done.alignment,
+                "time_offset_s": done.compared.time_offset_s,
+                "notes": done.notes,
+                "written": [str(path) for path in written],
+            }
+        )
+        return
+    print_pose_errors(done.metrics)
+    for path in written:
+        say(str(path))
 
 
 def _source_path(estimates: Log) -> Path:
@@ -241,8 +303,9 @@ def _print_outcome(
     as_json: bool,
     written: Sequence[Path],
     told: Mapping[str, Any] | None = None,
+    more: Mapping[str, float] | None = None,
 ) -> None:
-    values = in_order(plain(judge.metrics), estimators)
+    values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
     failures = judge.failures
     for sentence in [*judge.unjudged, *failures[:5]]:
         warn(sentence)

@@ -75,7 +75,12 @@ class Result(Parameters):
 
 
 def split_metric(key: str) -> tuple[str, str, str]:
-    """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`."""
+    """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`.
+
+    A key without a dot is a quantity of what has no estimator: a trajectory from a file.
+    """
+    if "." not in key:
+        return "", key, ""
     estimator, _, rest = key.partition(".")
     quantity, _, case = rest.partition(".")
     return estimator, quantity, case

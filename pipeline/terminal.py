@@ -5,6 +5,7 @@ Texts may come from a log or a file's name: what could steer a terminal is shown
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -103,6 +104,22 @@ def _with_bounds(measured: Measured) -> object:
         return measured.value
     low, high = map(format_value, measured.bounds)
     return f"{format_value(measured.value)} ({low} to {high})"
+
+
+def print_pose_errors(metrics: Mapping[str, float]) -> None:
+    """APE and RPE: a row each, a column per statistic; then how many poses and pairs they are of."""
+    rows: dict[str, dict[str, float]] = {}
+    counts = []
+    for key, value in metrics.items():
+        found = re.fullmatch(r"(ape|rpe)_(translation|rotation)_(\w+)_(m|deg)", key)
+        if found is None:
+            counts.append(f"{value:.0f} {key.replace('_', ' ')}")
+            continue
+        error, of, statistic, unit = found.groups()
+        rows.setdefault(f"{error.upper()} {of} ({unit})", {})[statistic] = value
+    names = next(iter(rows.values()))
+    print_table(["", *names], [[row, *values.values()] for row, values in rows.items()])
+    say(", ".join(counts))
 
 
 def print_parameters(parameters: Mapping[str, Mapping[str, object]]) -> None:

@@ -32,7 +32,20 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of MRCLAM data set 6, unpacked once."""
+    return _unpacked(real_data / "mrclam6.tar.xz", tmp_path_factory) / "mrclam6"
+
+
+@pytest.fixture(scope="session")
+def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of TUM and KITTI trajectories and of evo's results, unpacked once."""
+    archive = real_data / "trajectories.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    return _unpacked(archive, tmp_path_factory) / "trajectories"
+
+
+def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("data")
-    with tarfile.open(real_data / "mrclam6.tar.xz") as archive:
+    with tarfile.open(path) as archive:
         archive.extractall(place, filter="data")
-    return place / "mrclam6"
+    return place

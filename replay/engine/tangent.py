@@ -90,12 +90,21 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """The truth's state (n, d) at any stamps, the shortest way between; NaN over gaps above the limit.
+    """The truth's state (n, d) at any stamps; see `states_at`."""
+    return states_at(truth.publish_time_ns, truth["state"], time_ns, kinds, gap_limit_s)
 
-    A stamp that the truth has exactly needs no neighbour.
+
+def states_at(
+    times: NDArray[np.int64],
+    state: Floats,
+    time_ns: NDArray[np.int64],
+    kinds: Sequence[str],
+    gap_limit_s: float,
+) -> Floats:
+    """States (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
+
+    NaN over gaps above the limit; a stamp that there is a state of exactly needs no neighbour.
     """
-    times = truth.publish_time_ns
-    state = truth["state"]
     if len(times) == 0:
         return np.full((len(time_ns), len(kinds)), np.nan)
     right = np.searchsorted(times, time_ns, side="left").clip(0, len(times) - 1)

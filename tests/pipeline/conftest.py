@@ -95,6 +95,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         _break_results()
         _write_experiments()
         _write_mrclam()
+        Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))
     return folder
 
 

@@ -1,0 +1,181 @@
+"""Logs exported for other tools: estimates and truths as trajectories, any stream as a table.
+
+A log is read once, block by block, so that memory does not grow with it. No file is ever replaced.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+from urllib.parse import quote
+
+from pipeline.outputs import Kind, check_files, check_folder
+from recorders.atomic import whole_file, whole_folder
+from recorders.errors import BadInput, UnknownName, choices
+from recorders.log import Log, Stream, open_log, read_blocks, read_empty, schemas
+from recorders.trajectories import Trajectory, kitti_lines, tum_lines
+from replay.judging.trajectories import trajectory_of
+
+To = Literal["tum", "kitti", "csv", "parquet"]
+SUFFIXES: dict[To, str] = {"tum": ".txt", "kitti": ".txt", "csv": ".csv", "parquet": ".parquet"}
+TRAJECTORIES: dict[str, tuple[str, Callable[[Trajectory], list[str]]]] = {
+    "tum": ("# timestamp tx ty tz qx qy qz qw\n", tum_lines),
+    "kitti": ("", kitti_lines),
+}
+
+Write = Callable[[Stream], None]
+
+
+class Exported(NamedTuple):
+    """The files that were written, with the topics in them, and sentences on what is not in them."""
+
+    files: dict[str, Path]
+    notes: list[str]
+
+
+def export(
+    path: str | Path,
+    *,
+    to: To,
+    out: str | Path | None = None,
+    topics: Sequence[str] = (),
+    recover: bool = False,
+) -> Exported:
+    """Export topics of a log: "tum" and "kitti" trajectories, or "csv" and "parquet" tables.
+
+    Args:
+        path: the log, or estimates log.
+        to: the format; trajectories are of estimates and truths that state a position.
+        out: the folder of the files, by default named after the log; of one topic the file.
+        topics: which; none stands for all that fit.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where a topic is not there or does not fit, or the place is taken.
+    """
+    if to not in get_args(To):
+        raise BadInput(f"no format '{to}' to export to; {choices(to, get_args(To))}")
+    log = open_log(path, recover=recover)
+    notes = [log.loss_statement] if log.loss_statement else []
+    chosen = _chosen(log, to, topics, notes)
+    names = {topic: _file_name(topic, to) for topic in chosen}
+    for topic, name in names.items():
+        if list(names.values()).count(name) > 1:
+            raise BadInput(f"{path}: two topics would be the file {name}; export {topic} by --topic")
+    if len(topics) == 1:
+        (topic,) = chosen
+        place = Path(out or f"{log.path.stem}-{names[topic]}")
+        new = Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
+        check_files([(place, new)], {"log": [log.path]})
+        with whole_file(place) as part:
+            _write(log, to, {topic: part}, notes)
+        return Exported({topic: place}, notes)
+    place = Path(out or f"{log.path.stem}-{to}")
+    check_folder(place, {"log": [log.path]})
+    with whole_folder(place, _refuse) as part:
+        _write(log, to, {topic: part / name for topic, name in names.items()}, notes)
+    return Exported({topic: place / name for topic, name in names.items()}, notes)
+
+
+def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[str]:
+    """The topics to export; what does not fit is noted, or refused where it was asked for."""
+    chosen = []
+    for topic in dict.fromkeys(topics or log.topics):
+        if topic not in log.topics:
+            raise UnknownName(f"{log.path}: no topic {topic}; {choices(topic, log.topics)}")
+        try:
+            empty = read_empty(log, topic)
+            if to in TRAJECTORIES and not _is_state(log, topic):
+                raise BadInput(
+                    f"{log.path}: topic {topic}: is no estimate and no truth; export it as csv"
+                )
+            if to in TRAJECTORIES and trajectory_of(empty) is None:
+                raise BadInput(f"{log.path}: topic {topic}: states no position; export it as csv")
+        except BadInput as error:
+            if topics:
+                raise
+            if to not in TRAJECTORIES:
+                notes.append(str(error))
+            continue
+        chosen.append(topic)
+    if not chosen:
+        what = "estimates or truth with a position" if to in TRAJECTORIES else "streams of columns"
+        raise BadInput(f"{log.path}: holds no {what} to export to {to}")
+    return chosen
+
+
+def _is_state(log: Log, topic: str) -> bool:
+    """Whether a topic holds estimates or a truth; a prior is neither."""
+    schema = log.topics[topic].schema_name
+    is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
+    return is_estimate or schema == schemas.TRUTH_STATE.full_name
+
+
+def _file_name(topic: str, to: To) -> str:
+    return quote(topic.strip("/").replace("/", "-"), safe=" ") + SUFFIXES[to]
+
+
+def _refuse(place: Path) -> None:
+    raise BadInput(f"{place}: exists, and export replaces nothing; give another --out")
+
+
+def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
+    """Write every topic to its file."""
+    with ExitStack() as stack:
+        write = {
+            topic: stack.enter_context(
+                _trajectory_file(path, to, notes) if to in TRAJECTORIES else _table_file(path, to)
+            )
+            for topic, path in files.items()
+        }
+        for block in read_blocks(log, list(files)):
+            for topic, stream in block.items():
+                write[topic](stream)
+        for topic in files:
+            write[topic](read_empty(log, topic))
+
+
+@contextmanager
+def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
+    """A text file of poses; what they lack is noted."""
+    header, lines_of = TRAJECTORIES[to]
+    dropped: dict[str, int] = {}
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(header)
+
+        def write(stream: Stream) -> None:
+            trajectory = trajectory_of(stream)
+            assert trajectory is not None
+            if stream.topic not in dropped and trajectory.rotation is None:
+                notes.append(f"{stream.topic}: states no orientation; the identity stands for it")
+            dropped[stream.topic] = dropped.get(stream.topic, 0) + len(stream) - len(trajectory)
+            file.writelines(f"{line}\n" for line in lines_of(trajectory))
+
+        yield write
+    notes += [
+        f"{topic}: {count} poses are not finite; left out" for topic, count in dropped.items() if count
+    ]
+
+
+@contextmanager
+def _table_file(path: Path, to: To) -> Iterator[Write]:
+    """A file of rows, whose columns are those of the first stream that is written."""
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    make: Callable[..., Any] = pyarrow.csv.CSVWriter if to == "csv" else pyarrow.parquet.ParquetWriter
+    with path.open("wb") as file, ExitStack() as stack:
+        begun: list[tuple[Any, list[str]]] = []
+
+        def write(stream: Stream) -> None:
+            table = stream.arrow()
+            if not begun:
+                begun.append((stack.enter_context(make(file, table.schema)), table.column_names))
+            writer, columns = begun[0]
+            if len(table) and table.column_names != columns:
+                raise BadInput(
+                    f"topic {stream.topic}: has vectors of several lengths; no table holds it"
+                )
+            if len(table):
+                writer.write_table(table)
+
+        yield write

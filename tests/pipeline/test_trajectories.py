@@ -1,0 +1,115 @@
+"""Trajectories from the command line and from Python: files, estimates of logs, result folders."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import fuselog as fl
+from recorders.log import write_log
+from recorders.recording import record_run
+from recorders.trajectories import Trajectory, tum_lines
+
+Fuselog = Callable[..., Any]
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def spiral(name: str, noise_m: float = 0.0) -> Trajectory:
+    time_s = np.linspace(0, 20, 201)
+    generator = np.random.default_rng(3)
+    position_m = np.stack([time_s * np.cos(time_s), time_s * np.sin(time_s), 0.1 * time_s], axis=1)
+    noisy = position_m + generator.normal(scale=noise_m, size=position_m.shape)
+    rotation = Rotation.from_euler("z", time_s[:, None]).as_matrix()
+    return Trajectory(name, noisy, rotation, np.rint(time_s * 1e9).astype(np.int64))
+
+
+def test_two_files(fuselog: Fuselog) -> None:
+    """The keys and numbers that programs read; the same from Python; figures, tables and a report."""
+    truth, estimate = spiral("truth"), spiral("estimate", 0.05)
+    turn = Rotation.from_rotvec([0.3, 0.2, 1.0]).as_matrix()
+    moved = replace(estimate, position_m=estimate.position_m @ turn.T, rotation=turn @ estimate.rotation)
+    for each in (truth, moved):
+        Path(f"{each.name}.txt").write_text("\n".join(tum_lines(each)))
+    options = ("--align", "se3", "--delta", "2", "--delta-unit", "m", "--out", "judged")
+    said = fuselog("evaluate", "estimate.txt", "--truth", "truth.txt", *options, "--json").json
+    errors = (
+        ("ape_translation", "m"),
+        ("ape_rotation", "deg"),
+        ("rpe_translation", "m"),
+        ("rpe_rotation", "deg"),
+    )
+    keys = [f"{error}_{each}_{unit}" for error, unit in errors for each in STATISTICS]
+    assert list(said["metrics"]) == [*keys, "poses", "poses_without_truth", "rpe_pairs"]
+    assert said["metrics"]["ape_translation_rmse_m"] == pytest.approx(0.05 * np.sqrt(3), rel=0.1)
+    assert said["metrics"]["ape_rotation_rmse_deg"] == pytest.approx(0.0, abs=0.2)
+    assert said["alignment"]["rotation"] == pytest.approx(
+        Rotation.from_matrix(turn.T).as_quat(scalar_first=True), abs=2e-3
+    )
+    how = {"align": "se3", "delta": 2.0, "delta_unit": "m"}
+    done = fl.evaluate("estimate.txt", truth=truth, **how)
+    assert done.metrics == pytest.approx(said["metrics"], rel=1e-12)
+    result = json.loads(Path("judged/result.json").read_text())
+    assert result["metrics"] == said["metrics"]
+    assert result["settings"]["align"] == "se3"
+    for name in ("trajectory", "pose-errors", "error-along-path-estimate"):
+        assert Path(f"judged/figures/{name}.svg").stat().st_size > 10_000
+    folder = done.save("again")
+    assert len(folder.tables["poses"]) == 201
+    assert np.sqrt(np.mean(folder.tables["pairs"]["rpe_translation_m"] ** 2)) == pytest.approx(
+        said["metrics"]["rpe_translation_rmse_m"]
+    )
+    assert fuselog("report", "judged", "-o", "page.html").code == 0
+    assert "ape_translation_rmse_m" in Path("page.html").read_text(encoding="utf-8")
+    table = fuselog("evaluate", "estimate.txt", "--truth", "truth.txt").out
+    assert "APE translation (m)" in table
+    assert "201 poses" in table
+
+
+def test_estimates_of_a_log_in_another_frame(fuselog: Fuselog) -> None:
+    """Where the truth is turned, shifted and scaled, the aligned judgement is the same."""
+    recording, run = record_run("landmarks", {"duration_s": 5.0}, 3)
+    write_log("log.mcap", recording.streams, run)
+    assert fuselog("replay", "log.mcap", "-e", "ekf").code == 0
+    plain = fuselog("evaluate", "log.estimates.mcap", "--json").json["metrics"]
+    for align, scale in (("se2", 1.0), ("sim3", 3.0)):
+        ours = fuselog("evaluate", "log.estimates.mcap", "--align", align, "--json").json["metrics"]
+        turn = Rotation.from_rotvec([0, 0, 2.0]).as_matrix()[:2, :2]
+        moved = []
+        for stream in recording.streams:
+            if stream.topic == "/robot1/truth":
+                state = stream["state"].copy()
+                state[:, :2] = scale * state[:, :2] @ turn.T + [100.0, -50.0]
+                state[:, 2] = (state[:, 2] + 2.0 + np.pi) % (2 * np.pi) - np.pi
+                stream = replace(stream, columns={**stream.columns, "state": state})
+            moved.append(stream)
+        write_log("moved.mcap", moved, run)
+        command = ("evaluate", "log.estimates.mcap", "--log", "moved.mcap")
+        apart = fuselog(*command, "--json").json["metrics"]
+        assert apart["ekf.nees.robot1"] > 1e3 * plain["ekf.nees.robot1"]
+        said = fuselog(*command, "--align", align, "--out", "judged", "--json").json["metrics"]
+        for key in ("ekf.nees.robot1", "ekf.position_nees.robot1", "ekf.ape_rotation_max_deg.robot1"):
+            assert said[key] == pytest.approx(ours[key], rel=1e-6), key
+        for key in ("position_rmse_m", "ape_translation_rmse_m", "rpe_translation_max_m"):
+            assert said[f"ekf.{key}.robot1"] == pytest.approx(
+                scale * ours[f"ekf.{key}.robot1"], rel=1e-6
+            )
+        assert said["ekf.position_rmse_m.robot1"] == pytest.approx(
+            said["ekf.ape_translation_rmse_m.robot1"]
+        )
+    assert plain["ekf.position_rmse_m.robot1"] > ours["ekf.ape_translation_rmse_m.robot1"]
+    figures = {path.name for path in Path("judged/figures").glob("*.svg")}
+    assert {
+        "trajectory-robot1.svg",
+        "pose-errors-robot1.svg",
+        "error-along-path-ekf-robot1.svg",
+    } <= figures

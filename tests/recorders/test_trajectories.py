@@ -1,0 +1,93 @@
+"""Trajectory files: recognised from their content, read to the last digit, refused by their line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.trajectories import Trajectory, kitti_lines, read_trajectory, tum_lines
+
+# A pose at (1, 2, 3), turned a quarter about the vertical, and one more, not turned.
+HALF = 0.7071067811865476
+TUM = f"# time x y z\n1305031102.160407123 1 2 3 0 0 {HALF} {HALF}\n\n1305031103 4 5 6 0 0 0 1\n"
+KITTI = "0 -1 0 1 1 0 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n"
+EUROC = (
+    f"#timestamp [ns], p [m], q\n1305031102160407123,1,2,3,{HALF},0,0,{HALF},9,9\n"
+    "1305031103000000000,4,5,6,1,0,0,0,9,9\n"
+)
+QUARTER = [[[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.eye(3)]
+
+
+@pytest.mark.parametrize(
+    ("text", "is_timed"), [(TUM, True), (KITTI, False), (EUROC, True), ("﻿" + TUM, True)]
+)
+def test_formats_are_known_by_their_content(text: str, is_timed: bool, tmp_path: Path) -> None:
+    path = tmp_path / "poses"
+    path.write_text(text, encoding="utf-8")
+    found = read_trajectory(path)
+    assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+    assert found.rotation is not None
+    assert_allclose(found.rotation, QUARTER, atol=1e-15)
+    if is_timed:  # to the nanosecond, which a double cannot
+        assert_array_equal(found.time_ns, [1305031102160407123, 1305031103000000000])
+    else:
+        assert found.time_ns is None
+
+
+def test_poses_are_sorted_and_it_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "poses"
+    path.write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in (3, 1, 1, 2)))
+    found = read_trajectory(path)
+    assert found.position_m[:, 0].tolist() == [1, 1, 2, 3]
+    assert found.notes == (f"{path}: 1 stamps go back, 1 repeat; the poses were sorted",)
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    rotation = Rotation.random(20, rng=generator).as_matrix()
+    stamps = np.cumsum(generator.integers(1, 2**55, 20))
+    made = Trajectory("made", generator.normal(size=(20, 3)) * 1e6, rotation, stamps)
+    for lines, tolerance in ((tum_lines(made), 1e-15), (kitti_lines(made), 0.0)):
+        path = tmp_path / "poses"
+        path.write_text("\n".join(lines))
+        found = read_trajectory(path)
+        assert_array_equal(found.position_m, made.position_m)
+        assert found.rotation is not None
+        assert_allclose(found.rotation, rotation, atol=tolerance)
+        assert found.time_ns is None or found.time_ns.tolist() == stamps.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "format_", "words"),
+    [
+        ("", None, ("holds no poses", "TUM, KITTI or EuRoC")),
+        ("1 2 3\n", None, ("line 1 is no pose", "3 columns", "tum has 8 numbers")),
+        (TUM + "1305031104 4 5 6 0 0 0\n", None, ("line 5 has 7 columns", "8 numbers")),
+        (TUM + "1305031104 4 5 six 0 0 0 1\n", None, ("line 5 is no pose", "'six'")),
+        (TUM + "1305031104 4 5 nan 0 0 0 1\n", None, ("line 5 holds a value that is not finite",)),
+        (TUM + "1305031104 4 5 6 0 0 0 2\n", None, ("line 5", "quaternion", "not of unit length")),
+        (TUM + "1305031104000000 4 5 6 0 0 0 1\n", None, ("line 5", "beyond the year 2262", "in s")),
+        (KITTI + "1 0 0 4 0 2 0 5 0 0 1 6\n", None, ("line 3", "matrix that is no rotation")),
+        (KITTI + "1 0 0 4 0 1 0 5 0 0 -1 6\n", None, ("line 3", "matrix that is no rotation")),
+        (KITTI, "tum", ("line 1 has 12 columns", "tum has 8 numbers")),
+        (TUM, "tmu", ("no trajectory format 'tmu'", "did you mean 'tum'")),
+    ],
+)
+def test_what_is_no_trajectory_is_told_by_its_line(
+    text: str, format_: str | None, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = tmp_path / "poses"
+    path.write_text(text)
+    with pytest.raises(BadInput) as raised:
+        read_trajectory(path, format_)
+    assert all(word in str(raised.value) for word in words), raised.value
+
+
+def test_what_is_no_text_is_told(tmp_path: Path) -> None:
+    (tmp_path / "poses").write_bytes(b"\x89MCAP0\r\n\xff")
+    for place, words in ((tmp_path / "poses", "is no text"), (tmp_path / "none", "No such file")):
+        with pytest.raises(BadInput, match=words):
+            read_trajectory(place)
