@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
@@ -15,7 +15,7 @@ from ruamel.yaml.error import YAMLError
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
 from recorders.importers.ros.mcap_file import McapFile
-from recorders.importers.ros.raw import BagFile, Connection
+from recorders.importers.ros.raw import BagFile, Batch, Connection, joined
 from recorders.importers.ros.ros1_file import Ros1File
 from recorders.importers.ros.sqlite_file import SqliteFile
 
@@ -26,12 +26,23 @@ _ZSTD = ".zstd"
 
 @dataclass
 class Bag:
-    """The files of one bag, in the order of their splits, and what is known to be missing."""
+    """The files of one bag, in the order of their splits, and what is known to be missing.
+
+    `stated` is how many messages metadata.yaml says that each topic has; where `is_packed`, every
+    message is compressed by itself.
+    """
 
     path: Path
     files: list[BagFile]
     missing: list[str] = field(default_factory=list)
     stated: Counter[str] = field(default_factory=Counter)
+    is_packed: bool = False
+
+    def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
+        """The messages of the wanted connections, file by file."""
+        for file in self.files:
+            for batch in file.batches(wanted):
+                yield _unpacked(batch) if self.is_packed else batch
 
     @property
     def connections(self) -> list[Connection]:
@@ -62,16 +73,16 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise BadInput(f"{path}: holds no bag; {_WANTED}")
     for entry in about.get("topics_with_message_count") or []:
         bag.stated[entry["topic_metadata"]["name"]] += int(entry["message_count"])
-    is_zstd = str(about.get("compression_mode") or "").lower() == "message"
+    bag.is_packed = str(about.get("compression_mode") or "").lower() == "message"
     with scratch_folder("fuselog-ros") as scratch:
         for each in there:
-            bag.files.append(_open_file(each, scratch, zstd=is_zstd))
+            bag.files.append(_open_file(each, scratch))
         if len({type(each) for each in bag.files}) > 1:
             raise BadInput(f"{path}: holds bags of several formats; give one of them")
         yield bag
 
 
-def _open_file(path: Path, scratch: Path, *, zstd: bool) -> BagFile:
+def _open_file(path: Path, scratch: Path) -> BagFile:
     place = path
     if path.suffix == _ZSTD:
         place = scratch / path.stem
@@ -83,10 +94,21 @@ def _open_file(path: Path, scratch: Path, *, zstd: bool) -> BagFile:
     if place.suffix == ".mcap":
         return McapFile(place)
     if place.suffix == ".db3":
-        return SqliteFile(place, zstd=zstd)
+        return SqliteFile(place)
     if place.suffix in (".bag", ".active"):
         return Ros1File(place)
     raise BadInput(f"{path}: is no bag; {_WANTED}")
+
+
+def _unpacked(batch: Batch) -> Batch:
+    """The same messages, uncompressed; one that cannot be is empty."""
+    parts = []
+    for begin, length in zip(batch.begins.tolist(), batch.lengths.tolist(), strict=True):
+        try:
+            parts.append(zstandard.decompress(batch.data[begin : begin + length].tobytes()))
+        except zstandard.ZstdError:
+            parts.append(b"")
+    return joined(batch.connection, parts, batch.log_time_ns)
 
 
 def _metadata(folder: Path) -> dict[str, Any]:

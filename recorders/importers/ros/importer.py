@@ -87,6 +87,7 @@ class _Pending:
 class _Piece(NamedTuple):
     """Some messages of a stream, which are one of its parts of a block."""
 
+    rows: NDArray[np.int64]
     publish_time_ns: NDArray[np.int64]
     log_time_ns: NDArray[np.int64]
     sensor_time_ns: NDArray[np.int64]
@@ -137,7 +138,7 @@ class _Clocks:
             ]
             raise BadInput(
                 f"{path}: mixed time bases: the stamps of {what[0]} and of {what[1]} are "
-                f"{apart_s:.6g} s apart; use --clock bag, or name topics of one clock with --set topics=[...]"
+                f"{apart_s:.6g} s apart; use --clock bag, or topics of one clock with --set topics=[...]"
             )
 
     def notes(self) -> dict[str, str]:
@@ -284,6 +285,17 @@ class _Import:
         """Whether the messages of a connection are read."""
         return connection in self._readers
 
+    def _has_transforms(self, connection: Connection) -> bool:
+        return connection in self._readers and self._readers[connection].taken is None
+
+    def _transforms(
+        self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64]
+    ) -> list[tuple[Pair, Transforms]]:
+        try:
+            return list(transforms_of(messages, log_time_ns))
+        except BadInput as error:
+            raise BadInput(f"{self.path}: topic {topic}: {error}") from None
+
     def _named_chains(self) -> list[Chain]:
         """The chains of the named pairs; all transforms of the bag are read once to find them."""
         pairs = []
@@ -298,19 +310,19 @@ class _Import:
             return []
         sent: Counter[Pair] = Counter()
         static: dict[Pair, Transforms] = {}
-        for file in self._bag.files:
-            for batch in file.batches(
-                lambda each: each in self._readers and self._readers[each].taken is None
-            ):
-                reader = self._readers[batch.connection]
-                for which, raw in by_size(batch.data, batch.begins, batch.lengths):
-                    for messages in reader.type.read(raw, which):
-                        if isinstance(messages, Messages):
-                            for pair, found in transforms_of(messages, batch.log_time_ns[messages.rows]):
-                                if reader.is_static:
-                                    static[pair] = found
-                                else:
-                                    sent[pair] += len(found)
+        for batch in self._bag.batches(self._has_transforms):
+            reader = self._readers[batch.connection]
+            for which, raw in by_size(batch.data, batch.begins, batch.lengths):
+                for messages in reader.type.read(raw, which):
+                    if isinstance(messages, Undecodable):
+                        continue  # told when it is read for the streams
+                    for pair, found in self._transforms(
+                        batch.connection.topic, messages, batch.log_time_ns[messages.rows]
+                    ):
+                        if reader.is_static:
+                            static[pair] = found
+                        else:
+                            sent[pair] += len(found)
         try:
             return [Chain(pair, sent, static) for pair in pairs]
         except BadInput as error:
@@ -378,7 +390,8 @@ class _Import:
                     name = self._stream_name(topic, part.kind, frame)
                     of = rows if part.rows is None else part.rows[rows]
                     own = None if stamp_ns is None else stamp_ns[of]
-                    self._put(name, topic, part, rows, own, log_time_ns[of], frame)
+                    taken_of = messages.rows[of]
+                    self._put(name, topic, part, rows, own, log_time_ns[of], taken_of, frame)
 
     def _kept(self, topic: str, part: Part, stamp_ns: NDArray[np.int64] | None) -> NDArray[np.bool_]:
         """Which (k,) of a part are kept; the others are counted by reason."""
@@ -417,9 +430,10 @@ class _Import:
         rows: NDArray[np.int64],
         stamp_ns: NDArray[np.int64] | None,
         log_time_ns: NDArray[np.int64],
+        places: NDArray[np.int64],
         frame: Mapping[str, str],
     ) -> None:
-        """Take up the rows (k,) of a part for a stream, with their stamps (k,)."""
+        """Take up the rows (k,) of a part for a stream, with their stamps and places in the topic."""
         columns = {key: self._checked(topic, key, column[rows]) for key, column in part.columns.items()}
         constants = {key: column[rows] for key, column in part.constants.items()}
         widths = {key: column.shape[1] for key, column in columns.items() if column.ndim == 2}
@@ -443,7 +457,7 @@ class _Import:
             )
         sensed = log_time_ns if stamp_ns is None else stamp_ns
         published = log_time_ns if self._parameters.clock == "bag" else sensed
-        written.pieces.append(_Piece(published, log_time_ns, sensed, columns))
+        written.pieces.append(_Piece(places, published, log_time_ns, sensed, columns))
         self._came_of[topic][name] = None
 
     def _checked(self, topic: str, field: str, column: NDArray) -> NDArray:
@@ -465,11 +479,7 @@ class _Import:
         if is_static:
             self._came_of[topic]["what named transforms are composed with"] = None
             return
-        try:
-            found = list(transforms_of(messages, log_time_ns))
-        except BadInput as error:
-            raise BadInput(f"{self.path}: topic {topic}: {error}") from None
-        for pair, transforms in found:
+        for pair, transforms in self._transforms(topic, messages, log_time_ns):
             self._clocks.note(topic, *_stamped(transforms.stamp_ns, transforms.log_time_ns))
             for chain in self._chains:
                 chain.add(pair, transforms)
@@ -483,13 +493,14 @@ class _Import:
         rows = np.flatnonzero(self._kept(topic, part, found.stamp_ns))
         if len(rows):
             frame = dict(zip(("frame_id", "child_frame_id"), pair, strict=True))
-            self._put(name, topic, part, rows, found.stamp_ns[rows], found.log_time_ns[rows], frame)
+            kept = found.take(rows)
+            self._put(name, topic, part, rows, kept.stamp_ns, kept.log_time_ns, kept.rows, frame)
 
     def _stream(self, topic: str, written: _Written) -> Stream:
         """What waits for a stream, in the order in which the bag has it."""
         parts = written.pieces
         log_time_ns = np.concatenate([part.log_time_ns for part in parts])
-        order = np.argsort(log_time_ns, kind="stable")
+        order = np.lexsort((np.concatenate([part.rows for part in parts]), log_time_ns))
         published = np.concatenate([part.publish_time_ns for part in parts])[order]
         steps_ns = np.diff(
             published, prepend=published[0] - 1 if written.last_ns < 0 else written.last_ns
@@ -550,8 +561,7 @@ class _Import:
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
         for (subject, fact), count in self._told.items():
-            key = subject if subject not in notes else f"{subject}: {fact}"
-            notes[key] = str(count) if key != subject else f"{count} {fact}"
+            notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):
             notes[f"not taken, {topic}"] = f"{counts[topic]} {why}"
         for number, loss in enumerate(self._bag.losses, start=1):
@@ -610,11 +620,10 @@ def read(path: Path, parameters: RosParameters) -> Blocks:
 def _blocks(path: Path, parameters: RosParameters, told: Blocks) -> Iterator[list[Stream]]:
     with open_bag(path) as bag:
         work = _Import(bag, parameters)
-        for file in bag.files:
-            for batch in file.batches(work.is_wanted):
-                work.add(batch)
-                if work.is_full:
-                    yield work.block()
+        for batch in bag.batches(work.is_wanted):
+            work.add(batch)
+            if work.is_full:
+                yield work.block()
         yield work.block(is_last=True)
         work.check()
         told.notes.update(work.notes())

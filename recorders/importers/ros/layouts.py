@@ -93,7 +93,8 @@ class Layout:
         return (raw[:, list(self.fixed)] == np.array(list(self.fixed.values()), np.uint8)).all(axis=1)
 
 
-class Messages(NamedTuple):
+@dataclass(frozen=True)
+class Messages:
     """Messages (n,) of one layout: the bytes (n, size) of each, and their rows among all of a topic."""
 
     layout: Layout

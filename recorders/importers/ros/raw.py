@@ -1,6 +1,6 @@
 """Messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -51,6 +51,13 @@ class BagFile(Protocol):
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
         """The messages of the wanted connections, a chunk of the file at a time."""
+
+
+def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[np.int64]) -> Batch:
+    """Messages (n,) that are apart in memory, laid end to end."""
+    lengths = np.array([len(part) for part in parts], np.int64)
+    data = np.frombuffer(b"".join(parts), np.uint8)
+    return Batch(connection, data, np.cumsum(lengths) - lengths, lengths, log_time_ns)
 
 
 def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDArray:

@@ -7,7 +7,7 @@ what no such time has passed, so that memory stays bounded.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,16 @@ Floats = NDArray[np.float64]
 Pair = tuple[str, str]
 
 
-class Transforms(NamedTuple):
-    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder."""
+@dataclass(frozen=True)
+class Transforms:
+    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
+
+    `rows` says of which message of its topic each is.
+    """
 
     stamp_ns: NDArray[np.int64]
     log_time_ns: NDArray[np.int64]
+    rows: NDArray[np.int64]
     position_m: Floats
     quaternion: Floats
 
@@ -34,7 +39,13 @@ class Transforms(NamedTuple):
 
     def take(self, rows: NDArray | slice) -> "Transforms":
         """Some of them."""
-        return Transforms._make(column[rows] for column in self)
+        return Transforms(
+            self.stamp_ns[rows],
+            self.log_time_ns[rows],
+            self.rows[rows],
+            self.position_m[rows],
+            self.quaternion[rows],
+        )
 
 
 def transforms_of(
@@ -56,6 +67,7 @@ def transforms_of(
             found = Transforms(
                 np.asarray(stamp_ns)[rows],
                 log_time_ns[rows],
+                messages.rows[rows],
                 vector(messages, f"{path}.transform.translation")[rows],
                 require_unit(quaternion(messages, f"{path}.transform.rotation")[rows], what, 1e-3),
             )
@@ -68,7 +80,13 @@ def _frame(name: bytes) -> str:
 
 def join(parts: Sequence[Transforms]) -> Transforms:
     """Parts in the order of their stamps."""
-    joined = Transforms(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    joined = Transforms(
+        np.concatenate([part.stamp_ns for part in parts]),
+        np.concatenate([part.log_time_ns for part in parts]),
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.position_m for part in parts]),
+        np.concatenate([part.quaternion for part in parts]),
+    )
     return joined.take(np.argsort(joined.stamp_ns, kind="stable"))
 
 
@@ -132,7 +150,7 @@ class Chain:
         if self._held:
             return None
         zero = np.zeros(1, np.int64)
-        return self._product({}, Transforms(zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
+        return self._product({}, Transforms(zero, zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
 
     def _product(self, moving: Mapping[Pair, Transforms], wanted: Transforms) -> Transforms:
         """The chain's transforms one after another, at the wanted stamps."""
@@ -147,7 +165,7 @@ class Chain:
             position = position + rotate(orientation, step)
             orientation = compose(orientation, turn)
         orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
-        return Transforms(wanted.stamp_ns, wanted.log_time_ns, position, orientation)
+        return replace(wanted, position_m=position, quaternion=orientation)
 
 
 def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
@@ -165,7 +183,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
     first = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
     second = np.where(is_small, share, np.sin(share * angle) / sine)
     position = given.position_m[before] * (1.0 - share) + given.position_m[after] * share
-    return Transforms(stamp_ns, stamp_ns, position, first * begin + second * end)
+    return Transforms(stamp_ns, stamp_ns, stamp_ns, position, first * begin + second * end)
 
 
 def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
