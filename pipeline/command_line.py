@@ -157,21 +157,27 @@ def record(
 @click.argument("source")
 @click.argument("path", type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
+@click.option(
+    "--clock",
+    type=click.Choice(["header", "bag"]),
+    help="For ROS: what says when a message was published, its header or the bag [default: header].",
+)
 @set_option
-def import_(source: str, path: Path, out: Path | None, settings: tuple[str, ...]) -> None:
+def import_(
+    source: str, path: Path, out: Path | None, clock: str | None, settings: tuple[str, ...]
+) -> None:
     """Import real data of kind SOURCE from PATH, as published, and write their log."""
     from pipeline.outputs import check_files, imported
-    from recorders.log import write_log
     from recorders.parameters import parse_settings
-    from recorders.recording import import_run
+    from recorders.recording import import_log
 
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": [path]})
-    recording, metadata = import_run(source, path, parse_settings(settings))
-    write_log(target, recording.streams, metadata)
+    chosen = {} if clock is None else {"clock": clock}
+    metadata, messages = import_log(source, path, parse_settings(settings) | chosen, target)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}"))
-    _say_written(target, sum(map(len, recording.streams)))
+    _say_written(target, messages)
 
 
 def _say_written(path: Path, messages: int) -> None:

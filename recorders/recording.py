@@ -1,7 +1,7 @@
 """What a recorder is: something that turns parameters, or a folder of real data, into streams."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, Stream
+from recorders.log import LogWriter, RunMetadata, Stream
+from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 
@@ -51,6 +52,27 @@ class Recording:
                 raise BadInput(f"topic {topic}: recorded as {count} streams; make one stream of them")
 
 
+@dataclass
+class Blocks:
+    """Streams that come block by block, so that they may be more than memory holds.
+
+    A topic may come again in every block. `epoch_ns` and `notes`, as those of a `Recording`, are whole
+    when the last block has been drawn.
+    """
+
+    blocks: Iterator[list[Stream]]
+    epoch_ns: int = SIMULATION_EPOCH_NS
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def together(self) -> Recording:
+        """All of it in memory."""
+        parts: dict[str, list[Stream]] = {}
+        for block in self.blocks:
+            for stream in block:
+                parts.setdefault(stream.topic, []).append(stream)
+        return Recording([concatenate(each) for each in parts.values()], self.epoch_ns, self.notes)
+
+
 @dataclass(frozen=True)
 class Recorder(Generic[ParametersType]):
     """What recorders have in common: what they are in one line, and their parameters."""
@@ -68,9 +90,9 @@ class Simulator(Recorder[ParametersType]):
 
 @dataclass(frozen=True)
 class Importer(Recorder[ParametersType]):
-    """Reads real data: a file or folder as its publishers lay it out."""
+    """Reads real data: a file or folder as its publishers lay it out, at once or block by block."""
 
-    read: Callable[[Path, ParametersType], Recording]
+    read: Callable[[Path, ParametersType], Recording | Blocks]
 
 
 def record_run(
@@ -100,19 +122,43 @@ def record_run(
 
 def import_run(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Recording, RunMetadata]:
     """Import real data; raises BadInput for an unknown importer or parameter, or data it cannot read."""
+    importer, parameters = _importer(source, path, values)
+    with foreign_code(f"importer {source}"):
+        found = importer.read(path, parameters)
+        recording = found.together() if isinstance(found, Blocks) else found
+        return recording, _metadata(source, parameters, None, 0, recording)
+
+
+def import_log(
+    source: str, path: Path, values: Mapping[str, Any], target: Path
+) -> tuple[RunMetadata, int]:
+    """Import real data into a log, block by block where they come so; errors as `import_run`.
+
+    Returns what the run is, and how many messages the log has.
+    """
+    importer, parameters = _importer(source, path, values)
+    messages = 0
+    with foreign_code(f"importer {source}"), LogWriter(target) as log:
+        found = importer.read(path, parameters)
+        for block in found.blocks if isinstance(found, Blocks) else [found.streams]:
+            log.write(block)
+            messages += sum(map(len, block))
+        run = _metadata(source, parameters, None, 0, found)
+        log.describe(run)
+    return run, messages
+
+
+def _importer(source: str, path: Path, values: Mapping[str, Any]) -> tuple[Importer[Any], Parameters]:
     importer: Recorder[Any] = load("recorders", source, Recorder)
     if not isinstance(importer, Importer):
         raise BadInput(f"'{source}' simulates; use: fuselog record {source}")
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder; give the {source} data as published")
-    parameters = build(importer.parameters, values, f"importer {source}")
-    with foreign_code(f"importer {source}"):
-        recording = importer.read(path, parameters)
-        return recording, _metadata(source, parameters, None, 0, recording)
+    return importer, build(importer.parameters, values, f"importer {source}")
 
 
 def _metadata(
-    name: str, parameters: Parameters, seed: int | None, run: int, recording: Recording
+    name: str, parameters: Parameters, seed: int | None, run: int, recording: Recording | Blocks
 ) -> RunMetadata:
     values = parameters.model_dump(mode="json")
     return RunMetadata(name, values, seed, run, recording.epoch_ns, dict(recording.notes))

@@ -198,10 +198,27 @@ POSITION_FIX = _declare(
 )
 GEODETIC_FIX = _declare(
     "GeodeticFix",
-    "A position on the WGS 84 ellipsoid.",
+    "A position on the WGS 84 ellipsoid; its covariance, row-major, in m^2 east, north, up.",
     _real("latitude_deg"),
     _real("longitude_deg"),
     _real("altitude_m", may_be_nan=True),
+    Field("covariance_m2", "vector", may_be_nan=True, may_be_absent=True),
+)
+POSE = _declare(
+    "Pose",
+    "Where a body is in a frame: its position, and the rotation from the body's frame to it as a unit "
+    "quaternion w, x, y, z. The covariance, row-major, is of x, y, z in m and of small rotations about "
+    "the frame's x, y, z in rad. The channel's metadata names the frames.",
+    _vector("position_m"),
+    _vector("quaternion"),
+    _vector("covariance", may_be_nan=True),
+)
+TWIST = _declare(
+    "Twist",
+    "Velocity and turn rate of a body in its own frame, along x, y, z; their covariance, row-major.",
+    _vector("velocity_mps"),
+    _vector("turn_rate_radps"),
+    _vector("covariance", may_be_nan=True),
 )
 DETECTION = _declare(
     "Detection",
@@ -227,6 +244,12 @@ INERTIAL_SAMPLE = _declare(
     _vector("specific_force_mps2"),
     _vector("turn_rate_radps"),
     _vector("magnetic_field_ut", may_be_nan=True),
+)
+MAGNETIC_FIELD = _declare(
+    "MagneticField",
+    "The magnetic field in the body frame with its covariance, row-major.",
+    _vector("magnetic_field_ut"),
+    _vector("covariance_ut2", may_be_nan=True),
 )
 ODOMETRY = _declare(
     "Odometry",

@@ -128,9 +128,9 @@ def make_stream(
 ) -> Stream:
     """Build a stream; clocks that are not given equal `publish_time_ns`.
 
-    Raises BadInput where a column is missing or unknown, has another length, has the wrong number of
-    axes, holds NaN that its field does not allow or a number that its type cannot keep (a fraction of a
-    nanosecond, say), or a time is negative.
+    A vector that may be absent need not be given. Raises BadInput where another column is missing, or
+    one is unknown, has another length, has the wrong number of axes, holds NaN that its field does not
+    allow or a number that its type cannot keep (a fraction of a nanosecond, say), or a time is negative.
 
     >>> from recorders.log import schemas
     >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])
@@ -155,6 +155,13 @@ def stream_of(
     """As `make_stream`, of all columns by name; with `allow_nan`, NaN may stand in any of them."""
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
+    # an empty vector is as good as an absent one
+    absent = {
+        entry.name: np.empty((len(published), 0))
+        for entry in schema
+        if entry.may_be_absent and entry.kind == "vector"
+    }
+    given = {**absent, **given}
     names = [entry.name for entry in schema]
     if given.keys() != set(names):
         raise BadInput(

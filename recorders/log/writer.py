@@ -32,7 +32,7 @@ class LogWriter:
 
     Args:
         path: the log to write; an existing file is replaced at the end, in one step.
-        run: what the run was.
+        run: what the run was; where that is known at the end alone, see `describe`.
         compression: "zstd", "lz4" or "none".
         chunk_bytes: about how large an uncompressed chunk gets.
 
@@ -61,6 +61,10 @@ class LogWriter:
 
     def __exit__(self, *raised: Any) -> None:
         self._container.__exit__(*raised)
+
+    def describe(self, run: RunMetadata) -> None:
+        """Write what the run was, once."""
+        self._container.add_metadata(RECORD_NAME, run.to_record())
 
     def write(self, streams: Iterable[Stream]) -> None:
         """Write a block of streams, merged in log-time order; ties keep the order given.

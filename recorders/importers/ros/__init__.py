@@ -1,0 +1,1 @@
+"""Logs of ROS 1 and ROS 2: .bag, .db3 and MCAP files, and folders of them, without ROS."""

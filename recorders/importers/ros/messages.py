@@ -1,0 +1,305 @@
+"""What messages of ROS become: for each type the streams, their columns, and what their channels state.
+
+The types are those of common_interfaces and vision_msgs; the conventions on what is unknown are those
+of sensor_msgs: a covariance of zeros, or whose first number is -1, is none.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.importers.ros.layouts import Messages
+from recorders.log import Schema, schemas
+
+Floats = NDArray[np.float64]
+STAMP, FRAME, CHILD_FRAME = "header.stamp", "header.frame_id", "child_frame_id"
+_NO_FIX = -1  # sensor_msgs/NavSatStatus
+# A motion in the plane has less than this of the rest, in m/s and rad/s.
+_PLANAR = 1e-6
+
+
+@dataclass(frozen=True)
+class Part:
+    """What some messages (n,) say for one stream.
+
+    Attributes:
+        kind: the last part of the stream's name.
+        columns: the fields (k,) or (k, width) of the stream's schema.
+        metadata: what the channel states.
+        constants: columns (k, width) of which the channel states the first value, by their names there.
+        rows: of which message each is; None where there is one of each.
+        dropped: by reason, which (k,) are left out.
+        doubtful: by reason, which (k,) are kept all the same.
+    """
+
+    kind: str
+    schema: Schema
+    columns: Mapping[str, NDArray]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    constants: Mapping[str, Floats] = field(default_factory=dict)
+    rows: NDArray[np.int64] | None = None
+    dropped: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    doubtful: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+
+class Taken(NamedTuple):
+    """How messages of a type are taken: the kinds of the streams that they give, and what reads them."""
+
+    kinds: tuple[str, ...]
+    parts: Callable[[Messages], Iterator[Part]]
+
+
+def stamps_ns(messages: Messages, path: str = STAMP) -> NDArray[np.int64] | None:
+    """The stamps (n,) in ns of a field, a time or a whole number of ns; None where there is none."""
+    numbers = messages.layout.numbers
+    if path in numbers:
+        return messages.numbers(path).astype(np.int64)
+    if f"{path}.sec" not in numbers:
+        return None
+    seconds = messages.numbers(f"{path}.sec").astype(np.int64)
+    return seconds * 1_000_000_000 + messages.numbers(f"{path}.nanosec")
+
+
+def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:
+    """The numbers (n, d) that a field such as a Vector3 has under `names`."""
+    return np.stack([messages.numbers(f"{path}.{name}") for name in names], axis=1).astype(float)
+
+
+def quaternion(messages: Messages, path: str) -> Floats:
+    """A quaternion (n, 4): w, x, y, z."""
+    return vector(messages, path, "wxyz")
+
+
+def covariance(messages: Messages, path: str) -> Floats:
+    """A covariance (n, d * d), row-major; NaN where it is unknown."""
+    found = messages.numbers(path).astype(float)
+    unknown = (found == 0.0).all(axis=1) | (found[:, 0] == -1.0)
+    return np.where(unknown[:, None], np.nan, found)
+
+
+def _unknown(messages: Messages, width: int) -> Floats:
+    return np.full((len(messages), width), np.nan)
+
+
+def _fix(messages: Messages) -> Iterator[Part]:
+    yield Part(
+        "fix",
+        schemas.GEODETIC_FIX,
+        {
+            "latitude_deg": messages.numbers("latitude"),
+            "longitude_deg": messages.numbers("longitude"),
+            "altitude_m": messages.numbers("altitude"),
+            "covariance_m2": np.where(
+                (messages.numbers("position_covariance_type") == 0)[:, None],
+                np.nan,
+                covariance(messages, "position_covariance"),
+            ),
+        },
+        dropped={"without a fix": messages.numbers("status.status") == _NO_FIX},
+    )
+
+
+def _inertial(messages: Messages) -> Iterator[Part]:
+    yield Part(
+        "inertial",
+        schemas.INERTIAL_SAMPLE,
+        {
+            "specific_force_mps2": vector(messages, "linear_acceleration"),
+            "turn_rate_radps": vector(messages, "angular_velocity"),
+            "magnetic_field_ut": _unknown(messages, 3),
+        },
+        constants={
+            "specific_force_covariance_m2ps4": covariance(messages, "linear_acceleration_covariance"),
+            "turn_rate_covariance_rad2ps2": covariance(messages, "angular_velocity_covariance"),
+        },
+    )
+    orientation = quaternion(messages, "orientation")
+    is_none = (messages.numbers("orientation_covariance")[:, 0] == -1.0) | (orientation == 0.0).all(
+        axis=1
+    )
+    yield Part(
+        "orientation",
+        schemas.ORIENTATION,
+        {"quaternion": orientation},
+        constants={"covariance_rad2": covariance(messages, "orientation_covariance")},
+        dropped={"without an orientation": is_none},
+    )
+
+
+def _magnetic(messages: Messages) -> Iterator[Part]:
+    yield Part(
+        "magnetic_field",
+        schemas.MAGNETIC_FIELD,
+        {
+            "magnetic_field_ut": 1e6 * vector(messages, "magnetic_field"),
+            "covariance_ut2": 1e12 * covariance(messages, "magnetic_field_covariance"),
+        },
+    )
+
+
+def _odometry(messages: Messages) -> Iterator[Part]:
+    """The twist, as a body's in the plane and in full, and the pose that the robot made of it."""
+    velocity, turn = vector(messages, "twist.twist.linear"), vector(messages, "twist.twist.angular")
+    beside = np.abs(np.concatenate([velocity[:, 1:], turn[:, :2]], axis=1)).max(axis=1)
+    yield Part(
+        "odometry",
+        schemas.ODOMETRY,
+        {"forward_mps": velocity[:, 0], "turn_radps": turn[:, 2]},
+        doubtful={
+            "with a motion sideways, up or down, rolling or pitching, which it leaves out": beside
+            > _PLANAR
+        },
+    )
+    yield _twist("odometry_twist", messages, "twist.twist", "twist.covariance")
+    yield _pose(
+        "odometry_pose", messages, "pose.pose.position", "pose.pose.orientation", "pose.covariance"
+    )
+
+
+def _twist(kind: str, messages: Messages, path: str, uncertainty: str = "") -> Part:
+    return Part(
+        kind,
+        schemas.TWIST,
+        {
+            "velocity_mps": vector(messages, f"{path}.linear" if path else "linear"),
+            "turn_rate_radps": vector(messages, f"{path}.angular" if path else "angular"),
+            "covariance": covariance(messages, uncertainty) if uncertainty else _unknown(messages, 36),
+        },
+    )
+
+
+def _pose(kind: str, messages: Messages, position: str, orientation: str, uncertainty: str = "") -> Part:
+    return Part(
+        kind,
+        schemas.POSE,
+        {
+            "position_m": vector(messages, position),
+            "quaternion": quaternion(messages, orientation),
+            "covariance": covariance(messages, uncertainty) if uncertainty else _unknown(messages, 36),
+        },
+    )
+
+
+def _twists(path: str, uncertainty: str = "") -> Taken:
+    return Taken(("twist",), lambda messages: iter([_twist("twist", messages, path, uncertainty)]))
+
+
+def _poses(position: str, orientation: str, uncertainty: str = "") -> Taken:
+    return Taken(
+        ("pose",), lambda messages: iter([_pose("pose", messages, position, orientation, uncertainty)])
+    )
+
+
+def _point(messages: Messages) -> Iterator[Part]:
+    columns = {"position_m": vector(messages, "point"), "covariance_m2": _unknown(messages, 9)}
+    yield Part("position", schemas.POSITION_FIX, columns)
+
+
+def _orientation(messages: Messages) -> Iterator[Part]:
+    yield Part("orientation", schemas.ORIENTATION, {"quaternion": quaternion(messages, "quaternion")})
+
+
+def _range(messages: Messages) -> Iterator[Part]:
+    """Ranges as REP 117 has them: beyond the limits there is none."""
+    distance = messages.numbers("range").astype(float)
+    least, most = messages.numbers("min_range"), messages.numbers("max_range")
+    yield Part(
+        "range",
+        schemas.RANGE,
+        {"target_id": np.zeros(len(messages), np.uint32), "range_m": distance},
+        constants={
+            "field_of_view_rad": messages.numbers("field_of_view")[:, None].astype(float),
+            "least_range_m": least[:, None].astype(float),
+            "most_range_m": most[:, None].astype(float),
+        },
+        dropped={"outside the sensor's limits": ~((distance >= least) & (distance <= most))},
+    )
+
+
+def _detections(names: str, unit: str) -> Taken:
+    """A scan for each message, and its detections: the centres of the boxes."""
+
+    def parts(messages: Messages) -> Iterator[Part]:
+        count, size = messages.layout.counts["detections"], len(messages)
+        scan_id = messages.rows.astype(np.uint32)
+        yield Part(
+            "scan", schemas.SCAN, {"scan_id": scan_id, "detections": np.full(size, count, np.uint32)}
+        )
+        centres = []
+        for number in range(count):
+            centre = f"detections.{number}.bbox.center"
+            is_nested = f"{centre}.position.x" in messages.layout.numbers
+            centres.append(vector(messages, f"{centre}.position" if is_nested else centre, names))
+        if not count:
+            return
+        yield Part(
+            "detections",
+            schemas.DETECTION,
+            {
+                "scan_id": np.repeat(scan_id, count),
+                "position_m": np.stack(centres, axis=1).reshape(size * count, len(names)),
+            },
+            metadata={"components": ",".join(f"{name}_{unit}" for name in names)},
+            rows=np.repeat(np.arange(size), count),
+        )
+
+    return Taken(("scan", "detections"), parts)
+
+
+def _measured(components: Mapping[str, str]) -> Taken:
+    """Numbers without a meaning that the type tells: fields by the components' names."""
+    metadata = {"components": ",".join(components), "kinds": ",".join(["linear"] * len(components))}
+
+    def parts(messages: Messages) -> Iterator[Part]:
+        value = np.stack([messages.numbers(path) for path in components.values()], axis=1).astype(float)
+        yield Part("value", schemas.VECTOR_MEASUREMENT, {"value": value}, metadata)
+
+    return Taken(("value",), parts)
+
+
+def _array(messages: Messages) -> Iterator[Part]:
+    yield Part("value", schemas.VECTOR_MEASUREMENT, {"value": messages.numbers("data").astype(float)})
+
+
+def _xyz(path: str) -> dict[str, str]:
+    return {name: f"{path}{name}" for name in "xyz"}
+
+
+_NUMBERS = ["Bool", "Float32", "Float64"]
+_NUMBERS += [f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)]
+
+TYPES: dict[str, Taken] = {
+    "sensor_msgs/msg/NavSatFix": Taken(("fix",), _fix),
+    "sensor_msgs/msg/Imu": Taken(("inertial", "orientation"), _inertial),
+    "sensor_msgs/msg/MagneticField": Taken(("magnetic_field",), _magnetic),
+    "sensor_msgs/msg/Range": Taken(("range",), _range),
+    "nav_msgs/msg/Odometry": Taken(("odometry", "odometry_twist", "odometry_pose"), _odometry),
+    "geometry_msgs/msg/Twist": _twists(""),
+    "geometry_msgs/msg/TwistStamped": _twists("twist"),
+    "geometry_msgs/msg/TwistWithCovariance": _twists("twist", "covariance"),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twists("twist.twist", "twist.covariance"),
+    "geometry_msgs/msg/Pose": _poses("position", "orientation"),
+    "geometry_msgs/msg/PoseStamped": _poses("pose.position", "pose.orientation"),
+    "geometry_msgs/msg/PoseWithCovariance": _poses("pose.position", "pose.orientation", "covariance"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _poses(
+        "pose.pose.position", "pose.pose.orientation", "pose.covariance"
+    ),
+    "geometry_msgs/msg/TransformStamped": _poses("transform.translation", "transform.rotation"),
+    "geometry_msgs/msg/PointStamped": Taken(("position",), _point),
+    "geometry_msgs/msg/QuaternionStamped": Taken(("orientation",), _orientation),
+    "geometry_msgs/msg/Vector3": _measured(_xyz("")),
+    "geometry_msgs/msg/Vector3Stamped": _measured(_xyz("vector.")),
+    "sensor_msgs/msg/Temperature": _measured({"temperature_degc": "temperature"}),
+    "sensor_msgs/msg/FluidPressure": _measured({"pressure_pa": "fluid_pressure"}),
+    "sensor_msgs/msg/RelativeHumidity": _measured({"humidity": "relative_humidity"}),
+    "sensor_msgs/msg/Illuminance": _measured({"illuminance_lx": "illuminance"}),
+    "std_msgs/msg/Float32MultiArray": Taken(("value",), _array),
+    "std_msgs/msg/Float64MultiArray": Taken(("value",), _array),
+    "vision_msgs/msg/Detection2DArray": _detections("xy", "px"),
+    "vision_msgs/msg/Detection3DArray": _detections("xyz", "m"),
+    **{f"std_msgs/msg/{name}": _measured({"data": "data"}) for name in _NUMBERS},
+}
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

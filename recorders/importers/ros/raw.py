@@ -1,0 +1,65 @@
+"""Messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+
+from recorders.log.layout import windows
+
+FORMATS = {
+    "ros1msg": MessageDefinitionFormat.MSG,
+    "ros2msg": MessageDefinitionFormat.MSG,
+    "ros2idl": MessageDefinitionFormat.IDL,
+    "omgidl": MessageDefinitionFormat.IDL,
+}
+UNDEFINED = MessageDefinition(MessageDefinitionFormat.NONE, "")
+
+
+class Connection(NamedTuple):
+    """One publisher's topic in a file; its type is named as ROS 2 does, `nav_msgs/msg/Odometry`.
+
+    `encoding` is cdr or ros1 where the messages can be read.
+    """
+
+    topic: str
+    type_name: str
+    encoding: str
+    definition: MessageDefinition
+    messages: int
+
+
+class Batch(NamedTuple):
+    """Some messages (n,) of a connection, in file order: where in `data` they are, and their stamps."""
+
+    connection: Connection
+    data: NDArray[np.uint8]
+    begins: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    log_time_ns: NDArray[np.int64]
+
+
+class BagFile(Protocol):
+    """One file of a bag. `losses` says what of it cannot be read; it is whole after the reading."""
+
+    path: Path
+    connections: list[Connection]
+    losses: list[str]
+
+    def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
+        """The messages of the wanted connections, a chunk of the file at a time."""
+
+
+def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[np.int64]) -> Batch:
+    """Messages (n,) that are apart in memory, laid end to end."""
+    lengths = np.array([len(part) for part in parts], np.int64)
+    data = np.frombuffer(b"".join(parts), np.uint8)
+    return Batch(connection, data, np.cumsum(lengths) - lengths, lengths, log_time_ns)
+
+
+def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDArray:
+    """The numbers (n,) of a type that stand at `places` (n,) of `data`."""
+    return windows(data, np.dtype(dtype).itemsize)[places].view(dtype)

@@ -1,0 +1,216 @@
+"""Transforms between frames (TF): those that are sent, as poses, and named pairs composed of them.
+
+A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
+that part of its chain which is sent most often; the others are interpolated between the two nearest,
+linearly and along the shortest rotation, as tf2 does it, and never beyond their ends. What is held is
+what no such time has passed, so that memory stays bounded.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.ros.layouts import Messages
+from recorders.importers.ros.messages import quaternion, stamps_ns, vector
+from recorders.models.orientation import compose, conjugate, require_unit, rotate
+
+Floats = NDArray[np.float64]
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
+
+    `rows` says of which message of its topic each is.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    log_time_ns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    position_m: Floats
+    quaternion: Floats
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def take(self, rows: NDArray | slice) -> "Transforms":
+        """Some of them."""
+        return Transforms(
+            self.stamp_ns[rows],
+            self.log_time_ns[rows],
+            self.rows[rows],
+            self.position_m[rows],
+            self.quaternion[rows],
+        )
+
+
+def transforms_of(
+    messages: Messages, log_time_ns: NDArray[np.int64]
+) -> Iterator[tuple[Pair, Transforms]]:
+    """The transforms in messages (n,), by parent and child.
+
+    Raises BadInput where a quaternion is not of unit length.
+    """
+    for number in range(messages.layout.counts["transforms"]):
+        path = f"transforms.{number}"
+        stamp_ns = stamps_ns(messages, f"{path}.header.stamp")
+        parents = messages.text(f"{path}.header.frame_id")
+        children = messages.text(f"{path}.child_frame_id")
+        for parent, child in dict.fromkeys(zip(parents.tolist(), children.tolist(), strict=True)):
+            rows = (parents == parent) & (children == child)
+            pair = _frame(parent), _frame(child)
+            what = f"the rotation of frame {pair[1]} in {pair[0]}"
+            found = Transforms(
+                np.asarray(stamp_ns)[rows],
+                log_time_ns[rows],
+                messages.rows[rows],
+                vector(messages, f"{path}.transform.translation")[rows],
+                require_unit(quaternion(messages, f"{path}.transform.rotation")[rows], what, 1e-3),
+            )
+            yield pair, found
+
+
+def _frame(name: bytes) -> str:
+    return name.decode(errors="replace").lstrip("/")
+
+
+def join(parts: Sequence[Transforms]) -> Transforms:
+    """Parts in the order of their stamps."""
+    joined = Transforms(
+        np.concatenate([part.stamp_ns for part in parts]),
+        np.concatenate([part.log_time_ns for part in parts]),
+        np.concatenate([part.rows for part in parts]),
+        np.concatenate([part.position_m for part in parts]),
+        np.concatenate([part.quaternion for part in parts]),
+    )
+    return joined.take(np.argsort(joined.stamp_ns, kind="stable"))
+
+
+class Chain:
+    """A pair of frames, and the transforms that lead from one to the other.
+
+    Args:
+        pair: parent and child.
+        sent: how often each transform is sent.
+        static: those that hold for good.
+
+    `left_out` counts the stamps at which not every part of the chain is known, or which come too late.
+    Raises BadInput where no transforms lead from one to the other.
+    """
+
+    def __init__(self, pair: Pair, sent: Mapping[Pair, int], static: Mapping[Pair, Transforms]) -> None:
+        self.pair = pair
+        self._static = {each: static[each].take(slice(-1, None)) for each in static}
+        self._links = _path(pair, [*sent, *static])
+        moving = [link for link, _ in self._links if link not in static]
+        self._leader = max(moving, key=lambda each: sent[each], default=None)
+        self._held: dict[Pair, list[Transforms]] = {link: [] for link in moving}
+        self._done_ns = -1
+        self.left_out = 0
+
+    def add(self, pair: Pair, found: Transforms) -> None:
+        """Take up transforms, where they are of the chain."""
+        if pair in self._held and len(found):
+            self._held[pair].append(found)
+            self.left_out += int((found.stamp_ns <= self._done_ns).sum()) if pair == self._leader else 0
+
+    def composed(self, *, is_last: bool = False) -> Transforms | None:
+        """The pair's poses since the last call, up to where every part of the chain is known."""
+        if self._leader is None or not all(self._held.values()):
+            return None
+        held = {link: join(parts) for link, parts in self._held.items()}
+        known_ns = min(part.stamp_ns[-1] for part in held.values())
+        if is_last:
+            known_ns = max(part.stamp_ns[-1] for part in held.values())
+        leader = held[self._leader]
+        wanted = leader.take((leader.stamp_ns > self._done_ns) & (leader.stamp_ns <= known_ns))
+        self._done_ns = max(self._done_ns, int(known_ns))
+        for link, part in held.items():
+            # the last one before stays, for what is interpolated from it
+            first = max(int(np.searchsorted(part.stamp_ns, known_ns, side="right")) - 1, 0)
+            self._held[link] = [part.take(slice(first, None))]
+        inside = np.ones(len(wanted), bool)
+        for part in held.values():
+            inside &= (wanted.stamp_ns >= part.stamp_ns[0]) & (wanted.stamp_ns <= part.stamp_ns[-1])
+        self.left_out += int((~inside).sum())
+        wanted = wanted.take(inside)
+        if not len(wanted):
+            return None
+        return self._product(
+            {link: interpolated(part, wanted.stamp_ns) for link, part in held.items()}, wanted
+        )
+
+    @property
+    def static(self) -> Transforms | None:
+        """The pair's pose, where it never changes."""
+        if self._held:
+            return None
+        zero = np.zeros(1, np.int64)
+        return self._product({}, Transforms(zero, zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
+
+    def _product(self, moving: Mapping[Pair, Transforms], wanted: Transforms) -> Transforms:
+        """The chain's transforms one after another, at the wanted stamps."""
+        position = np.zeros((len(wanted), 3))
+        orientation = np.tile([1.0, 0.0, 0.0, 0.0], (len(wanted), 1))
+        for link, is_forward in self._links:
+            part = moving[link] if link in moving else self._static[link]
+            step, turn = part.position_m, part.quaternion
+            if not is_forward:
+                turn = conjugate(turn)
+                step = -rotate(turn, step)
+            position = position + rotate(orientation, step)
+            orientation = compose(orientation, turn)
+        orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
+        return replace(wanted, position_m=position, quaternion=orientation)
+
+
+def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
+    """Transforms at other stamps (n,), which lie within those of the given ones."""
+    last = len(given) - 1
+    after = np.clip(np.searchsorted(given.stamp_ns, stamp_ns), 0, last)
+    before = np.maximum(after - (given.stamp_ns[after] > stamp_ns), 0)
+    gap_ns = np.maximum(given.stamp_ns[after] - given.stamp_ns[before], 1)
+    share = ((stamp_ns - given.stamp_ns[before]) / gap_ns)[:, None]
+    begin, end = given.quaternion[before], given.quaternion[after]
+    cosine = (begin * end).sum(axis=1, keepdims=True)
+    end, angle = np.where(cosine < 0.0, -end, end), np.arccos(np.minimum(np.abs(cosine), 1.0))
+    is_small = angle < 1e-8
+    sine = np.where(is_small, 1.0, np.sin(angle))
+    first = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / sine)
+    second = np.where(is_small, share, np.sin(share * angle) / sine)
+    position = given.position_m[before] * (1.0 - share) + given.position_m[after] * share
+    return Transforms(stamp_ns, stamp_ns, stamp_ns, position, first * begin + second * end)
+
+
+def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
+    """The links from one frame to the other, and whether each is gone along or against its direction."""
+    above = {child: parent for parent, child in links}
+    parent, child = pair
+    for frame in pair:
+        if frame not in above and frame not in above.values():
+            frames = sorted({each for link in links for each in link})
+            raise BadInput(
+                f"no transform has the frame '{frame}'; there are {', '.join(frames) or 'none'}"
+            )
+    up, down = _ancestors(parent, above), _ancestors(child, above)
+    common = next((frame for frame in up if frame in down), None)
+    if common is None:
+        raise BadInput(
+            f"no transforms lead from '{parent}' to '{child}': from '{parent}' they end at '{up[-1]}', "
+            f"from '{child}' at '{down[-1]}'; record the transform between, or name another pair"
+        )
+    upwards = [((above[frame], frame), False) for frame in up[: up.index(common)]]
+    downwards = [((above[frame], frame), True) for frame in down[: down.index(common)]]
+    return [*upwards, *reversed(downwards)]
+
+
+def _ancestors(frame: str, above: Mapping[str, str]) -> list[str]:
+    """The frame, its parent, and so on to the root."""
+    found = [frame]
+    while (parent := above.get(found[-1])) is not None and parent not in found:
+        found.append(parent)
+    return found
