@@ -283,7 +283,7 @@ FAULTS = [
         EVALUATION,
     ),
     Fault(
-        "replay/judging/truths.py",
+        "replay/engine/tangent.py",
         "(span <= gap_limit_s * 1e9)",
         "(span < gap_limit_s * 1e9)",
         EVALUATION,

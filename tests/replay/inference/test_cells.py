@@ -27,8 +27,12 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
-# So many that a sharp measurement does not leave a few of them.
-ENOUGH = {"particles": {"particles": 10_000}}
+# So many particles that a sharp measurement does not leave a few of them; and these vehicles go on as they
+# are: an interacting multiple model that expects manoeuvres is too careful.
+SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
+    **{(name, "particles"): {"particles": 10_000} for name in SCENARIOS},
+    ("vehicle", "imm"): {"manoeuvres_per_s": 0.0},
+}
 CELLS = [
     (name, method)
     for name, model in registered_models().items()
@@ -63,7 +67,7 @@ def nees(model: str, method: str, **settings: Any) -> tuple[float, float]:
 @pytest.mark.parametrize(("model", "method"), CELLS)
 def test_every_cell_is_consistent(model: str, method: str) -> None:
     """The mean NEES per component is 1 within 4 standard errors where the model is near linear."""
-    mean, error = nees(model, method, **ENOUGH.get(method, {}))
+    mean, error = nees(model, method, **SETTINGS.get((model, method), {}))
     if model in NEAR_LINEAR:
         assert abs(mean - 1) < 4 * error
 

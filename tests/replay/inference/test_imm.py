@@ -288,7 +288,7 @@ def test_the_chain_is_the_matrix_exponential(duration_s: float) -> None:
 
 
 def test_the_chain_of_the_sheet() -> None:
-    """Section 3, which prints .0246288...: no row that sums to one, and not five times .004925..."""
+    """Section 3: the probabilities after .05 s."""
     found = np.empty((2, 2))
     changing(2)(np.array([0.1, 0.5]), 0.05, found)
     wanted = [[0.995074255591, 0.00492574440858], [0.0246287220429, 0.975371277957]]
