@@ -27,7 +27,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
-# So many particles that a sharp measurement does not leave a few of them; and these vehicles go on as they
+# So many particles that a sharp measurement does not leave a few; and these vehicles go on as they
 # are: an interacting multiple model that expects manoeuvres is too careful.
 SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     **{(name, "particles"): {"particles": 10_000} for name in SCENARIOS},
