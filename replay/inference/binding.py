@@ -140,8 +140,8 @@ def reading_settings(names: tuple[str, ...]) -> Function:
     return function_of(text, Settings=settings_type(names))
 
 
-class _Recorder:
-    """Parameters that remember which of them were read; what is unset reads as one."""
+class Recorder:
+    """Parameters that remember in `read` which of them were; what is unset reads as one."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
@@ -189,7 +189,7 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
     """The parameters that motion and sensors read; BadInput where the model is not what it says."""
     model, values = stage.model, dict(given)
     check_state(where, model)
-    motion, *sensors = recorders = [_Recorder(values) for _ in range(1 + len(stage.sensors))]
+    motion, *sensors = recorders = [Recorder(values) for _ in range(1 + len(stage.sensors))]
     check_motion(where, model, stage.motion, motion)
     for sensor, recorder in zip(stage.sensors, sensors, strict=True):
         check_sensor(where, model, sensor, recorder)
@@ -200,7 +200,7 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     """Why a message was not used, and what would help; "" where no covariance can be missing."""
     if not sensor.covariance:
         return ""
-    recorder = _Recorder(dict.fromkeys(number_fields(model.parameters)))
+    recorder = Recorder(dict.fromkeys(number_fields(model.parameters)))
     if sensor.noise is not None:
         sensor.noise(recorder)
     mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))
