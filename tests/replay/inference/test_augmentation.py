@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
+import fuselog as fl
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
@@ -115,6 +116,11 @@ def test_augmented_models_keep_to_what_they_declare() -> None:
     assert [sensor.linear for sensor in same.sensors] == [each.linear for each in wheel.sensors]
     assert not augmented(ON_A_LINE, ("delay_s",)).sensors[0].linear
     check_model(augmented(ON_A_LINE, ("delay_s",)))
+
+
+def test_what_can_be_estimated_is_listed() -> None:
+    listed = "bias_range_m, bias_bearing_rad (angle), forward_scale, turn_bias_radps"
+    assert fl.models["robot"].facts["estimable"] == listed
 
 
 def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
