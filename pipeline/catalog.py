@@ -137,6 +137,8 @@ def _model(name: str, model: Model) -> Entry:
         facts[f"control {model.control.topic}"] = ", ".join(model.control.components)
     if model.modes:
         facts["modes"] = ", ".join(model.modes)
+    if model.estimable:
+        facts["estimable"] = _listed(model.estimable)
     facts["needs"] = needs_of(model)
     facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
     return Entry(name, model.summary, facts, model.parameters)

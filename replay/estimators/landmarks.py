@@ -22,10 +22,15 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """Noise densities are per square root of a second; None takes what the log's channels state."""
+    """Noise densities are per square root of a second; None takes what the log's channels state.
+
+    The robot drives `forward_scale` times what the odometry says, and turns faster by `turn_bias_radps`.
+    """
 
     forward_noise_density: NonNegativeFloat | None = None
     turn_noise_density: NonNegativeFloat | None = None
+    forward_scale: float = 1.0
+    turn_bias_radps: float = 0.0
 
 
 class LocalizationParameters(DeadReckoningParameters):
@@ -40,7 +45,9 @@ class LocalizationParameters(DeadReckoningParameters):
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
     """The pose at the end of an arc."""
-    return drive(pose, velocity, duration_s)
+    forward, turn = velocity
+    true = parameters.forward_scale * forward, turn + parameters.turn_bias_radps
+    return drive(pose, true, duration_s)
 
 
 def velocity_noise(duration_s: Any, parameters: Any) -> Components:
@@ -92,6 +99,8 @@ def bearing_noise(parameters: Any) -> Components:
 
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
+DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps": "linear"}
+SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
 MOTION = Motion(move, control_noise=velocity_noise)
 ODOMETRY = Control("odometry", schemas.ODOMETRY, ("forward_mps", "turn_radps"), estimates=True)
 ROBOT = Model(
@@ -113,6 +122,7 @@ ROBOT = Model(
     MOTION,
     control=ODOMETRY,
     output="pose",
+    estimable={**SIGHT_ERRORS, **DRIVE_ERRORS},
 )
 RECKONING = Model(
     "robot pose from odometry alone",
@@ -123,5 +133,6 @@ RECKONING = Model(
     control=ODOMETRY,
     output="pose",
     needs_sensor=False,
+    estimable=DRIVE_ERRORS,
 )
 DEAD_RECKONING = modelled(RECKONING, "ekf")

@@ -148,8 +148,8 @@ def trial_parameters(model: Model) -> Any:
     return settings_type(names)(*(1.0,) * len(names))
 
 
-class _Recorder:
-    """Parameters that remember which of them were read; what is unset reads as one."""
+class Recorder:
+    """Parameters that remember in `read` which of them were; what is unset reads as one."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
@@ -200,7 +200,7 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
     """The parameters that motion and sensors read; BadInput where the model is not what it says."""
     model, values = stage.model, dict(given)
     check_state(where, model)
-    motion, *sensors = recorders = [_Recorder(values) for _ in range(1 + len(stage.sensors))]
+    motion, *sensors = recorders = [Recorder(values) for _ in range(1 + len(stage.sensors))]
     for each in stage.modes or (stage.motion,):
         check_motion(where, model, each, motion)
     if stage.modes:
@@ -214,7 +214,7 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     """Why a message was not used, and what would help; "" where no covariance can be missing."""
     if not sensor.covariance:
         return ""
-    recorder = _Recorder(dict.fromkeys(number_fields(model.parameters)))
+    recorder = Recorder(dict.fromkeys(number_fields(model.parameters)))
     if sensor.noise is not None:
         sensor.noise(recorder)
     mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))

@@ -21,6 +21,14 @@ from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, innovation_stream, state_stream
+from replay.inference.augmentation import (
+    Start,
+    augmented,
+    augmented_stage,
+    begin,
+    estimated,
+    with_drifts,
+)
 from replay.inference.binding import (
     Found,
     complaint_of,
@@ -176,24 +184,36 @@ def bind_model(
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
+    names = estimated(label, model, parameters)
+    lacking = method.lacks(augmented(model, names))
+    if names and lacking:
+        raise BadInput(
+            f"estimator {label}: with estimate = {', '.join(names)} the model lacks {lacking}, which "
+            "this method needs"
+        )
     for found in topics_of(model, topics):
-        stage = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
-        numbers = settings_of(label, stage, found, parameters)
+        own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
+        numbers = settings_of(label, own, found, parameters)
+        stage = augmented_stage(own, names)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)
-        made_of = (name, found, stage, method, parameters, numbers, samplers)
+        settings = with_drifts(numbers, names, parameters)
+        made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
         streams = (*control, *(topic.name for _, topic in found.sensors))
         whole = filtering.whole(topics)
         priors = {found.prior.name: model.state}
-        start, run, finish = filtering.start, filtering.run, filtering.finish
+        begun = begin(label, found.prior.name, own, names, numbers, parameters)
+        start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        bound.append(replace(made, rewinding=partial(_rewinding, made, filtering)))
+        bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
     return bound
 
 
-def _rewinding(bound: Recursive, filtering: "Filter", window_ns: int) -> Recursive:
+def _rewinding(
+    bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
+) -> Recursive:
     """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
     reason = filtering.cannot_rewind
     if reason:
@@ -201,7 +221,7 @@ def _rewinding(bound: Recursive, filtering: "Filter", window_ns: int) -> Recursi
             f"estimator {bound.name}: --late rewind: {reason}; give --late drop or --late wait:SECONDS"
         )
     back = Rewinding(filtering, window_ns)
-    return replace(bound, start=back.start, run=back.run, finish=back.finish)
+    return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
 
 
 def _made_for(label: str, method: Method, parameters: Any) -> Method:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
@@ -53,11 +53,16 @@ class MethodParameters(Parameters):
     """What every method takes.
 
     `every_s` asks for estimates every so often, beside those at the stamps of sensors; `mode` is the
-    motion to use of a model that has several.
+    motion to use of a model that has several. `estimate` names parameters that become part of the state:
+    each starts from its value with the standard deviation that `estimate_sigma` has for it, and drifts
+    at random by the density (per square root of a second) that `estimate_drift` has, by default not.
     """
 
     every_s: PositiveFloat | None = None
     mode: str | None = None
+    estimate: list[str] | None = None
+    estimate_sigma: dict[str, PositiveFloat] | None = None
+    estimate_drift: dict[str, NonNegativeFloat] | None = None
 
 
 class UnscentedParameters(MethodParameters):

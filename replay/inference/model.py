@@ -6,7 +6,7 @@ every model that gives what the method needs.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -185,6 +185,8 @@ class Model:
         output: the last part of the estimates' topic.
         system: what a channel's metadata has to name as its `system`, if anything.
         needs_sensor: whether a log without any of its sensors does not fit.
+        estimable: the parameters that may become part of the state, linear or angles, see
+            `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
     A thing on a line, whose range from the origin is measured:
 
@@ -228,6 +230,7 @@ class Model:
     output: str = "state"
     system: str = ""
     needs_sensor: bool = True
+    estimable: Components = field(default_factory=dict)
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -57,6 +57,19 @@ TABLE: dict[str, tuple[str, ...]] = {
     ),
     "run landmarks --late drop": ("only in the order of their arrival",),
     "run reactor --arrival-order": ("study reactor goes by the stamps", "leave out"),
+    'replay log.mcap -e ekf --set estimate=["bias_rnge_m"]': (
+        "no parameter that this model lets be estimated",
+        "'bias_range_m'",
+    ),
+    'replay log.mcap -e ekf --set estimate=["sigma_speed"]': ("lets be estimated", "bias_bearing_rad"),
+    'replay log.mcap -e ekf --set estimate=["bias_range_m"]': ("estimate_sigma.bias_range_m=",),
+    'replay log.mcap -e ekf --set estimate=["bias_range_m"] --set estimate_sigma.bias_range_m=0': (
+        "'estimate_sigma.bias_range_m' is 0",
+        "greater than 0",
+    ),
+    'replay log.mcap -e ekf --set estimate=["bias_range_m","bias_range_m"] '
+    "--set estimate_sigma.bias_range_m=1": ("twice",),
+    "replay log.mcap -e ekf --set estimate_drift.bias_range_m=1": ("`estimate` lacks bias_range_m",),
     "replay log.mcap -e ekf --set mode=calm": ("mode = calm", "one motion", "leave out"),
     "replay log.mcap -e ekf --set sigma_rnge_m=1": ("no such", "'sigma_range_m'"),
     "replay log.mcap -e ekf --set point_variance_m2=1": (

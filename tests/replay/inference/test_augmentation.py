@@ -1,0 +1,233 @@
+"""Parameters in the state: the same as a model that was written so, and recovered within their sigma."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.stats import chi2
+
+import fuselog as fl
+from pipeline.ensemble import record_ensemble, replay_ensemble
+from recorders.log import RunMetadata, make_stream, schemas
+from recorders.models.planar import range_bearing
+from replay.engine.blocks import gather
+from replay.engine.sources import MemorySource
+from replay.estimators.landmarks import RECKONING, ROBOT
+from replay.inference.augmentation import augmented
+from replay.inference.checking import check_model
+from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from tests.replay.inference import vehicle_a
+from tests.replay.inference.replays import outputs
+from tests.replay.inference.vehicle_a import (
+    RANGE_BEARING,
+    SPEED,
+    VEHICLE_A,
+    VehicleParameters,
+    move,
+    noise,
+)
+from tests.replay.inference.wheel import make_wheel
+
+BIAS, SIGMA, DRIFT = 0.25, 0.5, 0.02
+ESTIMATE: dict[str, Any] = {
+    "estimate": ["bias_range_m"],
+    "estimate_sigma": {"bias_range_m": SIGMA},
+    "estimate_drift": {"bias_range_m": DRIFT},
+}
+
+
+class BiasedParameters(VehicleParameters):
+    """With a range bias."""
+
+    bias_range_m: float = BIAS
+
+
+def see(state: Any, about: Any, parameters: Any) -> Any:
+    distance, bearing = range_bearing((state[0], state[1], state[2]), about)
+    return distance + parameters.bias_range_m, bearing
+
+
+def see_by_state(state: Any, about: Any, parameters: Any) -> Any:
+    distance, bearing = range_bearing((state[0], state[1], state[2]), about)
+    return distance + state[5], bearing
+
+
+def move_six(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    x, y, heading, speed, turn = move(state[:5], control, duration_s, parameters)
+    return x, y, heading, speed, turn, state[5]
+
+
+def noise_six(state: Any, duration_s: Any, parameters: Any) -> Any:
+    x, y, heading, speed, turn = noise(state[:5], duration_s, parameters)
+    return x, y, heading, speed, turn, 0.02**2 * duration_s
+
+
+DECLARED = replace(
+    VEHICLE_A,
+    parameters=BiasedParameters,
+    sensors=(replace(RANGE_BEARING, measure=see), SPEED),
+    estimable={"bias_range_m": "linear"},
+)
+WRITTEN = Model(
+    "the same by hand",
+    {**vehicle_a.STATE, "bias_range_m": "linear"},
+    VehicleParameters,
+    (replace(RANGE_BEARING, measure=see_by_state), SPEED),
+    Motion(move_six, noise_six),
+)
+
+
+def with_bias(source: MemorySource) -> MemorySource:
+    """The log with the bias in its prior."""
+    longer = make_stream(
+        "/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        source.streams["/prior"].publish_time_ns,
+        metadata={
+            "components": ",".join(WRITTEN.state),
+            "kinds": ",".join(WRITTEN.state.values()),
+        },
+        mean=[[*vehicle_a.MEAN, BIAS]],
+        covariance=np.diag([*vehicle_a.VARIANCES, SIGMA**2]).reshape(1, 36),
+    )
+    return MemorySource({**source.streams, "/prior": longer}, source.run, source.name)
+
+
+@pytest.mark.parametrize("method", ["ekf", "ukf", "smoother"])
+def test_it_is_the_model_that_has_it_in_its_state(method: str) -> None:
+    source = vehicle_a.source(vehicle_a.simulate(7)[0])
+    found = outputs(DECLARED, method, [source], **ESTIMATE)
+    by_hand = outputs(WRITTEN, method, [with_bias(source)])
+    assert found["state"].stream.components[-1] == "bias_range_m"
+    for name in ("mean", "covariance"):
+        assert_allclose(found["state"][name], by_hand["state"][name], rtol=1e-9, atol=1e-12)
+    likelihoods = [each["innovation"]["log_likelihood"].sum() for each in (found, by_hand)]
+    assert_allclose(*likelihoods, rtol=1e-12)
+
+
+def test_augmented_models_keep_to_what_they_declare() -> None:
+    """With noise of all kinds; what reads none of them stays linear."""
+    check_model(augmented(ROBOT, tuple(ROBOT.estimable)))
+    check_model(augmented(RECKONING, ("forward_scale",)))
+    wheel = replace(make_wheel(), estimable={"gate_probability": "linear"})
+    check_model(same := augmented(wheel, ("gate_probability",)))
+    assert [sensor.linear for sensor in same.sensors] == [each.linear for each in wheel.sensors]
+    assert not augmented(ON_A_LINE, ("delay_s",)).sensors[0].linear
+    check_model(augmented(ON_A_LINE, ("delay_s",)))
+
+
+def test_what_can_be_estimated_is_listed() -> None:
+    listed = "bias_range_m, bias_bearing_rad (angle), forward_scale, turn_bias_radps"
+    assert fl.models["robot"].facts["estimable"] == listed
+
+
+def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
+    """And the pose is as good as its covariance says, which without them it is not."""
+    runs, true = 40, {"bias_range_m": 0.2, "turn_bias_radps": 0.02}
+    scenario = {
+        "duration_s": 20.0,
+        "turn_bias_radps": true["turn_bias_radps"],
+        "range_bearing": {"rate_hz": 5.0, "bias_range_m": true["bias_range_m"]},
+    }
+    sources = record_ensemble("landmarks", scenario, 17, runs)
+    sigmas = {"bias_range_m": 0.3, "turn_bias_radps": 0.05}
+    settings = {"estimate": list(true), "estimate_sigma": sigmas, "gate_probability": 1.0}
+    labels = ["ekf", "ukf", "smoother:ekf"]
+    replayed = replay_ensemble(sources, dict.fromkeys(labels, settings), gap_limit_s=0.2)
+    metrics = replayed.metrics()
+    for label in labels:
+        poses = replayed.outputs[f"/estimates/{label}/robot1/pose"]
+        last = gather([poses.of_run(run).take(slice(-1, None)) for run in range(runs)]).stream
+        for index, (name, value) in enumerate(true.items(), start=3):
+            assert last.components[index] == name
+            sigma = np.sqrt(last["covariance"].reshape(runs, 5, 5)[:, index, index])
+            assert sigma.max() < 0.2 * sigmas[name]
+            squares = (((last["mean"][:, index] - value) / sigma) ** 2).sum()
+            assert chi2.ppf(0.005, runs) < squares < chi2.ppf(0.995, runs)
+        nees = metrics[f"{label}.nees.robot1"] * runs
+        assert chi2.ppf(0.005, 3 * runs) < nees < chi2.ppf(0.995, 3 * runs)
+    without = replay_ensemble(sources, {"ekf": {}}, gap_limit_s=0.2).metrics()
+    assert without["ekf.nees.robot1"] > 30
+
+
+# A time offset: what the sensor says is of the state of so much earlier
+
+
+class OffsetParameters(ModelParameters):
+    """How old a fix is when it is stamped."""
+
+    delay_s: float = 0.0
+
+
+def fix(state: Any, about: Any, parameters: Any) -> Any:
+    return (state[0] - parameters.delay_s * state[1],)
+
+
+def prompt_fix(state: Any, about: Any, parameters: Any) -> Any:
+    return (state[0],)
+
+
+def fix_noise(parameters: Any) -> Any:
+    return (0.05**2,)
+
+
+def walk(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+    return state[0] + duration_s * state[1], state[1]
+
+
+def walk_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+    return 0.0, 0.5 * duration_s
+
+
+FIX = Sensor(
+    "fix",
+    schemas.VECTOR_MEASUREMENT,
+    {"x_m": "linear"},
+    fix,
+    fix_noise,
+    read=lambda stream: stream["value"],
+    linear=True,
+)
+ON_A_LINE = Model(
+    "on a line",
+    {"x_m": "linear", "vx_mps": "linear"},
+    OffsetParameters,
+    (FIX, replace(FIX, topic="prompt", measure=prompt_fix)),
+    Motion(walk, walk_noise, linear=True),
+    estimable={"delay_s": "linear"},
+)
+
+
+def test_a_time_offset_is_a_parameter_too() -> None:
+    """A model whose state says how it moves lets its sensor see the state of another time."""
+    rng, delay_s, count = np.random.default_rng(3), 0.2, 400
+    x, speed = np.zeros(count), np.full(count, 3.0)
+    for k in range(1, count):
+        speed[k] = speed[k - 1] + np.sqrt(0.5 * 0.1) * rng.standard_normal()
+        x[k] = x[k - 1] + 0.1 * speed[k - 1]
+    stamps = 10**9 + 10**8 * np.arange(count)
+    streams = [
+        make_stream(
+            topic,
+            schemas.VECTOR_MEASUREMENT,
+            stamps,
+            value=(value + 0.05 * rng.standard_normal(count))[:, None],
+        )
+        for topic, value in {"/fix": x - delay_s * speed, "/prompt": x}.items()
+    ]
+    prior = make_stream(
+        "/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        stamps[:1],
+        metadata={"components": "x_m,vx_mps", "kinds": "linear,linear"},
+        mean=[[0.0, 3.0]],
+        covariance=[[0.01, 0.0, 0.0, 0.01]],
+    )
+    run = RunMetadata("line", epoch_ns=0)
+    source = MemorySource({each.topic: each for each in (prior, *streams)}, run, "line")
+    settings: dict[str, Any] = {"estimate": ["delay_s"], "estimate_sigma": {"delay_s": 0.5}}
+    last = outputs(ON_A_LINE, "ekf", [source], **settings)["state"].stream
+    sigma = np.sqrt(last["covariance"][-1][-1])
+    assert abs(last["mean"][-1, 2] - delay_s) < 3 * sigma < 0.05
