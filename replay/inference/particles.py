@@ -38,7 +38,9 @@ from replay.inference.generate import (
     derivative,
     differencing,
     filling,
+    lower_of,
     moments_of,
+    offset_of,
     retraction,
     tuple_of,
     weighted_mean_of,
@@ -332,6 +334,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     t, noise = stage.model.tangent, stage.motion.noise
     assert noise is not None
     read_state, add_noise = tuple_of(stage.model.size), adding_noise(t)
+    read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
     def factored(lower: Floats, variances: Any) -> bool:
         for row in range(t):
@@ -343,20 +346,18 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     def spread(
         states: Floats, offsets: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
     ) -> bool:
-        before = noise(read_state(states[0]), duration_s, parameters)
+        before, drawn = noise(read_state(states[0]), duration_s, parameters), memory.drawn[:, first:]
         if not factored(memory.lower, before):
             return False
+        lower = read_lower(memory.lower)
         for i in range(len(states)):
             found = noise(read_state(states[i]), duration_s, parameters)
             if found != before:
                 before = found
                 if not factored(memory.lower, found):
                     return False
-            for row in range(t):
-                entry = 0.0
-                for k in range(row + 1):
-                    entry += memory.lower[row, k] * memory.drawn[i, first + k]
-                offsets[i, row] = entry
+                lower = read_lower(memory.lower)
+            fill(offsets[i], offset(lower, drawn, i))
         return True
 
     return spread

@@ -35,7 +35,7 @@ ACCELERATION_MPS2, TURN_RADPS = 0.5, 0.05
 
 def main() -> list[Row]:
     """Microseconds per fix; both have to come as near to the Kalman filter as their number allows."""
-    motion = {"turn_rate_radps": [TURN_RADPS], "vehicles": 1, "duration_s": 200.0}
+    motion = {"turn_rate_radps": [TURN_RADPS], "vehicles": 1, "duration_s": 1000.0}
     source = record_ensemble("vehicles", motion, 1, 1)[0]
     exact = means_of(source, "vehicle-kalman")
     for found in (means_of(source, f"particles:{PARTICLES}"), stone_soup(source)):
