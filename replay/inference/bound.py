@@ -251,6 +251,11 @@ class BoundFilter(Filter):
             )
         return (*super().whole(topics), self.truth)
 
+    @property
+    def cannot_rewind(self) -> str:
+        """See `Filter.cannot_rewind`."""
+        return "a bound is that of all messages in the order of their stamps"
+
     def start(self, whole: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, see `Filter.start`."""
         state = super().start(whole)

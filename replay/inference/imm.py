@@ -47,7 +47,7 @@ from replay.inference.methods import (
     filter_with,
 )
 from replay.inference.model import Model, switching_of
-from replay.inference.recursion import Happenings, Innovations
+from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.steps import Gaussian, Note, Stage, Steps, noting, slots_of
 
 TINY = 1e-280  # below it a probability loses digits
@@ -510,13 +510,23 @@ class Interacting(Filter):
         probability = np.empty((len(mean), len(self.stage.modes)))
         return Mixtures(end, time_ns, mean, covariance, probability), innovations
 
+    @property
+    def cannot_rewind(self) -> str:
+        """See `Filter.cannot_rewind`."""
+        if self.parameters.smoothed_modes:
+            return "smoothed modes use what came later in any case (smoothed_modes)"
+        return super().cannot_rewind
+
+    def told(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
+        """The streams of the state and of the modes' probabilities."""
+        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
+        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
+
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
-        after, (mixtures, offsets), made = self.filtered(state, happenings)
-        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
-        made = [self.states(mixtures, offsets), modes, *made]
+        after, made = super().follow(state, happenings)
         if self.parameters.smoothed_modes:
-            after = after._replace(kept=(*state.kept, modes))
+            after = after._replace(kept=(*state.kept, made[1]))
         return after, made
 
     def finish(self, state: State) -> list[Ragged]:

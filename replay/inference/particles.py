@@ -651,6 +651,11 @@ class ParticleFilter(Filter):
         )
         return state._replace(carried=state.carried._replace(belief=cloud))
 
+    @property
+    def cannot_rewind(self) -> str:
+        """See `Filter.cannot_rewind`."""
+        return "all particles would have to be kept for every message of the window"
+
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events of the runs in which something was measured; those of the others wait."""
         if state.kept is not None:

@@ -369,8 +369,8 @@ class Rewinding:
             np.zeros(runs, np.int64),
             scratch=partial(steps.memory, sets),
         )
-        given, offsets = filled(estimates, due)
-        made = [issued(inner.states(given, offsets), happenings, history.start_ns)]
+        states, *others = inner.told(*filled(estimates, due))
+        made = [issued(states, happenings, history.start_ns), *others]
         made += [inner.innovations(*filled(innovations, noted))] if sensors else []
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES

@@ -19,6 +19,7 @@ from replay.engine.sources import MemorySource
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import bound
+from tests.replay.inference.test_imm import SWITCHING_A
 from tests.replay.inference.vehicle_a import VEHICLE_A
 from tests.replay.inference.wheel import make_wheel
 
@@ -297,15 +298,24 @@ def delayed(source: MemorySource, seed: int, *topics: str) -> MemorySource:
 
 
 @pytest.mark.parametrize(
-    ("method", "values"), [("ukf", {"gate_probability": 0.9}), ("lrkf", {"sampling": "s2kf-11"})]
+    ("model", "method", "values"),
+    [
+        (VEHICLE_A, "ukf", {"gate_probability": 0.9}),
+        (VEHICLE_A, "lrkf", {"sampling": "s2kf-11"}),
+        (SWITCHING_A, "imm", {"filter": "ekf"}),
+    ],
 )
-def test_angles_maps_gates_and_missing_components(method: str, values: dict[str, Any]) -> None:
-    """The final estimate and all innovations of a model with all of that."""
+def test_angles_maps_gates_and_missing_components(
+    model: Model, method: str, values: dict[str, Any]
+) -> None:
+    """The final estimate and all innovations of a model with all of that, of several modes too."""
     source = delayed(vehicle_a.source(vehicle_a.simulate(7)[0]), 3, "/sighting", "/speed")
-    in_order = replayed(None, [source], VEHICLE_A, method, **values)
-    back = replayed("rewind:0.5", [cut(source)], VEHICLE_A, method, **values)
+    in_order = replayed(None, [source], model, method, **values)
+    back = replayed("rewind:0.5", [cut(source)], model, method, **values)
     assert len(back["rewound"]) > 10
     assert_array_equal(back["state"]["mean"][-1], in_order["state"]["mean"][-1])
+    if "modes" in in_order:
+        assert_array_equal(back["modes"]["probability"][-1], in_order["modes"]["probability"][-1])
     for name in back["innovation"].stream.columns:
         assert_array_equal(back["innovation"][name], in_order["innovation"][name])
 
@@ -332,11 +342,13 @@ def test_who_cannot_go_back_says_why() -> None:
     other = Recursive("mine", ("/speed",), (), lambda _: None, lambda state, _: (state, []))
     assert isinstance(taking_late(other, parse_late("drop", arrival_order=True)), Recursive)
     random = bound(VEHICLE_A, "lrkf", [source], sampling="rukf-12")
+    cloud = bound(VEHICLE_A, "particles", [source], particles=50)
     (driven,) = bound(make_wheel(), "ekf", [driven_wheel()])
     for refused, late, words in (
         (batch, "drop", "all messages at once"),
         (other, "rewind:1", "a model and a method"),
         (random[0], "rewind:1", "random"),
+        (cloud[0], "rewind:1", "all particles"),
         (driven, "rewind:1", "drive is interpolated"),
     ):
         with pytest.raises(BadInput, match=f"estimator {refused.name}: .*{words}"):
