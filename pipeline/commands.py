@@ -251,8 +251,6 @@ def evaluate_trajectory(
         raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
     if logs or metrics or errors or recover:
         raise BadInput("--log, --metric, --errors and --recover: are for logs; --truth is for files")
-    if out is not None:
-        check_folder(out, {"input": [estimates[0], truth]})
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
     for sentence in done.notes:
