@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
@@ -107,6 +106,9 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     Raises BadInput where no poses belong together, they do not tell the alignment, or the way is shorter
     than the delta.
     """
+    for each in (estimate, truth):
+        if not len(each):
+            raise BadInput(f"{each.name}: holds no poses; give a trajectory that has some")
     offset_s = comparison.time_offset_s
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
@@ -323,6 +325,8 @@ def _best_lag(estimate: Floats, truth: Floats) -> int:
 
     Pearson's correlation of what overlaps, which is half of the shorter one at least.
     """
+    from scipy.signal import correlate, correlation_lags  # which takes long to import
+
     everywhere = np.ones_like(estimate), np.ones_like(truth)
     count = np.rint(correlate(everywhere[1], everywhere[0]))
     sums = correlate(everywhere[1], estimate), correlate(truth, everywhere[0])

@@ -220,6 +220,7 @@ def test_what_cannot_be_compared_is_told() -> None:
         (bare, bare, {"time_offset_s": "estimate"}, ("has no stamps",)),
         (bare, bare, {"time_offset_s": 1.0}, ("has no stamps",)),
         (line, truth, {"time_offset_s": "estimate"}, ("line", "speed never changes")),
+        (truth, truth.take(np.arange(0)), {}, ("walk: holds no poses",)),
         (truth, truth, {"align": "se4"}, ("align is 'se4'", "did you mean 'se3'")),
         (truth, truth, {"gap_limit_s": -1}, ("gap_limit_s is -1",)),
     ):
