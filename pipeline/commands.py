@@ -267,6 +267,10 @@ def evaluate_trajectory(
         )
         return
     print_pose_errors(done.metrics)
+    if done.compared.time_offset_s:
+        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimate")
+    if done.comparison.align == "sim3":
+        say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
     for path in written:
         say(str(path))
 
