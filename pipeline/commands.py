@@ -253,8 +253,6 @@ def evaluate_trajectory(
         raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
     if logs or metrics or errors or recover:
         raise BadInput("--log, --metric, --errors and --recover: are for logs; --truth is for files")
-    if out is not None:
-        check_folder(out, {"input": [estimates[0], truth]})
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
     for sentence in done.notes:
@@ -271,6 +269,10 @@ def evaluate_trajectory(
         )
         return
     print_pose_errors(done.metrics)
+    if done.compared.time_offset_s:
+        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimate")
+    if done.comparison.align == "sim3":
+        say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
     for path in written:
         say(str(path))
 

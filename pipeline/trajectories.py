@@ -226,6 +226,8 @@ def compare_logs(
 ) -> ComparedLogs:
     """Compare the estimated positions of logs with their truths, and align each run by itself.
 
+    Memory holds the poses of all runs.
+
     Raises BadInput as `compare`, and where an alignment would turn a planar state out of its plane.
     """
     compared: dict[tuple[str, str], list[Compared]] = {}
@@ -275,7 +277,7 @@ def _path_chart(compared: Mapping[str, Compared]) -> Chart:
     for label, done in compared.items():
         series.append(path(label, done.estimate.position_m[thinned(len(done.estimate))][:, plane]))
     x, y = (Axis(label=f"{AXES[axis]} (m)") for axis in plane)
-    return Chart(title="paths, aligned", panels=[Panel(x=x, y=y, series=series, plane=True)])
+    return Chart(title="paths", panels=[Panel(x=x, y=y, series=series, plane=True)])
 
 
 def _error_chart(compared: Mapping[str, Compared]) -> Chart:

@@ -51,6 +51,8 @@ class Trajectory:
             values = getattr(self, what)
             if values is not None and values.shape != shape:
                 raise BadInput(f"{self.name}: {what} has shape {values.shape}; expected {shape}")
+        if self.time_ns is not None and np.any(np.diff(self.time_ns) < 0):
+            raise BadInput(f"{self.name}: its stamps go back; give the poses in the order of time")
 
     def __len__(self) -> int:
         return len(self.position_m)

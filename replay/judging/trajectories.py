@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
@@ -29,6 +28,8 @@ Association = Literal["nearest", "interpolated"]
 POSE_KINDS = ("linear",) * 3 + ("quaternion",) * 4
 # Grids for the time offset are no longer than this.
 MOST_STEPS = 1 << 20
+# From the correlation's best place to the best offset it is a few steps.
+MOST_MOVES = 50
 
 
 @dataclass(frozen=True)
@@ -106,13 +107,15 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     Raises BadInput where no poses belong together, they do not tell the alignment, or the way is shorter
     than the delta.
     """
+    for each in (estimate, truth):
+        if not len(each):
+            raise BadInput(f"{each.name}: holds no poses; give a trajectory that has some")
     offset_s = comparison.time_offset_s
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
-    if estimate.time_ns is not None:
-        estimate = replace(estimate, time_ns=estimate.time_ns + round(offset_s * 1e9))
-    elif offset_s:
-        raise BadInput(f"{estimate.name}: has no stamps, so that no time offset can be added")
+    if offset_s:
+        _stamps(truth)  # without which the offset would go unnoticed
+        estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
     matched, true = associate(estimate, truth, comparison)
     if matched.rotation is None or true.rotation is None:
         matched, true = replace(matched, rotation=None), replace(true, rotation=None)
@@ -281,8 +284,8 @@ def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
 def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
     """What to add to the estimate's stamps, in s, so that it is nearest to the truth.
 
-    Where the speeds of both, which no alignment changes, correlate most is known first; about there the
-    offset with the least RMSE of aligned positions is searched.
+    From where the speeds of both correlate most, which no alignment changes, the search goes down to the
+    offset with the least RMSE of aligned positions.
 
     Raises BadInput where one has no stamps, or its speed never changes.
     """
@@ -301,20 +304,30 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
                 f"{trajectory.name}: its speed never changes, which tells no time offset; give it in s"
             )
         speeds.append(speed - speed.mean())
-    first_s = times[1][0] - times[0][0] + _best_lag(*speeds) * step_s
+    offset_s = float(times[1][0] - times[0][0] + _best_lag(*speeds) * step_s)
+
+    def covered(offset_s: float) -> NDArray[np.bool_]:
+        return (times[1][0] <= times[0] + offset_s) & (times[0] + offset_s <= times[1][-1])
+
+    least = covered(offset_s).sum() / 2  # of few poses the RMSE is small anywhere
 
     def rmse_m(offset_s: float) -> float:
-        at_s = times[0] + offset_s
-        inside = (times[1][0] <= at_s) & (at_s <= times[1][-1])
-        if not inside.any():
+        inside = covered(offset_s)
+        if inside.sum() < least:
             return np.inf
-        there, true = estimate.position_m[inside], _positions_at(truth, times[1], at_s[inside])
+        there = estimate.position_m[inside]
+        true = _positions_at(truth, times[1], times[0][inside] + offset_s)
         found = alignment_of(there, true, align, estimate.name)
         error = found.scale * there @ found.rotation.T + found.translation_m - true
         return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
-    around = first_s - 2 * step_s, first_s + 2 * step_s
-    return float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
+    for _ in range(MOST_MOVES):
+        around = offset_s - 2 * step_s, offset_s + 2 * step_s
+        before_s = offset_s
+        offset_s = float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
+        if abs(offset_s - before_s) < step_s:
+            break
+    return offset_s
 
 
 def _best_lag(estimate: Floats, truth: Floats) -> int:
@@ -322,6 +335,8 @@ def _best_lag(estimate: Floats, truth: Floats) -> int:
 
     Pearson's correlation of what overlaps, which is half of the shorter one at least.
     """
+    from scipy.signal import correlate, correlation_lags  # which takes long to import
+
     everywhere = np.ones_like(estimate), np.ones_like(truth)
     count = np.rint(correlate(everywhere[1], everywhere[0]))
     sums = correlate(everywhere[1], estimate), correlate(truth, everywhere[0])

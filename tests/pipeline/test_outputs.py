@@ -63,6 +63,7 @@ COMMANDS = {
     "evaluate in a result --out": Command(
         "evaluate result/estimates/run-0000.mcap --out OUT", "", ("result/estimates/run-0000.mcap",)
     ),
+    "evaluate --truth --out": Command("evaluate line.tum --truth line.tum --out OUT", "", ("line.tum",)),
     "view --save": Command("view log.mcap --save OUT", ".rrd", ("log.mcap",)),
     "view --screenshot": Command("view log.mcap --screenshot OUT", ".png", ("log.mcap",)),
     "view a timeline --screenshot": Command(
@@ -172,6 +173,7 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("audit")
     with chdir(folder):
         Path("dead.toml").write_text(EXPERIMENT)
+        Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))
         Path("ais.csv").write_text(AIS)
         Path("mrclam").mkdir()
         for name, text in MRCLAM.items():

@@ -91,3 +91,11 @@ def test_what_is_no_text_is_told(tmp_path: Path) -> None:
     for place, words in ((tmp_path / "poses", "is no text"), (tmp_path / "none", "No such file")):
         with pytest.raises(BadInput, match=words):
             read_trajectory(place)
+
+
+def test_arrays_that_are_no_trajectory_are_refused() -> None:
+    position_m = np.zeros((2, 3))
+    with pytest.raises(BadInput, match=r"mine: rotation has shape \(2, 4\); expected \(2, 3, 3\)"):
+        Trajectory("mine", position_m, rotation=np.zeros((2, 4)))
+    with pytest.raises(BadInput, match="mine: its stamps go back"):
+        Trajectory("mine", position_m, time_ns=np.array([1, 0]))

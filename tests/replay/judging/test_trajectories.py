@@ -188,6 +188,19 @@ def test_a_time_offset_is_found(offset_s: float) -> None:
     assert statistics(done.absolute_m)["rmse"] < 0.04
 
 
+def test_an_offset_that_speeds_do_not_tell_is_found_by_the_positions() -> None:
+    """A speed that grows evenly correlates with itself at every lag."""
+    time_s = np.linspace(0, 20, 201)
+    spiral = np.stack([time_s * np.cos(time_s), time_s * np.sin(time_s), 0.1 * time_s], axis=1)
+    stamps = np.rint(time_s * 1e9).astype(np.int64)
+    truth = Trajectory("truth", spiral, time_ns=stamps)
+    noise = np.random.default_rng(3).normal(scale=0.05, size=spiral.shape)
+    estimate = Trajectory("estimate", spiral + noise, time_ns=stamps + SECOND)
+    for align in ("none", "se3", "sim3"):
+        found = estimated_offset_s(estimate, truth, align)  # type: ignore[arg-type]
+        assert found == pytest.approx(-1.0, abs=0.02)  # aligned, a shift in time is nearly a turn
+
+
 def test_offsets_of_real_data(trajectories: Path) -> None:
     names = "freiburg1_xyz-rgbdslam_drift.txt", "freiburg1_xyz-groundtruth.txt"
     estimate, truth = (read_trajectory(trajectories / name) for name in names)
@@ -218,8 +231,9 @@ def test_what_cannot_be_compared_is_told() -> None:
         (truth, truth, {"delta": 1e6, "delta_unit": "m"}, ("m long", "smaller delta than 1e+06")),
         (bare, bare, {"delta_unit": "s"}, ("has no stamps",)),
         (bare, bare, {"time_offset_s": "estimate"}, ("has no stamps",)),
-        (bare, bare, {"time_offset_s": 1.0}, ("has no stamps",)),
+        (truth, bare, {"time_offset_s": 1.0}, ("has no stamps",)),
         (line, truth, {"time_offset_s": "estimate"}, ("line", "speed never changes")),
+        (truth, truth.take(np.arange(0)), {}, ("walk: holds no poses",)),
         (truth, truth, {"align": "se4"}, ("align is 'se4'", "did you mean 'se3'")),
         (truth, truth, {"gap_limit_s": -1}, ("gap_limit_s is -1",)),
     ):
