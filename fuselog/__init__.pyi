@@ -21,6 +21,7 @@ from pipeline.door import write as write
 from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
+from pipeline.observing import observability as observability
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome
