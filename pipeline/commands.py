@@ -30,7 +30,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import Clock, Log, open_log
 from recorders.parameters import parse_settings
 from recorders.parsing import parse_json
-from replay.engine.estimator import configure, find_estimator
+from replay.engine.estimator import find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
 from replay.judging.metrics import find_metrics
@@ -113,7 +113,7 @@ def _settings_of_estimators(
     """Parameters by estimator label.
 
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
-    BadInput where none has, or an estimator refuses it.
+    BadInput where none has.
     """
     chosen: dict[str, dict[str, Any]] = {}
     known: dict[str, set[str]] = {}
@@ -133,8 +133,6 @@ def _settings_of_estimators(
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
         for label in takers:
             chosen[label].setdefault(key, settings[key])
-    for label, values in chosen.items():
-        configure(label, values)
     return chosen
 
 

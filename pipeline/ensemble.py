@@ -9,13 +9,13 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import ExitStack
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import psutil
@@ -41,6 +41,7 @@ RUNS_AT_ONCE = 128
 # Of a run that was judged, so much is kept at least: its sums over time.
 KEPT_BYTES = 8 * TIME_BINS
 
+Item = TypeVar("Item")
 Settings = Mapping[str, Mapping[str, Any]]
 Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
 
@@ -167,12 +168,17 @@ def replay_parts(
                 block_messages=block_messages,
                 is_part=not part.is_all,
             )
-            for block in blocks:
-                for run, writer in enumerate(writers):
-                    writer.write([ragged.of_run(run) for ragged in block.values()])
+
+            def judge_and_draw(block: Mapping[str, Ragged]) -> None:
                 judged = judge.add(block)
                 if drawing is not None:
                     drawing.add(*of_run(block, judged.errors, 0))
+
+            hand_over = stack.enter_context(behind(judge_and_draw))
+            for block in blocks:
+                hand_over(block)
+                for run, writer in enumerate(writers):
+                    writer.write([ragged.of_run(run) for ragged in block.values()])
                 yield
         if passes:
             passes[0].judge.merge(judge)
@@ -187,6 +193,25 @@ def replay_parts(
         if all(name in report.refused for report in reports):
             raise refusal
     return passes[0]
+
+
+@contextmanager
+def behind(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
+    """Items handed over are worked on in order, one at a time, while the caller goes on.
+
+    What the work raises is raised when the next item is handed over, or at the end.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        working: list[Future[None]] = []
+
+        def hand_over(item: Item) -> None:
+            while working:
+                working.pop().result()
+            working.append(pool.submit(work, item))
+
+        yield hand_over
+        for last in working:
+            last.result()
 
 
 def bind_from(

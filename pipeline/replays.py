@@ -29,7 +29,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import Clock, RunMetadata, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.blocks import gather
-from replay.engine.estimator import Estimator, configure
+from replay.engine.estimator import Estimator
 from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.inference.model import Model
 from replay.judging.evaluation import Errors, innovations_of
@@ -307,7 +307,6 @@ def _settings(
                     f"estimator {label} is {type(kind).__name__}; make an estimator of it with "
                     "recursive, batch or modelled"
                 )
-            configure(label, chosen[label])
     if not chosen:
         raise BadInput("there are no estimators to replay; give at least one")
     return chosen

@@ -322,7 +322,7 @@ class Ensemble(list[SourceType]):
         """
         if not topics:
             return
-        if self._recordings and all(run.is_whole for run in self._recordings):
+        if self._are_whole:
             block = self._laid_out(topics, order)
             if any(len(ragged) for ragged in block.values()):
                 yield block
@@ -341,6 +341,11 @@ class Ensemble(list[SourceType]):
         """The runs, where all are in memory."""
         found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
         return found if len(found) == len(self) else []
+
+    @cached_property
+    def _are_whole(self) -> bool:
+        """Whether all runs are in memory, without spans."""
+        return bool(self._recordings) and all(run.is_whole for run in self._recordings)
 
     def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
         """Topics of recordings."""

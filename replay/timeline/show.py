@@ -93,6 +93,7 @@ class Drawing:
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
         """Take in a block of the run's outputs, and the errors of its estimates."""
         self._kept.add(outputs, errors)
+        self._sensed.advance(self._kept.last_ns)
         if self._live is not None:
             self._fresh.add(outputs, errors)
             if self._fresh.added >= LIVE_MESSAGES:

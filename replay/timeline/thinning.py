@@ -72,9 +72,8 @@ class Thinned(Generic[Rows]):
             self._parts = []
         self._parts.append(rows)
         self._count += count
-        while self._limit is not None and self._count > 2 * self._limit and self._shift < LAST_SHIFT:
-            self._shift += 1
-            self._thin()
+        if self._limit is not None and self._count > 2 * self._limit:
+            self._coarsen(2 * self._limit)
 
     @property
     def rows(self) -> Rows:
@@ -82,6 +81,14 @@ class Thinned(Generic[Rows]):
         if len(self._parts) > 1:
             self._thin()
         return self._parts[0]
+
+    def _coarsen(self, most: int) -> None:
+        """Widen the cells until so many rows are left at most."""
+        time_ns = np.concatenate([self._time_ns(part) for part in self._parts])
+        while len(time_ns) > most and self._shift < LAST_SHIFT:
+            self._shift += 1
+            time_ns = time_ns[last_of_cells(time_ns, self._shift)]
+        self._thin()
 
     def _thin(self) -> None:
         """Join the parts: of a cell that two of them share, the later one tells."""
@@ -123,13 +130,14 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 
 
 class Thin:
-    """The outputs of a run and the errors of its estimates, thinned."""
+    """The outputs of a run and the errors of its estimates, thinned; the last stamp of an output."""
 
     def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
         self._outputs: dict[str, Thinned[Stream]] = {}
         self._errors: dict[tuple[str, str], Thinned[Errors]] = {}
         self.added = 0
+        self.last_ns = -1
 
     def add(self, outputs: Mapping[str, Stream], errors: Sequence[Errors]) -> None:
         """Take in a block."""
@@ -138,6 +146,8 @@ class Thin:
                 self._outputs[topic] = thinned_stream(stream.schema.full_name, self._rows)
             self._outputs[topic].add(stream)
             self.added += len(stream)
+            if len(stream):
+                self.last_ns = max(self.last_ns, int(stream.publish_time_ns[-1]))
         for each in errors:
             what = each.estimator, each.case
             if what not in self._errors:
@@ -153,12 +163,6 @@ class Thin:
     def errors(self) -> list[Errors]:
         """What is kept of the errors."""
         return [kept.rows for kept in self._errors.values()]
-
-    @property
-    def last_ns(self) -> int:
-        """The last stamp of an output."""
-        ends = [int(each.publish_time_ns[-1]) for each in self.outputs.values() if len(each)]
-        return max(ends, default=-1)
 
 
 @dataclass(frozen=True)
@@ -235,7 +239,7 @@ class Sensed:
 
     def read_to(self, time_ns: int) -> Held:
         """What comes up to a stamp, and has not come yet, thinned to what is drawn; maps whole."""
-        self._advance(time_ns)
+        self.advance(time_ns)
         streams = {
             topic: (self._kept if self._is_map(topic) else self._fresh)[topic].rows
             for topic in self._topics
@@ -243,7 +247,8 @@ class Sensed:
         self._fresh = self._empty(DRAWN_ROWS)
         return Held(self.source, streams)
 
-    def _advance(self, time_ns: int) -> None:
+    def advance(self, time_ns: int) -> None:
+        """Read on up to a stamp."""
         while self._read_to_ns < time_ns and (block := next(self._blocks, None)) is not None:
             for topic, stream in block.items():
                 self._kept[topic].add(stream)
@@ -256,5 +261,5 @@ class Sensed:
 
     def all(self) -> Held:
         """The whole run, thinned."""
-        self._advance(np.iinfo(np.int64).max)
+        self.advance(np.iinfo(np.int64).max)
         return Held(self.source, {topic: kept.rows for topic, kept in self._kept.items()})
