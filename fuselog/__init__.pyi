@@ -22,6 +22,7 @@ from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
 from pipeline.exporting import export as export
+from pipeline.observing import observability as observability
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome

@@ -239,6 +239,37 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     replay_logs(list(logs), list(names), **options)
 
 
+@fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--model", help="The model, where several fit the logs.")
+@click.option(
+    "--window",
+    "window_s",
+    type=Seconds(),
+    help="Seconds of measurements to look at in turn [default: the whole run].",
+)
+@click.option(
+    "--scale",
+    "scales",
+    multiple=True,
+    metavar="COMPONENT=SIGMA",
+    help="What is worth one, instead of the prior's standard deviation (repeatable).",
+)
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
+@recover_option
+@json_option
+@set_option
+def observability(logs: tuple[Path, ...], **options: Any) -> None:
+    """Say how much the measurements of LOGS tell of the state, and which direction they tell least of.
+
+    For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
+    trajectory, in units of what the prior tells.
+    """
+    from pipeline.observing import show_observability
+
+    show_observability(list(logs), **options)
+
+
 @fuselog.command(short_help="Judge estimates against the truth.")
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")

@@ -74,7 +74,7 @@ def replay_logs(
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
-    starts = origins_of(sources, origins, _sigmas(sigmas), order, gap_limit_s)
+    starts = origins_of(sources, origins, sigmas_of(sigmas, "--start-sigma"), order, gap_limit_s)
     estimates = list(zip(paths, logs, strict=True))
     done = replay_parts(
         cut_in_parts(sources, estimates, starts),
@@ -141,8 +141,8 @@ def _settings_of_estimators(
     return chosen
 
 
-def _sigmas(texts: Sequence[str]) -> dict[str, float]:
-    """Standard deviations by component, from COMPONENT=SIGMA."""
+def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
+    """Standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
     sigmas: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")
@@ -151,7 +151,7 @@ def _sigmas(texts: Sequence[str]) -> dict[str, float]:
         except ValueError:
             sigmas[name] = math.nan
         if not 0 < sigmas[name] < math.inf:
-            raise BadInput(f"--start-sigma {text}: expected COMPONENT=SIGMA with a positive number")
+            raise BadInput(f"{option} {text}: expected COMPONENT=SIGMA with a positive number")
     return sigmas
 
 

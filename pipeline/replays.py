@@ -89,7 +89,7 @@ def replay(
     settings = _settings(estimators)
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
-    sources = [span_of(_source(log), start_s, end_s, order) for log in _listed(logs)]
+    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
     origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("fuselog-replay"))
@@ -270,11 +270,12 @@ class Replay:
         return digest.hexdigest()
 
 
-def _listed(logs: Log | Iterable[Log]) -> list[Log]:
+def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
+    """One log or several as sources; raises BadInput where there is none, or one is no log."""
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
         raise BadInput("there are no logs to replay; give at least one")
-    return found
+    return [_source(log) for log in found]
 
 
 def _source(log: Log) -> LogSource | MemorySource:

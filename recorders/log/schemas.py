@@ -384,6 +384,16 @@ ITERATION = _declare(
     _real("damping"),
     _real("largest_step"),
 )
+OBSERVABILITY = _declare(
+    "Observability",
+    "What the measurements since an earlier stamp say of the state at that stamp: the rank and the "
+    "eigenvalues, ascending, of the local Gramian in units of the prior, and the direction of the least.",
+    Field("begin_time_ns", "time_ns"),
+    _identifier("rank"),
+    _identifier("measurements"),
+    _vector("eigenvalues"),
+    _vector("direction"),
+)
 TRACK_ESTIMATE = _declare(
     "TrackEstimate",
     "Mean and covariance of one of several states, known by its number.",

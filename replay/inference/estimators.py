@@ -86,16 +86,20 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
     """
     if method not in FILTERS:
         raise BadInput(f"no filter '{method}'; {choices(method, FILTERS)}")
-    chosen = FILTERS[method]
-    lacking = chosen.lacks(model)
+    return modelled_by(model, FILTERS[method], method)
+
+
+def modelled_by(model: Model, method: Method, name: str) -> Estimator[Any]:
+    """The estimator of one model by a method of that name; BadInput where the model lacks something."""
+    lacking = method.lacks(model)
     if lacking:
-        raise BadInput(f"method {method} needs {lacking}")
+        raise BadInput(f"method {name} needs {lacking}")
     return Estimator(
-        f"{model.summary}, {chosen.summary}",
+        f"{model.summary}, {method.summary}",
         needs_of(model),
-        combined(model, chosen),
-        partial(bind_model, model=model, method=chosen),
-        variant=chosen.variant,
+        combined(model, method),
+        partial(bind_model, model=model, method=method),
+        variant=method.variant,
     )
 
 

@@ -28,7 +28,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Ragged, copied, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.components import Components
@@ -201,8 +201,8 @@ def affine_motion(stage: Stage) -> Function:
     add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
     noise_enters = bool(motion.noises) or motion.control_noise is not None
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
-    flat = is_flat(model.kinds)
-    turn, turn_back = resetting(model.kinds), resetting(model.kinds, back=True)
+    flat, carry = is_flat(model.kinds), carrying(model.kinds)
+    turn = resetting(model.kinds)
 
     def predict(
         mean: Floats,
@@ -224,10 +224,7 @@ def affine_motion(stage: Stage) -> Function:
         if not flat:
             turn(offset, noise)
             turn(offset, noise.T)
-            for row in range(len(step)):
-                step[row] = -offset[row]
-            turn_back(step, work.transition)
-            turn(offset, work.transition)
+            carry(offset, work.transition, step)
         for row in range(len(step)):
             step[row] = -offset[row]
             for k in range(len(step)):
@@ -247,6 +244,22 @@ def affine_motion(stage: Stage) -> Function:
         return not np.isnan(squared + held)
 
     return predict
+
+
+def carrying(kinds: tuple[str, ...]) -> Function:
+    """`carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
+
+    Takes tangent vectors at one state to those at the state that lies `offset` from it.
+    """
+    turn, turn_back = resetting(kinds), resetting(kinds, back=True)
+
+    def carry(offset: Floats, rows: Floats, step: Floats) -> None:
+        for row in range(len(step)):
+            step[row] = -offset[row]
+        turn_back(step, rows)
+        turn(offset, rows)
+
+    return carry
 
 
 def reaching(kinds: tuple[str, ...]) -> Function:
@@ -565,6 +578,27 @@ def copy_rows(these: Floats, there: Floats, begin: int, end: int) -> None:
 # As an estimator
 
 
+class Way(NamedTuple):
+    """Runs from their priors to their ends, as the extended smoother has them.
+
+    Attributes:
+        happenings: the events up to the last node, without those that a gate kept out.
+        node: (events,) of every event the node of its stamp.
+        nodes, offsets: the stamps, as the filter went through them; run r owns those from offsets[r] on.
+        states: the smoothed states there.
+        wanted: (nodes,) at which of them estimates are wanted.
+        made: the other outputs of the filter.
+    """
+
+    happenings: Happenings
+    node: Integers
+    nodes: Nodes
+    offsets: Integers
+    states: Estimates
+    wanted: Booleans
+    made: list[Ragged]
+
+
 class IteratedSmoother(Smoother):
     """A smoother that keeps the events of the whole run, and at the end searches their trajectory."""
 
@@ -582,6 +616,21 @@ class IteratedSmoother(Smoother):
         state, _ = self.ended(state)
         if not state.kept:
             return []
+        way = self.smoothed_once(state)
+        kept, offsets = way.states, way.offsets
+        scale = np.diagonal(kept.covariance, axis1=1, axis2=2).copy()
+        if self.parameters.start == "motion":
+            kept.mean[:] = self._moved(state, way)
+        elif self.parameters.start == "prior":
+            kept.mean[:] = np.repeat(state.carried.belief.mean, np.diff(offsets), axis=0)
+        ended = self._search(state, way, scale)
+        rows = way.wanted
+        found = Estimates(kept.end, kept.time_ns[rows], kept.mean[rows], kept.covariance[rows])
+        states = self.states(found, ragged_rows(rows, offsets))
+        return [states, *way.made, *self._told(ended, way)]
+
+    def smoothed_once(self, state: State) -> "Way":
+        """The extended smoother's states at all stamps, from the prior's on."""
         happenings = reduce(joined, (*self._first(state), *state.kept))
         run = np.repeat(np.arange(len(state.tick)), np.diff(happenings.offsets))
         asked, start_ns = happenings.is_due, state.carried.time_ns
@@ -595,27 +644,20 @@ class IteratedSmoother(Smoother):
         node = offsets[run] + stamp
         wanted = np.zeros(offsets[-1], bool)
         wanted[node[asked & known]] = True
-        kept, _ = self.gone_back([Piece(nodes, offsets)])
-        scale = np.diagonal(kept.covariance, axis1=1, axis2=2).copy()
-        if self.parameters.start == "motion":
-            unseen = np.where(happenings.source >= 0, NOTHING, happenings.source)
-            _, (moved, reached), _ = self.filtered(state, happenings._replace(source=unseen))
-            if not np.array_equal(reached, offsets):
-                raise BadInput(
-                    f"estimator {self.name}: start = motion: the prior cannot be moved along all of a "
-                    "run; choose another start"
-                )
-            kept.mean[:] = moved.mean
-        elif self.parameters.start == "prior":
-            kept.mean[:] = np.repeat(state.carried.belief.mean, np.diff(offsets), axis=0)
+        states, _ = self.gone_back([Piece(nodes, offsets)])
         used = of_rows(self._accepted(happenings, start_ns, made), known)
-        ended = self._search(state, used, node[known], nodes, offsets, kept, scale)
-        found = Estimates(kept.end, kept.time_ns[wanted], kept.mean[wanted], kept.covariance[wanted])
-        return [
-            self.states(found, ragged_rows(wanted, offsets)),
-            *made,
-            *self._told(ended, nodes, offsets),
-        ]
+        return Way(used, node[known], nodes, offsets, states, wanted, made)
+
+    def _moved(self, state: State, way: "Way") -> Floats:
+        """The prior's means, moved along all of every run as if nothing was measured."""
+        unseen = np.where(way.happenings.source >= 0, NOTHING, way.happenings.source)
+        _, (moved, reached), _ = self.filtered(state, way.happenings._replace(source=unseen))
+        if not np.array_equal(reached, way.offsets):
+            raise BadInput(
+                f"estimator {self.name}: start = motion: the prior cannot be moved along all of a run; "
+                "choose another start"
+            )
+        return moved.mean
 
     def _first(self, state: State) -> list[Happenings]:
         """The prior's time as an event; an interpolated control has made one already."""
@@ -644,18 +686,10 @@ class IteratedSmoother(Smoother):
             source[events[accepted == 0]] = NOTHING
         return happenings._replace(source=source)
 
-    def _search(
-        self,
-        state: State,
-        happenings: Happenings,
-        node: Integers,
-        nodes: Nodes,
-        offsets: Integers,
-        kept: Estimates,
-        scale: Floats,
-    ) -> Ended:
-        """Search the trajectories of all runs from `kept`, which they replace."""
+    def _search(self, state: State, way: Way, scale: Floats) -> Ended:
+        """Search the trajectories of all runs from the way's states, which they replace."""
         stage, asked = self.stage, self.parameters
+        happenings, nodes, offsets, kept = way.happenings, way.nodes, way.offsets, way.states
         loop, steps = _search(stage)
         t, runs, count = stage.model.tangent, len(offsets) - 1, len(kept.mean)
         noted = ragged_rows(happenings.source >= 0, happenings.offsets)
@@ -685,7 +719,7 @@ class IteratedSmoother(Smoother):
             own = Trajectory(
                 trajectory,
                 kept.mean,
-                node,
+                way.node,
                 scale,
                 loss,
                 np.zeros(1),
@@ -708,10 +742,10 @@ class IteratedSmoother(Smoother):
         )  # fmt: skip
         return ended
 
-    def _told(self, ended: Ended, nodes: Nodes, offsets: Integers) -> list[Ragged]:
+    def _told(self, ended: Ended, way: Way) -> list[Ragged]:
         """How the searches ended, and every pass of each, at the last node of its run."""
-        asked, some = self.parameters, np.diff(offsets) > 0
-        last_ns = np.append(nodes.time_ns, 0)[offsets[1:] - 1]
+        asked, some = self.parameters, np.diff(way.offsets) > 0
+        last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
         cost = ended.told[one, np.maximum(passes - 1, 0), 0]
         t = self.stage.model.tangent

@@ -19,6 +19,8 @@ Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
 
 import re
+import tempfile
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
@@ -46,6 +48,7 @@ from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.steps import Note, Stage, Steps
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
+IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file
 FOREVER_NS = np.iinfo(np.int64).max
 
 
@@ -483,6 +486,29 @@ class Piece(NamedTuple):
     offsets: Integers
 
 
+class Stored:
+    """A piece on disk, in a temporary file that is gone when nobody refers to it any more."""
+
+    def __init__(self, piece: Piece) -> None:
+        self.offsets = piece.offsets
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 lives as long as the piece
+        weakref.finalize(self, self._file.close)
+        for column in piece.nodes:
+            np.save(self._file, column)
+
+    def read(self) -> Piece:
+        """The piece, in memory."""
+        self._file.seek(0)
+        return Piece(Nodes(*(np.load(self._file) for _ in Nodes._fields)), self.offsets)
+
+
+def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
+    """A piece, on disk where it is too much beside those in memory."""
+    in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
+    size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
+    return new if size <= IN_MEMORY_BYTES else Stored(new)
+
+
 class Waiting(NamedTuple):
     """The nodes within the lag, and the steps between them."""
 
@@ -524,7 +550,7 @@ class Smoother(Filter):
         new = Piece(nodes, offsets)
         if self.lag_ns == FOREVER_NS:  # nothing yet
             nothing = self.states(*self.gone_back([new], offsets[:-1]))
-            return after._replace(kept=(*state.kept, new)), [nothing, *made]
+            return after._replace(kept=(*state.kept, stored(state.kept, new))), [nothing, *made]
         piece, window = new, self._no_window(len(offsets) - 1)
         if state.kept:
             piece, window = _joined([state.kept.piece, new]), copied(state.kept.window)
@@ -568,7 +594,7 @@ class Smoother(Filter):
         return Window(turned, through, gain, np.empty((runs, t)), rest)
 
     def gone_back(
-        self, pieces: Sequence[Piece], stop: Integers | None = None
+        self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
     ) -> tuple[Estimates, Integers]:
         """The estimates at the nodes of all pieces, or of one those before row stop[run].
 
@@ -581,7 +607,8 @@ class Smoother(Filter):
         smoothed = _no_estimates(offsets, n, t)
         later = no_later(runs, n, t)
         start = offsets[1:].copy()
-        for piece, of_piece in zip(reversed(pieces), reversed(counts), strict=True):
+        for kept, of_piece in zip(reversed(pieces), reversed(counts), strict=True):
+            piece = kept.read() if isinstance(kept, Stored) else kept
             start -= of_piece
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)

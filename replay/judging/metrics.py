@@ -385,26 +385,28 @@ def _solved(output: Output) -> Sums:
     if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name:
         return {}
     converged = output.rows["converged"] != 0
+    states_start = "start" in output.rows.stream.metadata
     return {
         "solutions": len(converged),
         "converged": int(converged.sum()),
         "iterations": set(output.rows["iterations"][converged].tolist()),
-        "cost": float(output.rows["cost"].sum()),
+        **({"cost": float(output.rows["cost"].sum())} if states_start else {}),
     }
 
 
 def solution(sums: Sums) -> dict[str, float]:
     """How the batch solutions ended: the share that converged, and the most iterations of one.
 
-    Where every iteration is told, also the mean costs at the start and at the end.
+    Where a start is stated, also the mean cost at the end; of single iterations that at the start.
     """
+    if sums.get("starts"):
+        return {"start_cost": sums["start_cost"] / sums["starts"]}
     if not sums.get("solutions"):
         return {}
     values = {"converged_share": sums["converged"] / sums["solutions"]}
     if sums["iterations"]:
         values["most_iterations"] = float(max(sums["iterations"]))
-    if sums.get("starts"):
-        values["start_cost"] = sums["start_cost"] / sums["starts"]
+    if "cost" in sums:
         values["cost"] = sums["cost"] / sums["solutions"]
     return values
 

@@ -242,6 +242,25 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
 
 
 @pytest.mark.usefixtures("here")
+def test_observability_of_a_log_is_a_command(world: Path, fuselog: Fuselog) -> None:
+    """For a person and for machines; what cannot be asked is one sentence."""
+    told = fuselog("observability", str(world / "log.mcap"), "--window", "2", "--scale", "x_m=0.5")
+    rows = fuselog(
+        "observability", str(world / "log.mcap"), "--window", "2", "--scale", "x_m=0.5", "--json"
+    ).json
+    assert {row["case"] for row in rows} == {"robot1"}
+    assert all(row["rank"] == 3 == len(row["eigenvalues"]) for row in rows)
+    assert all(row["weakest"] in told.out for row in rows)
+    for option, sentence in (
+        ("--window=0", "--window 0: give seconds above zero"),
+        ("--scale=x=1", "x_m"),
+    ):
+        said = fuselog("observability", str(world / "log.mcap"), option)
+        assert said.code == 2
+        assert sentence in said.err
+
+
+@pytest.mark.usefixtures("here")
 def test_the_model_and_the_interval_of_estimates_are_options(world: Path, fuselog: Fuselog) -> None:
     """They reach every label that has them; --set of one label is stronger."""
     log, out = str(world / "log.mcap"), "estimates.mcap"

@@ -10,13 +10,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
+from pipeline.ensemble import replay_ensemble
 from recorders.errors import BadInput
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference.estimators import modelled_by
 from replay.inference.iterated import robust
 from replay.inference.model import Motion
+from replay.inference.registered import METHODS
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs
@@ -383,6 +386,17 @@ def test_what_the_gate_keeps_out_has_no_cost(uncompiled: None) -> None:
     missing = outputs(VEHICLE_A, "smoother", [vehicle_a.source(without)], forward="iterated")
     assert_allclose(kept["solution"]["cost"], missing["solution"]["cost"], rtol=1e-12)
     assert_allclose(kept["state"]["mean"], missing["state"]["mean"], atol=1e-10)
+
+
+def test_start_and_cost_stand_in_the_summary(uncompiled: None) -> None:
+    source = vehicle_a.source(vehicle_a.simulate(7)[0][:40])
+    made = modelled_by(VEHICLE_A, METHODS["smoother"], "smoother")
+    settings = {"kind": made, "forward": "iterated", "start": "prior"}
+    told = replay_ensemble([source], {"best": settings}, gap_limit_s=1.0).metrics(["solution"])
+    found = outputs(VEHICLE_A, "smoother", [source], forward="iterated", start="prior")
+    assert told["best.start_cost"] == pytest.approx(found["iteration"]["cost"][0])
+    assert told["best.cost"] == pytest.approx(found["solution"]["cost"][0])
+    assert told["best.converged_share"] == 1
 
 
 def test_too_few_iterations_are_said(uncompiled: None) -> None:

@@ -1,6 +1,8 @@
 """Smoothers against the reference sheet, dense least squares, and their own filters."""
 
+import gc
 import tarfile
+import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -394,6 +396,37 @@ def test_blocks_are_the_whole(
     assert_array_equal(ours.stream.publish_time_ns, theirs.stream.publish_time_ns)
     assert_array_equal(ours["mean"][-1], theirs["mean"][-1])
     assert np.all(ours["covariance"][:-1, 0] < theirs["covariance"][:-1, 0])
+
+
+def test_nodes_beyond_what_memory_may_hold_lie_on_disk(
+    uncompiled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit for bit the same, and no file is left, be it that the way back fails."""
+    source = vehicle_a.source(vehicle_a.simulate(8)[0][:60])
+    inside = outputs(VEHICLE_A, "smoother", [source], 16)["state"]
+    monkeypatch.setattr(smoothers, "IN_MEMORY_BYTES", 6000)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    kept: list[bool] = []
+    gone_back = smoothers.Smoother.gone_back
+
+    def watched(self: Any, pieces: Any, stop: Any = None) -> Any:
+        kept.extend(isinstance(piece, smoothers.Stored) for piece in pieces)
+        if fails and stop is None:
+            raise RuntimeError("the way back")
+        return gone_back(self, pieces, stop)
+
+    monkeypatch.setattr(smoothers.Smoother, "gone_back", watched)
+    fails = False
+    outside = outputs(VEHICLE_A, "smoother", [source], 16)["state"]
+    assert any(kept)
+    assert not all(kept)
+    assert_equal(outside.of_run(0), inside.of_run(0))
+    assert not any(tmp_path.iterdir())
+    fails = True
+    with pytest.raises((RuntimeError, BadInput), match="the way back"):
+        outputs(VEHICLE_A, "smoother", [source], 16)
+    gc.collect()
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("forward", ["ekf", "ekf:lag=500ms"])

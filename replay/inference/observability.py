@@ -1,0 +1,326 @@
+"""Observability from a log: what the measurements of a window say of the state at its beginning.
+
+The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, carried back by
+the derivatives Phi of the motion along one trajectory, the smoothed one. Scaled, D W D with D the
+prior's standard deviations, an eigenvalue of one is worth as much as the prior. Along a trajectory that
+is only estimated, what is not observable at all fills up with a little false information: what is below
+ten priors is called weaker than the prior. F and H are the extended filter's.
+
+Chen, Jiang and Hung, IECON 1990 (local observability); Krener and Ide, CDC 2009 (the Gramian).
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from recorders.errors import BadInput, choices
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.blocks import Ragged, copied
+from replay.engine.compile import compile_over_runs
+from replay.engine.estimator import Estimator
+from replay.engine.tangent import tangent_components
+from replay.inference.binding import number_fields, reading_settings
+from replay.inference.estimators import State, modelled_by, of_any_model
+from replay.inference.gaussian import kalman_step, keep_measured, whiten
+from replay.inference.generate import differencing, is_flat, tuple_of
+from replay.inference.iterated import ITERATED, IteratedSmoother, Way, carrying
+from replay.inference.methods import Method, MethodParameters
+from replay.inference.model import Model
+from replay.inference.recursion import Estimates, filled, no_results, recursion
+from replay.inference.steps import (
+    NOTHING_MEASURED,
+    Note,
+    Stage,
+    Steps,
+    Workspace,
+    motion_derivative,
+    reading,
+    sensor_derivative,
+    sensor_noise,
+    slots_of,
+    workspace,
+)
+
+RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
+WEAK = 10.0  # priors
+
+
+class ObservabilityParameters(MethodParameters):
+    """How long a window is, by default the whole run, and scales by component instead of the prior's."""
+
+    window_s: PositiveFloat | None = None
+    scales: dict[str, PositiveFloat] = {}
+
+
+class Gramian(NamedTuple):
+    """What is carried along: Phi and W (runs, t, t), and how many messages are in W (runs,)."""
+
+    transition: Floats
+    information: Floats
+    messages: Integers
+
+
+class Along(NamedTuple):
+    """The trajectory: its states (nodes, n), of every event the node, and memory for one offset."""
+
+    mean: Floats
+    node: Integers
+    offset: Floats
+
+
+def gramian_steps(stage: Stage) -> Steps:
+    """The steps that sum the Gramian along a trajectory, the only one of `memory`'s sets."""
+    motion = _carried_by_motion(stage)
+    sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
+
+    def estimate(run: int, belief: Gramian, found: Estimates, row: int) -> None:
+        """Note the Gramian, and as the mean how many messages are in it; begin anew."""
+        transition, information = belief.transition[run], belief.information[run]
+        found.mean[row, 0] = belief.messages[run]
+        belief.messages[run] = 0
+        for i in range(len(transition)):
+            for j in range(len(transition)):
+                found.covariance[row, i, j] = information[i, j]
+                information[i, j] = 0.0
+                transition[i, j] = 1.0 if i == j else 0.0
+
+    return Steps(lambda sets: workspace(stage, sets), motion, sensors, estimate)
+
+
+def _carried_by_motion(stage: Stage) -> Function:
+    model = stage.model
+    linearise = motion_derivative(model, stage.motion, by_state=True)
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+    subtract, flat, carry = differencing(model.kinds), is_flat(model.kinds), carrying(model.kinds)
+
+    def predict(
+        run: int,
+        belief: Gramian,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        along, transition, product = work.samples[0], belief.transition[run], work.product
+        node = along.node[use]
+        linearise(read_state(along.mean[node - 1]), read_control(control), duration_s, parameters, work)
+        if not flat:
+            subtract(along.mean[node], work.state, along.offset, 0)
+            carry(along.offset[0], work.transition, work.step)
+        for row in range(len(product)):
+            for column in range(len(product)):
+                entry = 0.0
+                for k in range(len(product)):
+                    entry += work.transition[row, k] * transition[k, column]
+                product[row, column] = entry
+        for row in range(len(product)):
+            for column in range(len(product)):
+                transition[row, column] = product[row, column]
+        return True
+
+    return predict
+
+
+def _added_by_sensor(stage: Stage, number: int) -> Function:
+    model, sensor = stage.model, stage.sensors[number]
+    m, t = len(sensor.measured), model.tangent
+    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
+
+    def update(
+        run: int,
+        belief: Gramian,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        work: Workspace,
+        note: Note,
+    ) -> int:
+        along, innovation = work.samples[0], work.innovations[number]
+        cross = innovation.cross_covariance
+        linearise(read_state(along.mean[along.node[use]]), read_about(data), parameters, work)
+        innovation.covariance[:] = 0.0
+        add_noise(innovation.covariance, data, parameters, work)
+        for i in range(m):
+            innovation.difference[i] = data[i] - work.predicted[i]
+            for column in range(t):  # (H Phi)'
+                entry = 0.0
+                for k in range(t):
+                    entry += work.rows[i, k] * belief.transition[run, k, column]
+                cross[column, i] = entry
+        size = keep_measured(innovation)
+        squared, _ = whiten(innovation, size)
+        if size == 0 or np.isnan(squared):
+            return NOTHING_MEASURED
+        kalman_step(innovation, size, work.step)
+        information = belief.information[run]
+        for row in range(t):
+            for column in range(t):
+                for i in range(size):
+                    information[row, column] += cross[row, i] * cross[column, i]
+        belief.messages[run] += 1
+        return NOTHING_MEASURED
+
+    return update
+
+
+@lru_cache(maxsize=64)
+def _summing(stage: Stage) -> tuple[Function, Steps]:
+    steps = gramian_steps(stage)
+    settings_of = reading_settings(number_fields(stage.model.parameters))
+    return compile_over_runs(recursion(stage, steps, settings_of), allocates=False), steps
+
+
+class Observability(IteratedSmoother):
+    """The smoothed trajectory of every run, and the Gramians of its windows along it."""
+
+    def finish(self, state: State) -> list[Ragged]:
+        """One message for every window, at its last stamp."""
+        state, _ = self.ended(state)
+        if not state.kept:
+            return []
+        way = self.smoothed_once(state)
+        scales = self._scales(state)
+        window_of = self._windows(way, state.carried.time_ns)
+        found, offsets = self._gramians(state, way, window_of)
+        run = np.repeat(np.arange(len(scales)), np.diff(offsets))
+        told = [spectrum(each, scale) for each, scale in zip(found.covariance, scales[run], strict=True)]
+        is_first = np.ones(len(run), bool)
+        is_first[1:] = run[1:] != run[:-1]
+        before_ns = np.append(0, found.time_ns[:-1])
+        t = self.stage.model.tangent
+        stream = make_stream(
+            f"/estimates/{self.name}/observability",
+            schemas.OBSERVABILITY,
+            found.time_ns,
+            metadata={"components": ",".join(self.components)},
+            begin_time_ns=np.where(is_first, state.carried.time_ns[run], before_ns),
+            rank=np.array([each.rank for each in told], np.int64),
+            measurements=found.mean[:, 0].astype(np.int64),
+            eigenvalues=np.array([each.eigenvalues for each in told]).reshape(-1, t),
+            direction=np.array([each.direction for each in told]).reshape(-1, t),
+        )
+        return [Ragged(stream, offsets)]
+
+    @property
+    def components(self) -> list[str]:
+        """The names of the tangent space's components."""
+        model = self.stage.model
+        return [name for name, _ in tangent_components(list(model.state), model.kinds)]
+
+    def _scales(self, state: State) -> Floats:
+        """What a scaled component of one stands for (runs, t)."""
+        scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
+        for name, scale in self.parameters.scales.items():
+            if name not in self.components:
+                raise BadInput(
+                    f"estimator {self.name}: scale {name}: no such component; "
+                    f"{choices(name, self.components)}"
+                )
+            scales[:, self.components.index(name)] = scale
+        return scales
+
+    def _windows(self, way: Way, start_ns: Integers) -> Integers:
+        """The window of every node; what is left of a run behind the last whole one belongs to it."""
+        run = np.repeat(np.arange(len(start_ns)), np.diff(way.offsets))
+        since_ns = way.nodes.time_ns - start_ns[run]
+        if self.parameters.window_s is None:
+            return np.zeros(len(run), np.int64)
+        length_ns = max(round(self.parameters.window_s * 1e9), 1)
+        span_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1] - start_ns
+        last = np.maximum(span_ns // length_ns - 1, 0)
+        return np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
+
+    def _gramians(self, state: State, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
+        """The Gramians at the last stamps of windows, and how many messages are in each."""
+        stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
+        t, (loop, steps) = stage.model.tangent, _summing(stage)
+        ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
+        ends[offsets[1:][np.diff(offsets) > 0] - 1] = True
+        happenings = way.happenings
+        happenings = happenings._replace(is_due=happenings.is_due & ends[way.node])
+        due = np.append(0, np.cumsum(ends))[offsets]
+        one = np.arange(runs + 1)
+        _, innovations = no_results(due, one, stage.model, len(slots_of(stage.sensors)))
+        count = due[-1]
+        found = Estimates(
+            due[:-1].copy(), np.empty(count, np.int64), np.empty((count, 1)), np.empty((count, t, t))
+        )
+        unit = np.repeat(np.eye(t)[None], runs, axis=0)
+        carried = copied(
+            state.carried._replace(
+                belief=Gramian(unit, np.zeros((runs, t, t)), np.zeros(runs, np.int64))
+            )
+        )
+        settings = np.repeat(self.settings[None], runs, axis=0)
+
+        def memory() -> Any:
+            return steps.memory((Along(way.states.mean, way.node, np.empty((1, t))),))
+
+        loop(runs, happenings, settings, self.gates, carried, found, innovations, scratch=memory)
+        return filled(found, due)
+
+
+class Spectrum(NamedTuple):
+    """Eigenvalues of a scaled Gramian, ascending (t,), its rank, and the least one's direction (t,)."""
+
+    eigenvalues: Floats
+    rank: int
+    direction: Floats
+
+
+def spectrum(information: Floats, scales: Floats) -> Spectrum:
+    """Rank and eigenvalues of D W D, and the direction D e of the least, of length one in state units.
+
+    A component whose scale is zero, as something known exactly, has no part: its eigenvalue is infinite.
+    """
+    known = scales == 0.0
+    scaled = scales[:, None] * information * scales
+    values, vectors = np.linalg.eigh(scaled[np.ix_(~known, ~known)])
+    direction = np.zeros(len(scales))
+    if len(values):
+        direction[~known] = scales[~known] * vectors[:, 0]
+        direction /= np.linalg.norm(direction)
+        direction *= np.sign(direction[np.argmax(np.abs(direction))])
+    rank = int(np.sum(values > RANK_TOLERANCE * len(values) * values.max(initial=0.0))) + int(
+        known.sum()
+    )
+    return Spectrum(np.append(values, np.full(known.sum(), np.finfo(float).max)), rank, direction)
+
+
+def in_words(told: Spectrum, components: Sequence[str]) -> str:
+    """What there is to say of the weakest direction."""
+    largest = np.abs(told.direction).max(initial=0.0)
+    moved = [
+        f"{share:+.3g} {name}"
+        for name, share in zip(components, told.direction, strict=True)
+        if abs(share) > 1e-3 * largest
+    ]
+    weakest = float(told.eigenvalues[0])
+    strength = f"as much as {weakest:.3g} priors"
+    if told.rank < len(components):
+        strength = "not observable, weaker than the prior"
+    elif weakest < WEAK:
+        strength += ", weaker than the prior"
+    return f"{' '.join(moved)}: {strength}"
+
+
+METHOD = Method(
+    "observability of the state from the measurements",
+    ObservabilityParameters,
+    ITERATED.steps,
+    lacks=ITERATED.lacks,
+    filtering=Observability,
+)
+OBSERVABILITY = of_any_model(METHOD)
+
+
+def observability_of(model: Model) -> Estimator[Any]:
+    """The same of one model; raises BadInput where that lacks what it needs."""
+    return modelled_by(model, METHOD, "observability")
