@@ -12,11 +12,11 @@ from recorders.log import RunMetadata, make_stream, open_log, schemas, write_log
 from recorders.recording import Recording, import_run
 from replay.engine.estimator import bind
 from replay.engine.sources import LogSource, memory_source
+from replay.engine.tangent import truth_at
 from replay.estimators.feasible_sets import arena_around, box, exact_set, excess_rad, rings
 from replay.estimators.pseudo_ellipsoids import fit, room
 from replay.estimators.set_membership import Known, frames
 from replay.judging.set_evaluation import judge_sets
-from replay.judging.truths import truth_at
 
 pytestmark = pytest.mark.paper
 

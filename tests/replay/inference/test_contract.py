@@ -115,8 +115,7 @@ def test_a_model_that_does_not_compile_is_named_with_its_line() -> None:
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_model_is_one_sentence(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+def test_a_wrong_model_is_one_sentence(case: str, uncompiled: None) -> None:
     model, words = WRONG[case]
     with pytest.raises(BadInput) as caught:
         outputs(model, "ekf", [SOURCE])
@@ -236,8 +235,7 @@ def calm(state: Any, duration_s: Any, parameters: Any) -> Any:
     return 0.0, 0.0, 0.0, 0.01 * duration_s, 0.01 * duration_s
 
 
-def test_a_mode_is_one_of_the_models_motions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+def test_a_mode_is_one_of_the_models_motions(uncompiled: None) -> None:
     quiet = Motion(vehicle_a.move, calm)
     model = replace(VEHICLE_A, modes={"quiet": quiet, "usual": VEHICLE_A.motion})
     with pytest.raises(BadInput, match="mode = quiet: the model has one motion; leave out `mode`"):
@@ -254,8 +252,7 @@ def test_a_mode_is_one_of_the_models_motions(monkeypatch: pytest.MonkeyPatch) ->
     assert np.abs(alone - found[None]).max() > 1e-3
 
 
-def test_a_run_without_a_usable_prior_fails_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+def test_a_run_without_a_usable_prior_fails_alone(uncompiled: None) -> None:
     prior = SOURCE.streams["/prior"]
     streams = {**SOURCE.streams, "/prior": prior.take(slice(0, 0))}
     without = memory_source(Recording(list(streams.values())), SOURCE.run)

@@ -1,6 +1,6 @@
 """Interacting multiple models against the reference sheets, single filters, and their own formulas."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -31,15 +31,6 @@ from tests.replay.inference.vehicle_a import move as move_vehicle
 from tests.replay.inference.vehicle_a import noise as vehicle_noise
 
 EXACT = 1e-9
-
-
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Plain Python, and no loop of it is left to the next test."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    estimators._compiled.cache_clear()
-    yield
-    estimators._compiled.cache_clear()
 
 
 # The sheet's problem: a vehicle whose turn rate is steady, or changes fast

@@ -32,11 +32,6 @@ from tests.replay.inference.vehicle_a import SIGHTING, VEHICLE_A
 EXACT = 1e-9
 
 
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-
-
 @cache
 def smoothed(forward: str, **values: Any) -> Any:
     """The states of the sheet's problem, with one at t = 0, which a tick of every second gives."""
