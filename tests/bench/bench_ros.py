@@ -25,7 +25,7 @@ from recorders.importers.ros.importer import RosParameters, read
 from recorders.recording import import_log
 from tests.bench.timing import cpu_seconds
 
-MESSAGES = 30_000
+MESSAGES = 150_000
 MANY = 5_000_000
 START_NS, STEP_NS = 1_700_000_000_000_000_000, 5_000_000
 TOPICS = {

@@ -44,7 +44,7 @@ Distribution = Literal[
 ]  # fmt: skip
 # A block ends when it has so many messages, or bytes.
 _BLOCK_MESSAGES = 1 << 17
-_BLOCK_BYTES = 1 << 26
+_BLOCK_BYTES = 1 << 24
 _UNIT_TOLERANCE = 1e-3
 
 
@@ -447,14 +447,10 @@ class _Import:
             self._tell(topic, f"{part.kind} dropped: of another length than the first", len(rows))
             return
         for key, value in constants.items():
-            other = ~np.isclose(value, written.constants[key], rtol=0.0, atol=0.0, equal_nan=True).all(
-                axis=1
-            )
-            self._tell(
-                topic,
-                f"{part.kind} kept whose {key} is not the first one's, which is stated",
-                int(other.sum()),
-            )
+            known = written.constants[key]
+            same = ((value == known) | (np.isnan(value) & np.isnan(known))).all(axis=1)
+            fact = f"{part.kind} kept whose {key} is not the first one's, which is stated"
+            self._tell(topic, fact, int((~same).sum()))
         sensed = log_time_ns if stamp_ns is None else stamp_ns
         published = log_time_ns if self._parameters.clock == "bag" else sensed
         written.pieces.append(_Piece(places, published, log_time_ns, sensed, columns))
@@ -591,7 +587,9 @@ def _by_frame(
     if not stated:
         yield {}, np.ones(size, bool)
         return
-    for key in dict.fromkeys(zip(*(values.tolist() for _, values in stated), strict=True)):
+    is_one = all((values == values[0]).all() for _, values in stated)
+    shown = [values[:1] if is_one else values for _, values in stated]
+    for key in dict.fromkeys(zip(*(values.tolist() for values in shown), strict=True)):
         which = np.ones(size, bool)
         for (_, values), value in zip(stated, key, strict=True):
             which &= values == value
