@@ -39,7 +39,7 @@ def test_a_bag_becomes_a_log_and_info_says_how(
 def test_info_of_a_bag_that_is_no_mcap(
     fuselog: Callable[..., Any], real_data: Path, tmp_path: Path
 ) -> None:
-    """A folder and a .db3 file: topics, types, counts, and how to import them; nothing beside is made."""
+    """Topics, types and counts of a folder and a .db3 file; nothing beside them is made."""
     with tarfile.open(real_data / "trajectories.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
     folder = tmp_path / "trajectories" / "tf_example"
@@ -55,7 +55,7 @@ def test_info_of_a_bag_that_is_no_mcap(
 
 
 def test_an_imported_odometry_is_replayed(real_data: Path, tmp_path: Path) -> None:
-    """Dead reckoning over the odometry comes to where the robot's own does, from a prior at its start."""
+    """Dead reckoning over the odometry comes to where the robot's own reckoning does."""
     source = fl.import_("ros", real_data / "nav2_turtlebot.mcap")
     own = source["/odometry_pose"]
     w, x, y, z = own["quaternion"].T

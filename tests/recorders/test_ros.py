@@ -424,7 +424,7 @@ def test_rows_of_a_database_from_its_pages(tmp_path: Path) -> None:
         database.execute("CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, x TEXT)")
         database.execute("INSERT INTO topics VALUES (1, 'a', 'b', 'c')")
         database.execute(
-            "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+            "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)"
         )
         database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
         database.commit()
