@@ -19,7 +19,9 @@ from replay.engine.cache import cache_folder, kept_files
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
     """Print what a log holds: the run, how long it is, its topics; of a ROS log, how to import it."""
-    if path.is_dir() or path.suffix in (".bag", ".db3"):
+    from recorders.importers.ros.bags import looks_like_bag
+
+    if looks_like_bag(path):
         _show_bag(path, as_json=as_json)
         return
     log = open_log(path, recover=recover)
