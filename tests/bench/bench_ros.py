@@ -141,9 +141,7 @@ def import_many() -> None:
         print(
             f"{messages} messages written in {time.perf_counter() - begin - reading_s:.1f} s; ", end=""
         )
-        print(
-            f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB at most, with the libraries"
-        )
+        print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB at most, in all")
 
 
 if __name__ == "__main__":
