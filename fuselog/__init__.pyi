@@ -40,6 +40,7 @@ from recorders.log import make_stream as make_stream
 from recorders.log import schemas as schemas
 from recorders.parameters import Parameters as Parameters
 from recorders.recording import SIMULATION_EPOCH_NS as SIMULATION_EPOCH_NS
+from recorders.recording import Blocks as Blocks
 from recorders.recording import Importer as Importer
 from recorders.recording import Recorder as Recorder
 from recorders.recording import Recording as Recording

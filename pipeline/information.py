@@ -1,6 +1,7 @@
 """What a log holds, and what the cache holds, for a person and for machines."""
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -17,7 +18,12 @@ from replay.engine.cache import cache_folder, kept_files
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
-    """Print what a log holds: the run, how long it is, its topics."""
+    """Print what a log holds: the run, how long it is, its topics; of a ROS log, how to import it."""
+    from recorders.importers.ros.bags import looks_like_bag
+
+    if looks_like_bag(path):
+        _show_bag(path, as_json=as_json)
+        return
     log = open_log(path, recover=recover)
     if as_json:
         print_json(_as_json(log))
@@ -34,8 +40,31 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
         for topic in log.topics.values()
     ]
     print_table(["topic", "schema", "messages", "per second"], rows)
+    if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
+        _say_how_to_import(path)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+def _show_bag(path: Path, *, as_json: bool) -> None:
+    """Print what a bag of ROS holds that is no MCAP file."""
+    from recorders.importers.ros.bags import open_bag
+
+    with open_bag(path) as bag:
+        rows = [[each.topic, each.type_name, each.messages] for each in bag.connections]
+        losses = bag.losses
+    if as_json:
+        topics = [dict(zip(("topic", "schema", "messages"), row, strict=True)) for row in rows]
+        print_json({"path": str(path), "topics": topics, "lost": losses})
+        return
+    print_table(["topic", "schema", "messages"], rows)
+    _say_how_to_import(path)
+    for loss in losses:
+        warn(loss)
+
+
+def _say_how_to_import(path: Path) -> None:
+    say(f"This is a log of ROS; to replay it: fuselog import ros {shlex.quote(str(path))} -o NAME.mcap")
 
 
 def show_cache(*, clear: bool, as_json: bool) -> None:

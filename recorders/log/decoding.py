@@ -63,7 +63,7 @@ class Decoder:
             raise BadInput(
                 f"{self._where} is {schema.name if schema else 'without a schema'} in the encoding "
                 f"'{encoding}'; fuselog replays protobuf messages with numeric fields, "
-                "import other logs first"
+                "import other logs first, those of ROS with: fuselog import ros PATH"
             )
         return schema
 

@@ -2,8 +2,10 @@
 
 import json
 import shutil
+import sqlite3
 import tarfile
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from recorders.errors import BadInput
 from recorders.importers.ros import importer
 from recorders.importers.ros.layouts import Messages, MessageType
 from recorders.importers.ros.messages import TYPES
+from recorders.importers.ros.sqlite_pages import missing_bytes, whole_rows
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
 
@@ -178,17 +181,16 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
         readers: dict[str, MessageType] = {}
         found: dict[str, list[Messages]] = {}
         for batch in ours.batches(lambda _: True):
-            if batch:
-                each = batch.connection
-                definitions = importer.definitions_of(each.type_name, each.definition, "ros2_humble")
-                reader = readers.setdefault(
-                    each.topic, MessageType(each.type_name, definitions, each.encoding)
-                )
-                for which, raw in importer.by_size(batch.data, batch.begins, batch.lengths):
-                    for messages in reader.read(raw, which):
-                        assert isinstance(messages, Messages), messages
-                        stamps = batch.log_time_ns[messages.rows]
-                        found.setdefault(each.topic, []).append((messages, stamps))
+            each = batch.connection
+            definitions = importer.definitions_of(each.type_name, each.definition, "ros2_humble")
+            reader = readers.setdefault(
+                each.topic, MessageType(each.type_name, definitions, each.encoding)
+            )
+            for which, raw in importer.by_size(batch.data, batch.begins, batch.lengths):
+                for messages in reader.read(raw, which):
+                    assert isinstance(messages, Messages), messages
+                    stamps = batch.log_time_ns[messages.rows]
+                    found.setdefault(each.topic, []).append((messages, stamps))
         for connection, stamp_ns, raw in theirs.messages():
             expected = theirs.deserialize(raw, connection.msgtype)
             ((messages, row),) = [
@@ -204,7 +206,8 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
     assert checked > 12 * len(names)
     streams, _ = imported(path, clock="bag")
     assert {stream.topic.rpartition("/")[2] for stream in streams.values()} >= {
-        "fix", "inertial", "magnetic_field", "odometry", "odometry_twist", "odometry_pose", "twist", "pose",
+        "fix", "inertial", "magnetic_field", "odometry", "odometry_twist", "odometry_pose", "twist",
+        "pose",
         "position", "orientation", "range", "value", *(["scan", "detections"]),
     }  # fmt: skip
     lengths = {name: len(stream) for name, stream in streams.items()}
@@ -304,7 +307,7 @@ def test_a_real_log_with_two_clocks(real_data: Path, tmp_path: Path) -> None:
 
 
 def test_named_transforms_are_composed(real_data: Path) -> None:
-    """From map to base_footprint: two transforms that move, one that does not, against SciPy's interpolation."""
+    """Two transforms that move and one that does not, against SciPy's interpolation."""
     path = real_data / "nav2_turtlebot.mcap"
     chain = imported(path, transforms="map:base_footprint")[0]["/tf/map/base_footprint"]
     parts = imported(path)[0]
@@ -332,7 +335,7 @@ def test_named_transforms_are_composed(real_data: Path) -> None:
 
 
 def test_a_sqlite_bag(real_data: Path, tmp_path: Path) -> None:
-    """A .db3 file alone and in its folder; a pair of frames against the direction in which it is sent."""
+    """A .db3 file alone and in its folder; a pair of frames against its direction."""
     with tarfile.open(real_data / "trajectories.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
     folder = tmp_path / "trajectories" / "tf_example"
@@ -413,6 +416,22 @@ def test_a_bag_that_was_cut_off(form: str, tmp_path: Path) -> None:
     assert any(key.startswith("lost") for key in notes), notes
 
 
+def test_rows_of_a_database_from_its_pages(tmp_path: Path) -> None:
+    """As the library reads them: rows in the page, on further pages, and of other tables."""
+    path = tmp_path / "bag.db3"
+    rows = [(1 + k % 3, START_NS + k, bytes([k % 256]) * (k * 37 % 9000)) for k in range(700)]
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, x TEXT)")
+        database.execute("INSERT INTO topics VALUES (1, 'a', 'b', 'c')")
+        database.execute(
+            "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)"
+        )
+        database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+        database.commit()
+    assert missing_bytes(path) == 0
+    assert list(whole_rows(path)) == rows
+
+
 def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     """Stamps that repeat or go back, fixes that are NaN or none, and what is not taken."""
     make = Maker()
@@ -448,7 +467,7 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
 
 
 def test_frames_and_constants_that_change(tmp_path: Path) -> None:
-    """A second frame of a topic is a stream of its own; another covariance than the stated one is told."""
+    """A second frame of a topic is another stream; a covariance that changes is told."""
     make = Maker()
     own = np.eye(3).ravel()
     sent: list[Sent] = [
@@ -471,7 +490,7 @@ def test_frames_and_constants_that_change(tmp_path: Path) -> None:
 
 
 def test_messages_of_ones_own_by_a_mapping(tmp_path: Path) -> None:
-    """Fields by their paths, scaled, with a stamp of their own; what the mapping has wrong is a sentence."""
+    """Fields by their paths, scaled, with a stamp of their own; what is wrong with a mapping is told."""
     make = Maker()
     name = "my_robot_msgs/msg/Wheels"
     sent: list[Sent] = [
@@ -533,8 +552,8 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     assert refusal(scan, topics="/pos") == "has no topic /pos; did you mean '/pose'?"
     mixed = bag("mixed", ("/pose", make(pose, 5_000_000_000)), ("/level", make("std_msgs/msg/Float64")))
     assert refusal(mixed) == (
-        "mixed time bases: the stamps of /level (no header, the bag's) and of /pose are 1.7e+09 s apart; "
-        "use --clock bag, or topics of one clock with --set topics=[...]"
+        "mixed time bases: the stamps of /level (no header, the bag's) and of /pose are 1.7e+09 s "
+        "apart; use --clock bag, or topics of one clock with --set topics=[...]"
     )
     assert len(imported(mixed, clock="bag")[0]) == 2
     sent = {
@@ -559,7 +578,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
 
 
 def test_big_endian_and_damaged_messages(tmp_path: Path) -> None:
-    """Plain CDR of either byte order; a message that is shorter than its type is counted and left out."""
+    """Plain CDR of either byte order; a message shorter than its type is counted and left out."""
     make, path = Maker(), tmp_path / "bag"
     name = "geometry_msgs/msg/PointStamped"
     messages = [make(name, START_NS + number) for number in range(4)]
@@ -577,7 +596,7 @@ def test_big_endian_and_damaged_messages(tmp_path: Path) -> None:
 
 
 def test_a_bag_is_imported_block_by_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blocks are small, follow one another, and give the same log as one block; so do composed transforms."""
+    """Small blocks give the same log as one block; so do composed transforms."""
     make = Maker()
     sent: list[Sent] = []
     for number in range(400):

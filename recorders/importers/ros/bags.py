@@ -55,6 +55,13 @@ class Bag:
         return [*self.missing, *(loss for file in self.files for loss in file.losses)]
 
 
+def looks_like_bag(path: Path) -> bool:
+    """Whether a path is named as a bag that is no MCAP file: a folder of one, a .bag or a .db3 file."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or bool(_members(path, {}))
+    return path.suffix in (".bag", ".db3")
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag; raises BadInput where there is none, or nothing of it can be read.

@@ -157,6 +157,9 @@ class MessageType:
                 yield error
                 raw, rows = raw[1:], rows[1:]
                 continue
+            if same.all():
+                yield Messages(layout, raw, rows)
+                return
             yield Messages(layout, raw[same], rows[same])
             raw, rows = raw[~same], rows[~same]
 

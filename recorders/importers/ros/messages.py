@@ -75,9 +75,9 @@ def quaternion(messages: Messages, path: str) -> Floats:
 
 def covariance(messages: Messages, path: str) -> Floats:
     """A covariance (n, d * d), row-major; NaN where it is unknown."""
-    found = messages.numbers(path).astype(float)
-    unknown = (found == 0.0).all(axis=1) | (found[:, 0] == -1.0)
-    return np.where(unknown[:, None], np.nan, found)
+    found = messages.numbers(path).astype(float, copy=False)
+    unknown = ~found.any(axis=1) | (found[:, 0] == -1.0)
+    return np.where(unknown[:, None], np.nan, found) if unknown.any() else found
 
 
 def _unknown(messages: Messages, width: int) -> Floats:

@@ -27,11 +27,6 @@ EPOCH_NS = 10**9
 PLANE = ("x_m", "y_m", "vx_mps", "vy_mps")
 
 
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-
-
 # The sheet's linear example
 
 

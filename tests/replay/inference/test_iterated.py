@@ -34,11 +34,6 @@ EXACT = 1e-9
 Told = list[tuple[float, str, int, Any]]
 
 
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-
-
 @cache
 def solved(start: str) -> Any:
     """The sheet's problem; a tick of every second gives a state at t = 0."""

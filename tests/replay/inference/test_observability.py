@@ -23,9 +23,7 @@ EPOCH_NS = 10**9
 STATE = ("x_m", "y_m", "vx_mps", "vy_mps")
 
 
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+pytestmark = pytest.mark.usefixtures("uncompiled")
 
 
 class SensorParameters(ModelParameters):

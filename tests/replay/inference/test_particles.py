@@ -39,11 +39,6 @@ from tests.replay.inference.wheel import make_wheel
 Floats = Any
 
 
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-
-
 # The sheet's test model
 
 

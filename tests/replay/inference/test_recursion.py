@@ -26,12 +26,6 @@ from tests.replay.inference.wheel import ANGLE, COVARIANCE, RATE, make_wheel
 Floats = Any
 
 
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    return
-
-
 # A plain filter of the wheel, its state the angle and the rate
 
 

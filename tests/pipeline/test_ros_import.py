@@ -1,0 +1,82 @@
+"""Bags of ROS from the command line and from Python."""
+
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.testing import assert_array_equal
+
+import fuselog as fl
+
+
+def test_a_bag_becomes_a_log_and_info_says_how(
+    fuselog: Callable[..., Any], real_data: Path, tmp_path: Path
+) -> None:
+    """`info` leads to `import`, whose log is what Python imports; a refused one leaves nothing."""
+    bag, out = real_data / "nav2_turtlebot.mcap", tmp_path / "nav.mcap"
+    told = fuselog("info", str(bag))
+    assert told.code == 0
+    assert f"fuselog import ros {bag} -o NAME.mcap" in told.out
+    said = fuselog("import", "ros", str(bag), "-o", str(out), "--clock", "bag")
+    assert said.code == 0
+    assert "/odom: 2639 nav_msgs/msg/Odometry as /odometry, /odometry_twist, /odometry_pose" in said.out
+    log, direct = fl.open(out), fl.import_("ros", bag, clock="bag")
+    assert log.run.parameters["clock"] == "bag"
+    assert set(log) == set(direct)
+    assert_array_equal(log["/pose"]["position_m"], direct["/pose"]["position_m"])
+    refused = tmp_path / "refused.mcap"
+    hole = fuselog("import", "ros", str(bag), "-o", str(refused), "--set", "transforms=map:nowhere")
+    assert hole.code == 2
+    assert hole.err.count("\n") == 1
+    assert "no transform has the frame 'nowhere'" in hole.err
+    assert not refused.exists()
+    none = fuselog("import", "mrclam", str(tmp_path), "-o", str(refused), "--clock", "bag")
+    assert (none.code, "no parameter 'clock'" in none.err) == (2, True)
+
+
+def test_info_of_a_bag_that_is_no_mcap(
+    fuselog: Callable[..., Any], real_data: Path, tmp_path: Path
+) -> None:
+    """Topics, types and counts of a folder and a .db3 file; nothing beside them is made."""
+    with tarfile.open(real_data / "trajectories.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    folder = tmp_path / "trajectories" / "tf_example"
+    before = sorted(folder.iterdir())
+    for path in (folder, folder / "tf_example.db3"):
+        told = fuselog("info", str(path))
+        assert told.code == 0
+        assert "tf2_msgs/msg/TFMessage" in told.out
+        assert "517" in told.out
+        assert f"fuselog import ros {path}" in told.out
+        assert fuselog("info", str(path), "--json").json["topics"][1]["messages"] == 517
+    assert sorted(folder.iterdir()) == before
+
+
+def test_an_imported_odometry_is_replayed(real_data: Path, tmp_path: Path) -> None:
+    """Dead reckoning over the odometry comes to where the robot's own reckoning does."""
+    source = fl.import_("ros", real_data / "nav2_turtlebot.mcap")
+    own = source["/odometry_pose"]
+    w, x, y, z = own["quaternion"].T
+    heading_rad = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    begin = [[*own["position_m"][0, :2], heading_rad[0]]]
+    prior = fl.make_stream(
+        "/prior",
+        fl.schemas.GAUSSIAN_ESTIMATE,
+        own.publish_time_ns[:1],
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=begin,
+        covariance=[np.diag([1e-4, 1e-4, 1e-4]).ravel()],
+    )
+    path = tmp_path / "with-prior.mcap"
+    fl.write(path, [*(source[topic] for topic in ("/odometry", "/odometry_pose")), prior])
+    settings = {"forward_noise_density": 0.01, "turn_noise_density": 0.01, "kind": "dead-reckoning"}
+    replay = fl.replay(path, {"reckoned": settings})
+    (topic,) = [each for each in replay.estimates[0] if each.endswith("/pose")]
+    reckoned = replay.estimates[0][topic]
+    rows = np.searchsorted(own.publish_time_ns, reckoned.publish_time_ns)
+    apart_m = np.hypot(*(reckoned["mean"][:, :2] - own["position_m"][rows, :2]).T)
+    travelled_m = np.hypot(*np.diff(own["position_m"][:, :2], axis=0).T).sum()
+    assert travelled_m > 10.0
+    assert apart_m.max() < 0.02 * travelled_m
