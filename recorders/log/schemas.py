@@ -386,8 +386,8 @@ ITERATION = _declare(
 )
 OBSERVABILITY = _declare(
     "Observability",
-    "What the measurements since an earlier stamp say of the state at that stamp: the rank and the "
-    "eigenvalues, ascending, of the local Gramian in units of the prior, and the direction of the least.",
+    "What the measurements since an earlier stamp say of the state at that stamp: rank and eigenvalues, "
+    "ascending, of the local Gramian in units of the prior, and the direction of the least.",
     Field("begin_time_ns", "time_ns"),
     _identifier("rank"),
     _identifier("measurements"),
