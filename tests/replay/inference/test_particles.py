@@ -23,10 +23,10 @@ from replay.engine.estimator import bind
 from replay.engine.philox import fill_normals, philox, unit
 from replay.engine.sources import memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import of_any_model
 from replay.inference.model import Motion
 from replay.inference.particles import BOOTSTRAP
-from replay.inference.registered import METHODS
 from replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
