@@ -325,6 +325,12 @@ DENSITY_ESTIMATE = _declare(
     _vector("mean"),
     _vector("covariance"),
 )
+EFFECTIVE_PARTICLES = _declare(
+    "EffectiveParticles",
+    "Of how many particles an estimate was made, and how many of equal weight are worth as much.",
+    _identifier("particles"),
+    _real("effective"),
+)
 INNOVATION = _declare(
     "Innovation",
     "How one measurement fitted the prediction, and whether the gate let it in.",
