@@ -13,11 +13,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from recorders.errors import BadInput, printable
+
+if TYPE_CHECKING:
+    from pipeline.surgery import Changed
 
 
 class OutputFile(click.Path):
@@ -77,6 +80,7 @@ parameters_option = click.option(
 recover_option = click.option(
     "--recover", is_flag=True, help="Read what is whole of a log that was cut off or damaged."
 )
+out_log_option = click.option("-o", "--out", type=FILE, required=True, help="The log to write.")
 gap_option = click.option(
     "--gap-limit",
     "gap_limit_s",
@@ -379,6 +383,103 @@ def export(path: Path, to: Any, **options: Any) -> None:
         click.echo(printable(f"fuselog: {note}"), err=True)
     for topic, file in done.files.items():
         click.echo(printable(f"{file}: {topic}"))
+
+
+@fuselog.command(short_help="Write a span, some topics or fewer messages of a log.")
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
+@click.option(
+    "--topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="A topic, or a pattern such as '/robot1/*' (repeatable) [default: all].",
+)
+@click.option(
+    "--decimate",
+    multiple=True,
+    metavar="TOPIC=N|TOPIC=RATEHz",
+    help="Keep every Nth stamp of a topic or pattern, or at most so many a second (repeatable).",
+)
+@recover_option
+def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
+    """Write a part of PATH, a log or an estimates log, as a log of its own.
+
+    Maps, priors and what was said at the first stamp of the log stay whole, whatever the span.
+    """
+    from pipeline.surgery import cut as cut_log
+
+    _say_changed(cut_log(path, decimate=_pairs("--decimate", decimate), **options))
+
+
+@fuselog.command(short_help="Write one log of several, whose clocks may differ.")
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@out_log_option
+@click.option(
+    "--offset",
+    "offsets",
+    multiple=True,
+    metavar="LOG=SECONDS",
+    help="Add this to all stamps of one of LOGS (repeatable) [default: 0].",
+)
+@recover_option
+def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
+    """Write one log of LOGS, which have no topic in common: fuselog relabel tells topics apart."""
+    from pipeline.surgery import merge as merge_logs
+
+    offsets_s = {}
+    for log, text in _pairs("--offset", offsets).items():
+        try:
+            offsets_s[log] = float(text)
+        except ValueError:
+            raise BadInput(f"--offset {log}={text}: expected LOG=SECONDS, as {log}=-0.5") from None
+    _say_changed(merge_logs(list(logs), offsets_s=offsets_s, **options))
+
+
+@fuselog.command(short_help="Write a log with other names of topics and components.")
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Rename a topic, or as /robot1/=/robot2/ all that begin so (repeatable).",
+)
+@click.option(
+    "--component",
+    "components",
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Rename a component of states, as x_m=east_m, in all topics (repeatable).",
+)
+@recover_option
+def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
+    """Write PATH, a log or an estimates log, with other names; what refers to them follows."""
+    from pipeline.surgery import relabel as relabel_log
+
+    done = relabel_log(
+        path, topics=_pairs("--topic", topics), components=_pairs("--component", components), **options
+    )
+    _say_changed(done)
+
+
+def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
+    """What an option gives as NAME=VALUE, each name once."""
+    pairs: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.rpartition("=")
+        if not (name and equals and value) or name in pairs:
+            raise BadInput(f"{option} {text}: expected NAME=VALUE, with every name once")
+        pairs[name] = value
+    return pairs
+
+
+def _say_changed(done: "Changed") -> None:
+    for note in done.notes:
+        click.echo(printable(f"fuselog: {note}"), err=True)
+    _say_written(done.path, sum(done.messages.values()))
 
 
 @fuselog.command(short_help="Open a log, estimates or a result in the Rerun viewer.")

@@ -14,6 +14,9 @@ from pipeline.results import RESULT_FILE, read_result
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
 
+# The note of a log's run that tells how it was cut, merged or relabelled.
+CHANGES = "changes"
+
 
 class Kind(NamedTuple):
     """A kind of file that a command writes: its suffix, what it is, and how it is known."""
@@ -80,10 +83,11 @@ def _identity(path: Path) -> Hashable:
     return state.st_dev, state.st_ino
 
 
-def _run_of(path: Path) -> RunMetadata | None:
-    """What run a log is of, if fuselog wrote it."""
+def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
+    """What run a log is of, if fuselog wrote it: as the run gave it, or changed since."""
     with suppress(BadInput):
-        return open_log(path).run if _is_log(path) else None
+        run = open_log(path).run if _is_log(path) else None
+        return run if run is not None and (CHANGES in run.notes) == is_changed else None
     return None
 
 
@@ -113,6 +117,10 @@ def _is_recorded(path: Path) -> bool:
 def _holds_estimates(path: Path) -> bool:
     run = _run_of(path)
     return run is not None and _is_estimates(run)
+
+
+def _is_changed(path: Path) -> bool:
+    return _run_of(path, is_changed=True) is not None
 
 
 def imported(source: str) -> Kind:
@@ -159,6 +167,7 @@ def _is_report(path: Path) -> bool:
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
 ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)
+CHANGED = Kind(".mcap", "a log that fuselog cut, merged or relabelled", _is_changed)
 TIMELINE = Kind(".rrd", "a timeline of fuselog", _is_timeline)
 PICTURE = Kind(".png", "a picture that fuselog took", _is_picture)
 REPORT = Kind(".html", "a report of fuselog", _is_report)

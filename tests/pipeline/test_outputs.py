@@ -64,6 +64,11 @@ COMMANDS = {
         "evaluate result/estimates/run-0000.mcap --out OUT", "", ("result/estimates/run-0000.mcap",)
     ),
     "evaluate --truth --out": Command("evaluate line.tum --truth line.tum --out OUT", "", ("line.tum",)),
+    "cut -o": Command("cut log.mcap --end 0.5 -o OUT", ".mcap", ("log.mcap",)),
+    "merge -o": Command(
+        "merge log.mcap log.estimates.mcap -o OUT", ".mcap", ("log.mcap", "log.estimates.mcap")
+    ),
+    "relabel -o": Command("relabel log.mcap --component x_m=a -o OUT", ".mcap", ("log.mcap",)),
     "view --save": Command("view log.mcap --save OUT", ".rrd", ("log.mcap",)),
     "view --screenshot": Command("view log.mcap --screenshot OUT", ".png", ("log.mcap",)),
     "view a timeline --screenshot": Command(
