@@ -75,8 +75,8 @@ from replay.engine.plain import recursive as recursive
 from replay.engine.sources import LogSource as LogSource
 from replay.engine.sources import MemorySource as MemorySource
 from replay.inference import small_matrices as small_matrices
+from replay.inference.all_methods import modelled as modelled
 from replay.inference.checking import check_model as check_model
-from replay.inference.estimators import modelled as modelled
 from replay.inference.model import Control as Control
 from replay.inference.model import Map as Map
 from replay.inference.model import Model as Model

@@ -16,10 +16,10 @@ from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
 from replay.engine.estimator import Estimator
+from replay.inference.all_methods import METHODS
 from replay.inference.binding import needs_of
 from replay.inference.estimators import registered_models
 from replay.inference.model import Model
-from replay.inference.registered import METHODS
 from replay.judging.metrics import Metric
 
 

@@ -29,7 +29,7 @@ from pipeline.terminal import (
 from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Log, open_log
+from recorders.log import Log, NotMcap, open_log
 from recorders.parameters import parse_settings
 from recorders.parsing import parse_json
 from replay.engine.estimator import find_estimator
@@ -182,7 +182,10 @@ def evaluate_logs(
         raise BadInput("--errors: goes into a result folder; give it with --out")
     if logs and len(logs) != len(estimates):
         raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
-    opened = [open_log(path, recover=recover) for path in estimates]
+    try:
+        opened = [open_log(path, recover=recover) for path in estimates]
+    except NotMcap as error:
+        raise BadInput(f"{error}, or with --truth the file that a trajectory is judged by") from error
     for each in opened:
         if not any(topic.startswith("/estimates/") for topic in each.topics):
             raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")

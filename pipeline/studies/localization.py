@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
-from pipeline.charts import Axis, Chart, Panel, band, curve, thinned
+from pipeline.charts import Axis, Chart, Panel, Style, band, curve, thinned
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome, split_metric
 from pipeline.runner import Runner
@@ -35,8 +35,12 @@ def summarise(judge: Judge) -> Outcome:
         outcome.tables["steps"] = pd.concat(steps)
         outcome.tables["runs"] = judge.runs_table
         outcome.tables["times"] = judge.times
-        for case, chart in error_charts(judge).items():
-            outcome.figures[f"errors-{case}" if case else "errors"] = chart
+    modes = judge.modes
+    if len(modes):
+        outcome.tables["modes"] = modes
+    for what, charts in {"errors": error_charts(judge), "modes": mode_charts(modes)}.items():
+        for case, chart in charts.items():
+            outcome.figures[f"{what}-{case}" if case else what] = chart
     return outcome
 
 
@@ -78,6 +82,26 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     runs = int(table["runs"].max())
     what = f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}"
     return Chart(title=f"{what}; bands: the RMSE's 95 % if consistent", panels=[rmse, nees])
+
+
+def mode_charts(modes: pd.DataFrame) -> dict[str, Chart]:
+    """How probable modes are over time, by case, where there are any; see `Judge.modes`."""
+    if modes.empty:
+        return {}
+    return {str(case): mode_chart(each, str(case)) for case, each in modes.groupby("case", sort=False)}
+
+
+def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
+    """The mean probability of each mode over time, all runs together, a panel for each estimator."""
+    x, y = Axis(label="time (s)"), Axis(label="mean probability", limits=(0.0, 1.0))
+    panels = {name: Panel(x=x, y=y, title=name) for name in modes["estimator"].unique()}
+    for (name, mode, smoothed), rows in modes.groupby(["estimator", "mode", "smoothed"], sort=False):
+        style: Style = "dashed" if smoothed else "line"
+        series = curve(str(mode), rows["elapsed_s"], rows["probability"], style)
+        panels[name].series.append(series)
+    dashed = "; dashed: given all data of a run" if modes["smoothed"].any() else ""
+    title = f"{case or 'modes'}, probability of each mode{dashed}"
+    return Chart(title=title, panels=list(panels.values()))
 
 
 LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)

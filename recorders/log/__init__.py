@@ -1,5 +1,6 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
+from recorders.log.container import NotMcap
 from recorders.log.opening import Log, Topic, open_log
 from recorders.log.reader import read_blocks, read_empty, read_span, read_streams
 from recorders.log.run import RunMetadata
@@ -12,6 +13,7 @@ __all__ = [
     "Field",
     "Log",
     "LogWriter",
+    "NotMcap",
     "RunMetadata",
     "Schema",
     "Stream",

@@ -108,6 +108,10 @@ class _Index(NamedTuple):
         return entry if entry.message_end_time else None
 
 
+class NotMcap(BadInput):
+    """A file of some other kind, which some commands take in another way."""
+
+
 def open_container(path: Path, *, use_index: bool = True) -> Container:
     """Find out what `path` holds; without the index every region is opened, and only whole ones kept.
 
@@ -116,7 +120,7 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
     try:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise BadInput(f"{path}: not an MCAP file; give a log that starts with the MCAP magic")
+                raise NotMcap(f"{path}: not an MCAP file; give a log that starts with the MCAP magic")
             return _opened(file, use_index)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror})") from error

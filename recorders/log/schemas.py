@@ -325,6 +325,12 @@ DENSITY_ESTIMATE = _declare(
     _vector("mean"),
     _vector("covariance"),
 )
+EFFECTIVE_PARTICLES = _declare(
+    "EffectiveParticles",
+    "Of how many particles an estimate was made, and how many of equal weight are worth as much.",
+    _identifier("particles"),
+    _real("effective"),
+)
 INNOVATION = _declare(
     "Innovation",
     "How one measurement fitted the prediction, and whether the gate let it in.",
@@ -386,8 +392,8 @@ ITERATION = _declare(
 )
 OBSERVABILITY = _declare(
     "Observability",
-    "What the measurements since an earlier stamp say of the state at that stamp: the rank and the "
-    "eigenvalues, ascending, of the local Gramian in units of the prior, and the direction of the least.",
+    "What the measurements since an earlier stamp say of the state at that stamp: rank and eigenvalues, "
+    "ascending, of the local Gramian in units of the prior, and the direction of the least.",
     Field("begin_time_ns", "time_ns"),
     _identifier("rank"),
     _identifier("measurements"),

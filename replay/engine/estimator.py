@@ -102,11 +102,19 @@ def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
     """
     kind, _, variant = name.partition(":")
     estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    return estimator, set_by_variant("estimator", kind, variant, estimator.variant)
+
+
+def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Any]:
+    """The parameter that the variant of a name sets; nothing where the name has none.
+
+    Raises BadInput where what is named, an estimator or a method of this kind, has no variants.
+    """
     if not variant:
-        return estimator, {}
-    if estimator.variant is None:
-        raise BadInput(f"estimator {kind} has no variants; give '{kind}' without ':{variant}'")
-    return estimator, {estimator.variant: variant}
+        return {}
+    if parameter is None:
+        raise BadInput(f"{what} {kind} has no variants; give '{kind}' without ':{variant}'")
+    return {parameter: variant}
 
 
 def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:

@@ -14,7 +14,7 @@ from recorders.log import schemas
 from recorders.models.planar import Components, drive, range_bearing
 from replay.engine.measurements import PLANE
 from replay.engine.tangent import Kind
-from replay.inference.estimators import modelled
+from replay.inference.all_methods import modelled
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}

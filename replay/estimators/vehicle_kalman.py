@@ -17,7 +17,7 @@ from recorders.models.planar import Components
 from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import noise_moments, turn
 from replay.engine.measurements import PLANE
-from replay.inference.estimators import modelled
+from replay.inference.all_methods import modelled
 from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switching
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import create_model
+from pydantic.fields import FieldInfo
 from scipy.stats import chi2
 
 from recorders.errors import BadInput, choices
@@ -51,7 +52,7 @@ from replay.inference.happenings import (
     times_alone,
     with_ticks,
 )
-from replay.inference.methods import FILTERS, Method
+from replay.inference.methods import Method
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.recursion import (
     Carried,
@@ -79,25 +80,38 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
     return create_model(name, __base__=(method.parameters, model.parameters))  # type: ignore[arg-type]
 
 
-def modelled(model: Model, method: str) -> Estimator[Any]:
-    """The estimator that estimates the state of one model by one filter.
+def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
+    """A type of parameters with other defaults for some of them."""
+    fields: Any = {name: (_accepted(kind.model_fields[name]), value) for name, value in defaults.items()}
+    return create_model(kind.__name__, __base__=kind, **fields) if fields else kind
 
-    Raises BadInput where there is no such filter, or the model lacks what it needs.
+
+def _accepted(field: FieldInfo) -> Any:
+    """What a parameter accepts: its type with its bounds."""
+    bounds = tuple(field.metadata)
+    return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+
+
+def modelled_by(
+    model: Model, method: Method, name: str, settings: Mapping[str, Any] | None = None
+) -> Estimator[Any]:
+    """The estimator of one model by a method of that name; `settings` are its own defaults.
+
+    Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
     """
-    if method not in FILTERS:
-        raise BadInput(f"no filter '{method}'; {choices(method, FILTERS)}")
-    return modelled_by(model, FILTERS[method], method)
-
-
-def modelled_by(model: Model, method: Method, name: str) -> Estimator[Any]:
-    """The estimator of one model by a method of that name; BadInput where the model lacks something."""
-    lacking = method.lacks(model)
+    where, settings = f"method {name}", settings or {}
+    values = build(method.parameters, settings, where)
+    made = _made_for(where, method, values)
+    if made.sampling:
+        made.sampling(values)
+    lacking = made.lacks(model)
     if lacking:
-        raise BadInput(f"method {name} needs {lacking}")
+        raise BadInput(f"{where}: the model lacks {lacking}, which this method needs")
+    of_name = f" ({name})" if settings else ""
     return Estimator(
-        f"{model.summary}, {method.summary}",
+        f"{model.summary}, {method.summary}{of_name}",
         needs_of(model),
-        combined(model, method),
+        _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
     )
@@ -133,8 +147,7 @@ def _any_parameters(method: Method) -> type[Parameters]:
     for model in registered_models().values():
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
-                bounds = tuple(field.metadata)
-                kind = Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+                kind = _accepted(field)
                 same = fields.get(name, (kind,))[0] == kind
                 fields[name] = (kind if same else Any, None)
     return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
@@ -173,7 +186,7 @@ def _bind_fitting(
             f"the log has {', '.join(topics) or 'no topics'}"
         )
     (name,) = fitting
-    lacking = _made_for(label, method, values).lacks(models[name])
+    lacking = _made_for(f"estimator {label}", method, values).lacks(models[name])
     if lacking:
         raise BadInput(f"estimator {label}: model {name} lacks {lacking}, which this method needs")
     parameters = build(combined(models[name], method), given, f"estimator {label}, model {name}")
@@ -184,7 +197,7 @@ def bind_model(
     label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
 ) -> list[Bound]:
     """A filter for everything in the log that is of this model."""
-    method = _made_for(label, method, parameters)
+    method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
@@ -228,12 +241,12 @@ def _rewinding(
     return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
 
 
-def _made_for(label: str, method: Method, parameters: Any) -> Method:
-    """The method that the parameters choose; BadInput, which names the estimator, where they do not."""
+def _made_for(where: str, method: Method, parameters: Any) -> Method:
+    """The method that the parameters choose; BadInput that begins with `where`, if they choose none."""
     try:
         return method.made_for(parameters) if method.made_for else method
     except BadInput as error:
-        raise BadInput(f"estimator {label}: {error}") from error
+        raise BadInput(f"{where}: {error}") from error
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:

@@ -77,7 +77,7 @@ def gramian_steps(stage: Stage) -> Steps:
     motion = _carried_by_motion(stage)
     sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
 
-    def estimate(run: int, belief: Gramian, found: Estimates, row: int) -> None:
+    def estimate(run: int, belief: Gramian, found: Estimates, row: int, _: Any) -> None:
         """Note the Gramian, and as the mean how many messages are in it; begin anew."""
         transition, information = belief.transition[run], belief.information[run]
         found.mean[row, 0] = belief.messages[run]

@@ -106,12 +106,16 @@ class Cloud(NamedTuple):
 
 
 class Clouds(NamedTuple):
-    """Estimates as the recursion fills them in (`recursion.Estimates`), with all particles or none."""
+    """Estimates as the recursion fills them in (`recursion.Estimates`), with all particles or none.
+
+    `effective` (n,) is the effective number of particles.
+    """
 
     end: Integers
     time_ns: Integers
     mean: Floats
     covariance: Floats
+    effective: Floats
     states: Floats
     weight: Floats
 
@@ -244,10 +248,7 @@ def moving(stage: Stage, by_control: int) -> Function:
 
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
     """Resample where the effective number of particles is too small; returns the counter after it."""
-    squared = 0.0
-    for i in range(len(weight)):
-        squared += weight[i] * weight[i]
-    if not 1.0 / squared < memory.least_effective:
+    if not effective_number(weight) < memory.least_effective:
         return counter
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
     for i in range(len(weight)):
@@ -258,6 +259,14 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
         for k in range(states.shape[1]):
             states[i, k] = memory.spare[i, k]
     return counter + 1
+
+
+def effective_number(weight: Floats) -> float:
+    """How many particles of equal weight are worth as much as these (N,): 1 / sum w^2."""
+    squared = 0.0
+    for i in range(len(weight)):
+        squared += weight[i] * weight[i]
+    return 1.0 / squared
 
 
 def _driving(stage: Stage) -> Function:
@@ -618,6 +627,7 @@ def summing_up(model: Model) -> Function:
                 subtract(states[i], mean, offsets, i)
             settle(weight, offsets, mean, shift)
             moments(weight, offsets, offsets, shift, covariance, covariance)
+        clouds.effective[row] = effective_number(weight)
         for i in range(clouds.states.shape[1]):
             clouds.weight[row, i] = weight[i]
             for k in range(n):
@@ -704,14 +714,22 @@ class ParticleFilter(Filter):
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.stage.model.size))
         weight = np.empty((rows, particles))
-        return Clouds(end, times, mean, covariance, states, weight), innovations
+        return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
     def told(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
-        """The stream of estimates, and where they are wanted the particles."""
+        """The streams of estimates and of the effective number, and where they are wanted particles."""
         model, (rows, particles) = self.stage.model, clouds.weight.shape
-        made = [self.states(Estimates(*clouds[:4]), offsets)]
+        stem = f"/estimates/{self.name}"
+        effective = make_stream(
+            f"{stem}/effective",
+            schemas.EFFECTIVE_PARTICLES,
+            clouds.time_ns,
+            particles=np.full(rows, self.parameters.particles),
+            effective=clouds.effective,
+        )
+        made = [self.states(Estimates(*clouds[:4]), offsets), Ragged(effective, offsets)]
         if self.parameters.cloud:
-            stem, metadata = f"/estimates/{self.name}", {**named(model.state), "truth": self.truth}
+            metadata = {**named(model.state), "truth": self.truth}
             size = make_stream(
                 f"{stem}/particles",
                 schemas.ESTIMATE_SIZE,

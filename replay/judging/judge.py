@@ -42,12 +42,13 @@ from replay.judging.metrics import (
     plus,
     step_bounds,
 )
+from replay.judging.modes import Modes
 from replay.judging.set_errors import SetErrors, set_errors
 from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
-BOUND_STEP = schemas.BOUND_STEP.full_name
+BOUND_STEP, MODES = schemas.BOUND_STEP.full_name, schemas.MODE_PROBABILITIES.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
 COVERAGE = schemas.COVERAGE.full_name
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
@@ -142,6 +143,7 @@ class Judge:
         self._unjudged: dict[str, str] = {}
         self._degrees: Counter[str] = Counter()
         self._bounds: dict[tuple[str, str], Bounds] = {}
+        self._modes: dict[str, Modes] = {}
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
@@ -160,6 +162,8 @@ class Judge:
             output = Output(*named, rows, self._sources, self._first_run)
             if schema == BOUND_STEP:
                 self._bounds.setdefault(split_topic(topic), Bounds()).add(output)
+            elif schema == MODES:
+                self._modes.setdefault(topic, Modes.of(output)).add(output)
             self._measured.add(topic, output)
         found = set_errors(
             outputs, self._truths, gap_limit_s=self._gap_limit_s, first_run=self._first_run
@@ -224,6 +228,11 @@ class Judge:
                 self._quantities[topic].merge(quantities)
             else:
                 self._quantities[topic] = quantities
+        for topic, modes in other._modes.items():
+            if topic in self._modes:
+                self._modes[topic].merge(modes)
+            else:
+                self._modes[topic] = modes
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
         for topic, theirs in other._told.items():
@@ -313,6 +322,11 @@ class Judge:
     def times(self) -> pd.DataFrame:
         """The same for each run's spans of time; `until_s` is where a span ends, after the epoch."""
         return joined(time_table(each) for each in self._quantities.values())
+
+    @property
+    def modes(self) -> pd.DataFrame:
+        """How probable modes are: a row per estimator, case, span of time and mode; see `Modes`."""
+        return joined(each.table for each in self._modes.values())
 
     @property
     def judged(self) -> dict[str, Errors]:

@@ -411,6 +411,18 @@ def solution(sums: Sums) -> dict[str, float]:
     return values
 
 
+def _effective(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name != schemas.EFFECTIVE_PARTICLES.full_name:
+        return {}
+    shares = output.rows["effective"] / output.rows["particles"]
+    return {"estimates": len(shares), "shares": float(shares.sum())}
+
+
+def effective(sums: Sums) -> dict[str, float]:
+    """What share of a filter's particles counts, 1 / (N sum w^2): the mean over all estimates."""
+    return {"effective_share": sums["shares"] / sums["estimates"]} if sums.get("estimates") else {}
+
+
 ACCURACY = metric_of_sums(
     "RMSE of position and other components against truth", Errors, squares, accuracy
 )
@@ -430,3 +442,9 @@ COVERAGE = metric_of_sums(
     "what share of the span was estimated, and what was not used", Output, covered, coverage
 )
 SOLUTION = metric_of_sums("how many batch solutions converged, and how fast", Output, _solved, solution)
+PARTICLES = metric_of_sums(
+    "what share of the particles is effective, their weights being unequal",
+    Output,
+    _effective,
+    effective,
+)

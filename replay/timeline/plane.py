@@ -5,7 +5,7 @@ hangs on one transform that turns it up. What moves sits at its time and vanishe
 current; a path is a segment per row, of which the view shows the last minute.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,8 +94,26 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
 
 
-def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
-    """The particles of estimators that say where they are, all of a stamp until those of the next."""
+class Cloud(NamedTuple):
+    """The particles of an estimator that are drawn.
+
+    Attributes:
+        estimator: whose they are.
+        stamps: (s,) their times.
+        row: (n,) the number of each particle's stamp, in order.
+        places: (n, 2).
+        weights: (n,) one on average over the particles of a stamp.
+    """
+
+    estimator: str
+    stamps: Times
+    row: NDArray[np.int64]
+    places: Floats
+    weights: Floats
+
+
+def clouds_of(scene: Scene, case: str) -> Iterator[Cloud]:
+    """The particles of all estimators that say where they are."""
     for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
         if not set(PLANE) <= set(stream.components):
             continue
@@ -105,13 +123,24 @@ def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
         columns = [stream.components.index(component) for component in PLANE]
         size = len(stream.components)
         places = stream["mean"][drawn].reshape(-1, size)[:, columns]
-        share = stream["weight"][drawn] * np.repeat(counts[rows], counts[rows])
-        points = rr.Points2D.columns(
-            positions=places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(share)
-        )
-        canvas.send(f"{root}/{name}/particles", stamps[rows], points.partition(counts[rows]))
-        colour = rr.Points2D.from_fields(colors=[(*scene.colour(name), 120)])
-        canvas.fix(f"{root}/{name}/particles", colour)
+        weights = stream["weight"][drawn] * np.repeat(counts[rows], counts[rows])
+        yield Cloud(name, stamps[rows], np.repeat(np.arange(len(rows)), counts[rows]), places, weights)
+
+
+def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
+    """The particles of all estimators of a case; see `draw_cloud`."""
+    for cloud in clouds_of(scene, case):
+        draw_cloud(canvas, f"{root}/{cloud.estimator}/particles", cloud, scene.colour(cloud.estimator))
+
+
+def draw_cloud(canvas: Canvas, entity: str, cloud: Cloud, colour: Colour) -> None:
+    """All particles of a stamp until those of the next."""
+    points = rr.Points2D.columns(
+        positions=cloud.places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(cloud.weights)
+    )
+    counts = np.bincount(cloud.row, minlength=len(cloud.stamps))
+    canvas.send(entity, cloud.stamps, points.partition(counts))
+    canvas.fix(entity, rr.Points2D.from_fields(colors=[(*colour, 120)]))
 
 
 def draw_polygons(

@@ -33,6 +33,9 @@ from replay.timeline.events import draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
+    clouds_of,
+    draw_cloud,
+    draw_clouds,
     draw_ellipses,
     draw_lines,
     draw_path,
@@ -203,6 +206,7 @@ def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str
             known = np.isfinite(places[:, n, 0])
             stroke = Stroke(scene.colour(name))
             draw_path(canvas, f"{root}/{name}/{n}", vehicles.time_ns[known], places[known, n], stroke)
+        draw_clouds(canvas, scene, f"vehicle{n + 1}", f"{root}/vehicle{n + 1}")
     _draw_points(canvas, f"{root}/fixes", _points(scene, "/network/detection"), FIX, 4.0)
     for name, points in _registered(scene):
         _draw_points(canvas, f"{root}/{name}/detections", points, SEEN, 3.0)
@@ -244,6 +248,14 @@ def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[s
         for n in range(vehicles.number):
             stream = scene.outputs[f"/estimates/{name}/vehicle{n + 1}/state"]
             _draw_ellipse(canvas, scene, vehicles, name, n, stream, centres[n])
+    for n in range(vehicles.number):
+        case = f"vehicle{n + 1}"
+        for cloud in clouds_of(scene, case):
+            apart = cloud.places - vehicles.places[vehicles.rows(cloud.stamps), n][cloud.row]
+            shown = np.abs(apart).max(axis=1) < SHOWN_M
+            places, entity = apart[shown] + centres[n], f"{CLOSE}/{case}/{cloud.estimator}/particles"
+            close = cloud._replace(row=cloud.row[shown], places=places, weights=cloud.weights[shown])
+            draw_cloud(canvas, entity, close, scene.colour(cloud.estimator))
     times, lines, number = _links(scene)
     apart = lines - vehicles.places[vehicles.rows(times), number][:, None]
     shown = np.abs(apart).max(axis=(1, 2)) < SHOWN_M

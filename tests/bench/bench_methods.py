@@ -22,9 +22,9 @@ from replay.engine.estimator import Bound, bind
 from replay.engine.sources import MemorySource
 from replay.estimators.landmarks import ROBOT
 from replay.estimators.vehicle_kalman import VEHICLE
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
 from replay.inference.model import Model, Switching
-from replay.inference.registered import METHODS
 from tests.bench.loops import Call, calls_of, first_use_s
 from tests.bench.reference.landmarks import fill_motion_jacobians, fill_sensor_jacobian
 from tests.bench.timing import cpu_seconds

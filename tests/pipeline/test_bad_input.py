@@ -237,6 +237,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     # estimates
     "evaluate zzz.mcap": ("zzz.mcap", "No such file"),
     "evaluate log.mcap": ("log.mcap", "no estimates", "fuselog replay"),
+    "evaluate line.tum": ("line.tum", "not an MCAP", "with --truth the file"),
     "evaluate moved/log.estimates.mcap": ("moved/log.mcap", "not there", "--log"),
     "evaluate log.estimates.mcap --log zzz.mcap": ("zzz.mcap", "No such file"),
     "evaluate log.estimates.mcap --log other.mcap": ("seed 0", "seed 1"),

@@ -13,7 +13,9 @@ import matplotlib.figure
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
+from pipeline.charts import Chart
 from pipeline.claims import Claim
 from pipeline.ensemble import hash_files, hash_streams, record_ensemble
 from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
@@ -21,6 +23,7 @@ from pipeline.results import Outcome, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
+from recorders.parameters import build
 from recorders.recording import Recording
 from replay.engine.blocks import gather
 from replay.engine.sources import memory_source
@@ -265,6 +268,27 @@ def test_topics_that_look_like_formulas_are_drawn(tmp_path: Path) -> None:
     with result_folder(tmp_path / "r") as part:
         write_outcome(part, "test", {"title": ""}, outcome)
     assert len(list((tmp_path / "r/figures").glob("*.svg"))) == 2
+
+
+def test_probabilities_of_modes_are_drawn_beside_the_errors(tmp_path: Path, fuselog: Fuselog) -> None:
+    """Of the interacting filter alone, over time, and dashed in the same colour given all data."""
+    folder = tmp_path / "result"
+    run = ["run", "manoeuvres", "--runs", "2", "--set", "duration_s=10", "--out", folder]
+    assert fuselog(*run).code == 0
+    chart = build(Chart, json.loads((folder / "figures/modes-vehicle1.json").read_text()), "chart")
+    [panel] = chart.panels
+    assert panel.title == "imm:ekf"
+    for style in ("line", "dashed"):
+        series = [each for each in panel.series if each.style == style]
+        assert [each.label for each in series] == ["drive", "manoeuvre", "stand"]
+        probabilities = np.array([each.y for each in series])
+        assert probabilities.shape == (3, 20)  # two fixes a second
+        assert probabilities.min() > 0.0
+        assert_allclose(probabilities.sum(axis=0), 1.0, atol=1e-6)
+    table = pd.read_parquet(folder / "tables/modes.parquet")
+    assert_allclose(table.groupby(["smoothed", "elapsed_s"])["probability"].sum(), 1.0, rtol=1e-12)
+    assert fuselog("report", folder, "-o", tmp_path / "page.html").code == 0
+    assert "probability of each mode" in (tmp_path / "page.html").read_text()
 
 
 def test_real_data_run_as_an_experiment(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:

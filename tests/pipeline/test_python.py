@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -36,6 +37,12 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def recordings() -> list[fl.MemorySource]:
     return [fl.record("landmarks", seed=3, run=run, **SHORT) for run in range(2)]
+
+
+def robot() -> fl.Model:
+    from replay.estimators.landmarks import ROBOT
+
+    return ROBOT
 
 
 def blocks_of(page: str) -> list[str]:
@@ -217,10 +224,10 @@ def test_a_replay_says_what_the_command_says(
 
 def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -> None:
     """A model with a method is what the registered estimator is, with settings too."""
-    from replay.estimators.landmarks import DEAD_RECKONING, ROBOT
+    from replay.estimators.landmarks import DEAD_RECKONING
 
     assert isinstance(DEAD_RECKONING, Estimator)
-    mine, wide = fl.modelled(ROBOT, "ekf"), {"sigma_range_m": 0.4}
+    mine, wide = fl.modelled(robot(), "ekf"), {"sigma_range_m": 0.4}
     own = {"mine": mine, "wide": {"kind": mine, **wide}, "same": {"kind": "ekf", **wide}}
     done = fl.replay(recordings, ["ekf", own, {"reckoned": DEAD_RECKONING}])
     values = done.metrics.pivot_table("value", "quantity", "estimator")
@@ -230,6 +237,26 @@ def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -
     stated = json.loads(done.estimates[0].run.notes["estimators"])  # type: ignore[union-attr]
     assert stated["wide"] == {"kind": str(mine), **wide}
     assert "reckoned" in repr(done)
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["smoother:ekf:lag=500ms", "smoother:iterated", "particles:50", "bound:smoother", "imm:ekf"],
+)
+def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.MemorySource]) -> None:
+    """What is not registered, tied to a method by its name, is replayed as the command replays it."""
+    from replay.estimators.vehicle_kalman import VEHICLE
+
+    has_modes = method.startswith("imm")
+    logs = [fl.record("manoeuvres", **SHORT)] if has_modes else recordings
+    mine = fl.modelled(replace(VEHICLE if has_modes else robot(), summary="mine"), method)
+    assert str(mine).startswith("mine, ")
+    assert str(mine).endswith(f"({method})")
+    values = fl.replay(logs, [method, {"mine": mine}]).metrics.pivot_table(
+        "value", ["quantity", "case"], "estimator"
+    )
+    assert len(values) > 2
+    assert values["mine"].equals(values[method])
 
 
 @pytest.mark.parametrize(
@@ -246,7 +273,18 @@ def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -
         (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: no such entry"),
         (lambda _: fl.write("a.mcap", [1]), "a.mcap: give streams"),
         (lambda _: fl.estimators["ekff"], "no estimator 'ekff'; did you mean 'ekf'"),
-        (lambda _: fl.modelled(object(), "ekff"), "no filter 'ekff'"),
+        (lambda _: fl.modelled(object(), "ekff"), "no method 'ekff'; did you mean 'ekf'"),
+        (lambda _: fl.modelled(robot(), "ekf:9"), "method ekf has no variants; give 'ekf' without ':9'"),
+        (lambda _: fl.modelled(robot(), "smoother:ekg"), "method smoother:ekg: 'ekg' is no filter that"),
+        (lambda _: fl.modelled(robot(), "lrkf:s2kf"), "sampling 's2kf': count: is missing"),
+        (
+            lambda _: fl.modelled(robot(), "particles:0"),
+            "method particles:0: parameter 'particles' is '0'",
+        ),
+        (
+            lambda _: fl.modelled(robot(), "imm:ekf"),
+            "method imm:ekf: the model lacks several modes, which this method needs",
+        ),
         (lambda runs: fl.replay(runs, "ekff"), "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda runs: fl.replay(runs, {"ekf": {"sigma": 1}}), "estimator ekf: no parameter 'sigma'"),
         (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),

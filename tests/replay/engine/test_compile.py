@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import numba
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.testing import assert_array_equal
 
 import replay.engine.compile
 from recorders.errors import BadInput
+from recorders.importers.ros import ros1_file
 from recorders.log import loops
 from replay.engine.compile import _load, cache_folder, compile_over_runs, compiled
 
@@ -260,17 +262,24 @@ def test_every_kernel_of_replay_is_compiled_here():
     assert "njit" not in users["jets.py"].read_text(encoding="utf-8")
 
 
-def test_the_loops_of_the_log_call_nothing_outside_their_file():
+@pytest.mark.parametrize(
+    ("module", "names"),
+    [(loops, {"_scan", "_agree"}), (ros1_file, {"_scan", "_number"})],
+    ids=["loops", "ros1_file"],
+)
+def test_the_loops_of_recorders_call_nothing_outside_their_file(module: ModuleType, names: set[str]):
     """Numba caches them, since recorders know no replay, and notices a change in their own file only."""
-    users = [path for path in Path("recorders").rglob("*.py") if "numba" in imports_of(path)]
-    assert users == [Path("recorders/log/loops.py")]
-    kernels = [each for each in vars(loops).values() if hasattr(each, "py_func")]
-    assert {kernel.py_func.__name__ for kernel in kernels} == {"_scan", "_agree"}
+    kernels = [each for each in vars(module).values() if hasattr(each, "py_func")]
+    assert {kernel.py_func.__name__ for kernel in kernels} == names
     for kernel in kernels:
         outside = dict(inspect.getclosurevars(kernel.py_func).globals)
-        assert outside.pop("np") is np
-        assert set(outside) <= {"MESSAGE_HEAD_BYTES", "HEAD_BYTES", "_MESSAGE", "_SCHEMA", "_CHANNEL"}
-        assert all(type(value) is int for value in outside.values())
+        assert outside.pop("np", np) is np
+        assert all(type(value) is int or value in kernels for value in outside.values())
+
+
+def test_recorders_have_no_other_loops():
+    users = {path.stem for path in Path("recorders").rglob("*.py") if "numba" in imports_of(path)}
+    assert users == {"loops", "ros1_file"}
 
 
 def imports_of(path: Path) -> set[str]:

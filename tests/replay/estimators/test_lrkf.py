@@ -15,8 +15,8 @@ from replay.engine.replaying import collect, replay
 from replay.engine.sources import LogSource, MemorySource
 from replay.estimators.extended_target import EXTENDED_TARGET, measure
 from replay.estimators.reactor import REACTOR
+from replay.inference.all_methods import METHODS
 from replay.inference.gaussian import no_innovation
-from replay.inference.registered import METHODS
 from replay.inference.regression import regression, sample_memory, sampled_sensor
 from replay.inference.steps import Gaussian, Stage
 from replay.sampling import Samples, parse_sampling

@@ -8,9 +8,9 @@ from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import Source
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
 from replay.inference.model import Model
-from replay.inference.registered import METHODS
 
 
 def bound(model: Model, method: str, sources: Sequence[Source], **values: Any) -> list[Bound]:

@@ -12,8 +12,8 @@ import pytest
 
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from replay.engine.sources import MemorySource
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
-from replay.inference.registered import METHODS
 from tests.replay.inference.wheel import make_wheel
 
 RUNS = 30

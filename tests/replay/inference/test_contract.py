@@ -17,8 +17,8 @@ from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference import estimators
+from replay.inference.all_methods import METHODS
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.inference.registered import METHODS
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

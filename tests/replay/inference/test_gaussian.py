@@ -12,10 +12,10 @@ from scipy.stats import multivariate_normal
 
 from recorders.log import schemas
 from replay.engine.results import ALL_WELL
+from replay.inference.all_methods import METHODS
 from replay.inference.gaussian import cholesky
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
 from replay.inference.recursion import fault_of
-from replay.inference.registered import METHODS
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,

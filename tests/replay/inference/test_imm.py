@@ -19,9 +19,9 @@ from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
 from replay.inference import estimators
+from replay.inference.all_methods import METHODS
 from replay.inference.imm import Memory, changing, mixing
 from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switching
-from replay.inference.registered import METHODS
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

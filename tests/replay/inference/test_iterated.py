@@ -16,10 +16,10 @@ from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import modelled_by
 from replay.inference.iterated import robust
 from replay.inference.model import Motion
-from replay.inference.registered import METHODS
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

@@ -23,10 +23,11 @@ from replay.engine.estimator import bind
 from replay.engine.philox import fill_normals, philox, unit
 from replay.engine.sources import memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference.all_methods import METHODS
 from replay.inference.estimators import of_any_model
 from replay.inference.model import Motion
 from replay.inference.particles import BOOTSTRAP
-from replay.inference.registered import METHODS
+from replay.judging.metrics import PARTICLES, Output
 from replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
@@ -75,6 +76,20 @@ def test_means_and_likelihoods_err_as_the_sheet_says(particles: int, spread: flo
     assert_allclose(total.std(), spread, rtol=0.25)  # 4 standard errors of a standard deviation
 
 
+def test_as_many_particles_are_effective_as_the_sheet_says() -> None:
+    """Of 400 particles over 40 seeds, and so often are too few of them; the last step moves none."""
+    source = scalar.source(scalar.simulate(11))
+    replays = [outputs(SCALAR, "particles", [source], particles=400, seed=seed) for seed in range(40)]
+    shares = np.array(
+        [each["effective"]["effective"] / each["effective"]["particles"] for each in replays]
+    )
+    assert_allclose(shares.mean(), 0.567, atol=0.004)
+    resamplings = (shares[:, :-1] < 0.5).sum(axis=1)
+    assert_allclose(resamplings.mean(), 20.0, atol=0.5)
+    told = PARTICLES.of(Output("particles", "", "effective", replays[0]["effective"], [source]))
+    assert told["effective_share"] == pytest.approx(shares[0].mean(), rel=1e-12)
+
+
 @pytest.mark.paper
 def test_the_likelihood_is_unbiased() -> None:
     _, total = errors(400, 5000)
@@ -112,9 +127,9 @@ def test_a_gate_keeps_outliers_out() -> None:
 # A plain filter of vehicle A
 
 
-def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Floats]:
-    """Means, covariances at the stamps, and log-likelihoods of the messages, in NumPy."""
-    counter = 0
+def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Floats, Floats, int]:
+    """Means, covariances, effective numbers, log-likelihoods of messages, and how often it resampled."""
+    counter, resamplings = 0, 0
 
     def drawn(columns: int) -> Floats:
         nonlocal counter
@@ -130,7 +145,7 @@ def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Fl
     for index, (time_s, sensor, beacon, value) in enumerate(told):
         if time_s > now:
             if 1 / np.sum(weight**2) < particles / 2:
-                counter += 1
+                counter, resamplings = counter + 1, resamplings + 1
                 with np.errstate(over="ignore"):
                     start = unit(philox(counter, key)[0])
                 ends = np.cumsum(weight)
@@ -156,9 +171,9 @@ def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Fl
         weight = weight * np.exp(density) / total
         if index + 1 == len(told) or told[index + 1][0] > time_s:
             mean = weight @ x
-            found.append((mean, (x - mean).T @ (weight[:, None] * (x - mean))))
-    means, covariances = zip(*found, strict=True)
-    return np.array(means), np.array(covariances), np.array(likelihoods)
+            covariance = (x - mean).T @ (weight[:, None] * (x - mean))
+            found.append((mean, covariance, 1 / np.sum(weight**2)))
+    return (*map(np.array, zip(*found, strict=True)), np.array(likelihoods), resamplings)
 
 
 @pytest.mark.usefixtures("uncompiled")
@@ -168,11 +183,13 @@ def test_every_step_is_that_of_a_plain_filter(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("replay.inference.particles.run_key", lambda *_: key)
     told = vehicle_a.simulate(7)[0][:34]
     assert sum(np.isnan(each[3]).any() for each in told) > 2
-    means, covariances, likelihoods = plain(told, 60, key)
+    means, covariances, effective, likelihoods, resamplings = plain(told, 60, key)
     found = outputs(VEHICLE_A, "particles", [vehicle_a.source(told)], particles=60)
     assert_allclose(found["state"]["mean"], means, atol=1e-10)
     assert_allclose(found["state"]["covariance"].reshape(-1, 5, 5), covariances, atol=1e-10)
     assert_allclose(found["innovation"]["log_likelihood"], likelihoods, atol=1e-9)
+    assert_allclose(found["effective"]["effective"], effective, rtol=1e-9)
+    assert resamplings == (effective[:-1] < 30).sum() > 0
 
 
 # Manifolds, and noise that is not additive

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.log import Clock, Stream
+from recorders.log import Clock, Stream, make_stream, schemas
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import bind
@@ -91,6 +91,43 @@ def test_parts_of_the_runs_merge_to_the_whole(
     parts.merge(judged(sources[2:], [of_runs([2])], first_run=2))
     assert_alike(parts, judged(sources, [outputs]))
     assert set(parts.runs_table["run"]) == {0, 1, 2}
+
+
+def test_probabilities_of_modes_are_means_over_the_runs(sources: list[MemorySource]) -> None:
+    """At every stamp, of the runs that have it; blocks and parts change no number."""
+    rng = np.random.default_rng(3)
+    counts, modes = (40, 40, 25), ("drive", "stand")
+    probability = [rng.dirichlet([1.0, 2.0], count) for count in counts]
+
+    def of(runs: slice, rows: slice, leaf: str = "modes") -> dict[str, Ragged]:
+        topic = f"/estimates/imm/robot1/{leaf}"
+        streams = [
+            make_stream(
+                topic,
+                schemas.MODE_PROBABILITIES,
+                source.epoch_ns + np.arange(len(each))[rows] * 100_000_000,
+                metadata={"components": ",".join(modes)},
+                probability=each[rows],
+            )
+            for source, each in zip(sources[runs], probability[runs], strict=True)
+        ]
+        return {topic: gather(streams)}
+
+    everything = slice(None)
+    whole = judged(sources, [of(everything, everything)]).modes
+    assert_allclose(whole.groupby("elapsed_s")["probability"].sum(), 1.0, rtol=1e-12)
+    mean = [np.mean([each[step] for each in probability if step < len(each)], 0) for step in range(40)]
+    assert_allclose(whole["probability"], np.ravel(mean), rtol=1e-12)
+    assert_allclose(whole["elapsed_s"], np.repeat(np.arange(40) * 0.1, 2), atol=1e-9)
+    assert whole["estimates"].tolist() == [3] * 50 + [2] * 30
+    assert whole["mode"].tolist() == [*modes] * 40
+    blocks = judged(sources, [of(everything, slice(0, 17)), of(everything, slice(17, None))])
+    parts = judged(sources[:2], [of(slice(0, 2), everything)])
+    parts.merge(judged(sources[2:], [of(slice(2, 3), everything)], first_run=2))
+    for other in (blocks.modes, parts.modes):
+        pd.testing.assert_frame_equal(other, whole, rtol=1e-12)
+    smoothed = judged(sources, [of(everything, everything, "smoothed_modes")]).modes
+    assert (bool(whole["smoothed"].any()), bool(smoothed["smoothed"].all())) == (False, True)
 
 
 def test_the_runs_add_up_to_the_metrics(sources: list[MemorySource], outputs: dict[str, Ragged]) -> None:

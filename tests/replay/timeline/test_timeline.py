@@ -91,6 +91,14 @@ def read(path: Path, *, static: bool = False) -> dict[str, Columns]:
     return found
 
 
+def views(path: Path) -> set[str]:
+    """The names of all views of a file's layout."""
+    reader, name = rc.RrdReader(str(path)), "ViewBlueprint:display_name"
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=reader.blueprints()[0])]
+    rows = [row for batch in batches if name in batch.schema.names for row in batch.column(name)]
+    return {each for row in rows for each in row.as_py()}
+
+
 def of_run(errors: list[Errors], estimator: str) -> tuple[Errors, np.ndarray]:
     (found,) = [each for each in errors if each.estimator == estimator]
     return found, found.run == RUN
@@ -148,6 +156,44 @@ def test_mode_probabilities_are_plots(tmp_path: Path) -> None:
         for column, mode in enumerate(("drive", "manoeuvre", "stand")):
             curve = found[f"/plots/vehicle1/{topic}/imm/{mode}"]
             assert np.array_equal(np.ravel(curve["Scalars:scalars"]), probability[:, column])
+
+
+def test_vehicles_have_their_particles_and_a_tab_for_their_modes(tmp_path: Path) -> None:
+    """Particles lie on the map where they are, and close up beside the true place if they are near."""
+    source = memory_source(*record_run("vehicles", {"duration_s": 5.0, "vehicles": 2}, 1, 0))
+    settings: dict[str, dict[str, object]] = {
+        "cloud": {"kind": "particles:50", "model": "vehicle", "cloud": True},
+        "imm": {"model": "vehicle", "smoothed_modes": True},
+    }
+    bound = [each for name in settings for each in bind(name, [source], settings[name])]
+    outputs = collect(replayed([source], bound))
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    found = read(tmp_path / "run.rrd")
+    left_out = 0
+    for number, case in enumerate(("vehicle1", "vehicle2")):
+        cloud, truth = outputs[f"/estimates/cloud/{case}/particle"], source.streams[f"/{case}/truth"]
+        places = cloud["mean"].reshape(5, 50, 4)[:, :, 0::2]
+        weights = cloud["weight"].reshape(5, 50)
+        at = np.searchsorted(truth.publish_time_ns, cloud.stream.publish_time_ns[::50])
+        apart = places - truth["state"][at, None, 0::2]
+        is_near = np.abs(apart).max(axis=2) < 3.8
+        left_out += np.count_nonzero(~is_near)
+        beside = apart + np.array([8.0 * number, 0.0])
+        everywhere = np.ones_like(is_near)
+        for entity, expected, is_drawn in (("map", places, everywhere), ("close", beside, is_near)):
+            points = found[f"/map/{entity}/{case}/cloud/particles"]
+            for step in range(5):
+                drawn, radii = (points[f"Points2D:{name}"][step] for name in ("positions", "radii"))
+                np.testing.assert_allclose(drawn, expected[step, is_drawn[step]], rtol=1e-5, atol=1e-5)
+                area = 1.5**2 * 50 * weights[step, is_drawn[step]]
+                np.testing.assert_allclose(np.square(radii), area, rtol=1e-4, atol=1e-9)
+        for topic in ("modes", "smoothed_modes"):
+            probability = outputs[f"/estimates/imm/{case}/{topic}"]["probability"]
+            curve = found[f"/plots/{case}/{topic}/imm/stand"]["Scalars:scalars"]
+            assert np.array_equal(np.ravel(curve), probability[:, 2])
+        tabs = {f"Modes of imm, {case}", f"Smoothed modes of imm, {case}"}
+        assert tabs <= views(tmp_path / "run.rrd")
+    assert 0 < left_out < 250
 
 
 def test_the_map_holds_poses_paths_and_ellipses_in_true_coordinates(
