@@ -103,6 +103,8 @@ TABLE: dict[str, tuple[str, ...]] = {
     "cut log.mcap --decimate /robot1/truth=0 -o new.mcap": ("/robot1/truth=0", "as 10", "as 5Hz"),
     "cut log.mcap --decimate /robot1/truth=0Hz -o new.mcap": ("/robot1/truth=0Hz", "as 5Hz"),
     "cut log.mcap --decimate /robot1/truth=often -o new.mcap": ("/robot1/truth=often", "as 5Hz"),
+    "cut json.mcap --topics /robot1/odometry -o new.mcap": ("json.mcap", "the encoding 'json'"),
+    "cut json.mcap --topics /robot1/o* -o new.mcap": ("json.mcap", "import it first"),
     "cut nan.mcap -o new.mcap": ("nan.mcap", "is NaN in message"),
     "merge log.mcap -o new.mcap": ("log.mcap", "at least two logs"),
     "merge log.mcap other.mcap -o new.mcap": (
