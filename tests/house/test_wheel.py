@@ -33,7 +33,17 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
         (wheel,) = dist.glob("*.whl")
         venv.create(bare, with_pip=True)
         scripts = Path(sysconfig.get_path("scripts", "venv", {"base": str(bare)}))
-        run(scripts / "python", "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel)
+        run(
+            scripts / "python",
+            "-m",
+            "pip",
+            "install",
+            "-q",
+            "--no-compile",
+            "-c",
+            ROOT / "constraints.txt",
+            wheel,
+        )
         place = run(scripts / "python", "-c", "import fuselog; print(fuselog.__file__)")
         assert Path(place).is_relative_to(bare)
         door = "import fuselog as fl; print(fl.replay(fl.record('landmarks', duration_s=2.0), 'ekf'))"
