@@ -29,6 +29,8 @@ from replay.engine.blocks import gather
 from replay.engine.sources import memory_source
 from replay.judging.judge import Judge
 
+pytestmark = pytest.mark.paper
+
 Fuselog = Callable[..., Any]
 SHORT = ["--set", "duration_s=2"]
 RUN = ["run", "landmarks", "--set", "duration_s=2", "--runs", "3", "--seed", "5"]

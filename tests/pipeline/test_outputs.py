@@ -20,6 +20,8 @@ from PIL.PngImagePlugin import PngInfo
 from replay.timeline.viewer import SOFTWARE
 from tests.pipeline.conftest import MRCLAM, Said, run_here
 
+pytestmark = pytest.mark.paper
+
 resource = pytest.importorskip("resource")
 
 AIS = (

@@ -33,6 +33,8 @@ from pipeline.report.verdict import verdict
 from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.paper
+
 Fuselog = Callable[..., Any]
 WINDOWS = [(width, scheme) for width in (1280, 400) for scheme in ("light", "dark")]
 

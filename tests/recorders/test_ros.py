@@ -29,6 +29,8 @@ from recorders.importers.ros.sqlite_pages import missing_bytes, whole_rows
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
 
+pytestmark = pytest.mark.paper
+
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 10_000_000
 VISION = {

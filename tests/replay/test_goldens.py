@@ -9,6 +9,8 @@ from tests.goldens import store
 from tests.goldens.recipes import RECIPES, covered, index, unpack
 from tests.goldens.store import ALLOWED, Allowed, Golden, differences
 
+pytestmark = pytest.mark.paper
+
 SIMULATED = [name for name, recipe in RECIPES.items() if not recipe.importer]
 IMPORTED = [name for name, recipe in RECIPES.items() if recipe.importer]
 

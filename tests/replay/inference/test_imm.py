@@ -30,6 +30,8 @@ from tests.replay.inference.vehicle_a import VEHICLE_A
 from tests.replay.inference.vehicle_a import move as move_vehicle
 from tests.replay.inference.vehicle_a import noise as vehicle_noise
 
+pytestmark = pytest.mark.paper
+
 EXACT = 1e-9
 
 

@@ -30,6 +30,8 @@ from tests.replay.inference.wheel import make_wheel
 from tests.replay.inference.wheel import simulate as simulate_wheel
 from tests.replay.inference.wheel import source as wheel_source
 
+pytestmark = pytest.mark.paper
+
 EXACT = 1e-9
 Told = list[tuple[float, str, int, Any]]
 

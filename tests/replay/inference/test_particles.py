@@ -37,6 +37,8 @@ from tests.replay.inference.test_recursion import assert_equal, assert_same, in_
 from tests.replay.inference.vehicle_a import BEACONS, COVARIANCE, MEAN, VEHICLE_A, wrap
 from tests.replay.inference.wheel import make_wheel
 
+pytestmark = pytest.mark.paper
+
 Floats = Any
 
 

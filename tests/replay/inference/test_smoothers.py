@@ -29,6 +29,8 @@ from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_recursion import assert_equal, in_blocks
 from tests.replay.inference.vehicle_a import SIGHTING, VEHICLE_A
 
+pytestmark = pytest.mark.paper
+
 EXACT = 1e-9
 
 

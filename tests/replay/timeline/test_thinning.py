@@ -42,6 +42,7 @@ def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[in
         assert_array_equal(whole.rows.publish_time_ns, times)
 
 
+@pytest.mark.paper
 def test_a_receiver_sees_estimates_before_the_replay_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
