@@ -19,7 +19,7 @@ from replay.engine.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
 # Of a run, those that an opening looks at.
-FIRST_MESSAGES = 1 << 12
+FIRST_MESSAGES = 1 << 15
 # The state of what can start in no run.
 _REFUSED = object()
 

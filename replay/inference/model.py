@@ -206,10 +206,16 @@ class Start:
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
         parameters: numbers that no channel of such a log states.
+        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
+            None where these do not tell it yet. The path (k, n) is where the control alone leads from
+            zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
+            The state is that at the last of them, and begins just after it: they are used up. For a
+            state of which a position tells too little.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
+    align: Callable[..., tuple[Floats, Floats] | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
