@@ -1,4 +1,4 @@
-"""Places in a local tangent plane (east, north) as latitude and longitude on the WGS 84 ellipsoid."""
+"""Places in a local tangent plane (east, north, up) and on the WGS 84 ellipsoid."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 
 
 def earth_centred(
-    latitude_deg: Component, longitude_deg: Component
+    latitude_deg: Component, longitude_deg: Component, height_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """The point of the ellipsoid in the frame that turns with the earth, in m."""
+    """A point at a height above the ellipsoid in the frame that turns with the earth, in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (
-        normal * np.cos(latitude) * np.cos(longitude),
-        normal * np.cos(latitude) * np.sin(longitude),
-        normal * (1.0 - ECCENTRICITY_SQUARED) * np.sin(latitude),
+        (normal + height_m) * np.cos(latitude) * np.cos(longitude),
+        (normal + height_m) * np.cos(latitude) * np.sin(longitude),
+        (normal * (1.0 - ECCENTRICITY_SQUARED) + height_m) * np.sin(latitude),
     )
 
 
@@ -55,7 +55,10 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """East, north and up (m) of a point of the ellipsoid (latitude, longitude), seen from the origin."""
+    """East, north and up (m) of a place as it is seen from the origin.
+
+    Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
+    """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     x, y, z = (
         there - here
