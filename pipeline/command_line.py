@@ -159,28 +159,59 @@ def record(
 
 @fuselog.command(name="import", short_help="Import real data and write their log.")
 @click.argument("source")
-@click.argument("path", type=ANY_PATH)
+@click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
     help="For ROS: what says when a message was published, its header or the bag [default: header].",
 )
+@click.option("--mapping", help="What becomes of messages or columns: a TOML file, or one that ships.")
+@click.option(
+    "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
+)
 @set_option
 def import_(
-    source: str, path: Path, out: Path | None, clock: str | None, settings: tuple[str, ...]
+    source: str,
+    paths: tuple[Path, ...],
+    out: Path | None,
+    clock: str | None,
+    mapping: str | None,
+    guess: bool,
+    settings: tuple[str, ...],
 ) -> None:
-    """Import real data of kind SOURCE from PATH, as published, and write their log."""
-    from pipeline.outputs import check_files, imported
+    """Import real data of kind SOURCE from PATH, as published, and write their log.
+
+    Tables (SOURCE table) may be several files and folders, which become one log.
+    """
+    from pipeline.outputs import MAPPING, check_files, imported
+    from recorders.atomic import whole_file
     from recorders.parameters import parse_settings
     from recorders.recording import import_log
 
+    if guess:
+        from recorders.importers.tables.guessing import guess as guessed
+
+        if source != "table":
+            raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
+        target = out or Path("mapping.toml")
+        check_files([(target, MAPPING)], {"data": paths})
+        text = guessed(paths)
+        with whole_file(target) as file:
+            file.write_text(text, encoding="utf-8")
+        command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(target)])
+        click.echo(f"{target}: read it, then: {command}")
+        return
+    if len(paths) > 1 and source != "table":
+        raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
     target = out or Path(f"{source}.mcap")
-    check_files([(target, imported(source))], {"data": [path]})
-    chosen = {} if clock is None else {"clock": clock}
-    metadata, messages = import_log(source, path, parse_settings(settings) | chosen, target)
+    check_files([(target, imported(source))], {"data": paths})
+    more = [str(path) for path in paths[1:]]
+    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
-        click.echo(printable(f"{subject}: {fact}"))
+        click.echo(printable(f"{subject}: {fact}" if fact else subject))
     _say_written(target, messages)
 
 

@@ -44,6 +44,15 @@ def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return _unpacked(archive, tmp_path_factory) / "trajectories"
 
 
+@pytest.fixture(scope="session")
+def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of GNSS, inertial and UWB recordings, unpacked once."""
+    archive = real_data / "navigation.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    return _unpacked(archive, tmp_path_factory) / "navigation"
+
+
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("data")
     with tarfile.open(path) as archive:

@@ -168,6 +168,13 @@ RELATIVE_BEARING = _declare(
     _real("angle_rad"),
 )
 RANGE = _declare("Range", "The distance to one target.", _identifier("target_id"), _real("range_m"))
+ANCHOR_RANGE = _declare(
+    "AnchorRange",
+    "The distance from a tag on the body (a BodyPoint) to an anchor (a Landmark).",
+    _identifier("anchor_id"),
+    _identifier("tag_id"),
+    _real("range_m"),
+)
 RANGE_BEARING = _declare(
     "RangeBearing",
     "Distance and angle to one target in the sensor's frame.",
@@ -196,6 +203,12 @@ POSITION_FIX = _declare(
     "or diagonal.",
     _vector("position_m"),
     _vector("covariance_m2", may_be_nan=True),
+)
+VELOCITY_FIX = _declare(
+    "VelocityFix",
+    "A velocity in the log's Cartesian frame with its covariance, row-major.",
+    _vector("velocity_mps"),
+    _vector("covariance_m2ps2", may_be_nan=True),
 )
 GEODETIC_FIX = _declare(
     "GeodeticFix",
@@ -280,6 +293,12 @@ COURSE_FIX = _declare(
 
 LANDMARK = _declare(
     "Landmark", "A fixed point of the map.", _identifier("landmark_id"), _vector("position_m")
+)
+BODY_POINT = _declare(
+    "BodyPoint",
+    "Where a sensor, antenna or tag sits in the body's frame: its lever arm.",
+    _identifier("point_id"),
+    _vector("position_m"),
 )
 TRUTH_STATE = _declare(
     "TruthState",
