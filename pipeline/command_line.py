@@ -517,6 +517,8 @@ def _say_changed(done: "Changed") -> None:
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
 @click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
+@click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
+@click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
 @click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option("--focus", help="What to show first, such as robot3.")

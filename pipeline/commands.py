@@ -6,6 +6,7 @@ Rerun and matplotlib take long to import: only what draws imports them.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -340,6 +341,8 @@ def view_path(
     *,
     screenshot: Path | None,
     at_s: float | None,
+    start_s: float | None,
+    end_s: float | None,
     focus: str | None,
     save: Path | None,
     connect: str | None,
@@ -355,9 +358,12 @@ def view_path(
     with scratch_folder("fuselog-view") as folder:
         if rrd.suffix != ".rrd":
             rrd = save or folder / "timeline.rrd"
-            _draw_log(path, rrd, connect, focus, gap_limit_s, recover=recover)
-        elif save is not None or connect is not None or focus is not None:
-            raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
+            span = (start_s, end_s)
+            _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
+        elif any(given is not None for given in (start_s, end_s, focus, save, connect)):
+            raise BadInput(
+                f"{rrd}: is drawn already; give --start, --end, --focus, --save and --connect with a log"
+            )
         if screenshot is not None:
             for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
                 warn(complaint)
@@ -366,9 +372,16 @@ def view_path(
 
 
 def _draw_log(
-    path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
+    path: Path,
+    rrd: Path,
+    connect: str | None,
+    focus: str | None,
+    span: tuple[float | None, float | None],
+    gap_limit_s: float,
+    *,
+    recover: bool,
 ) -> None:
-    """Draw a log, or an estimates log together with the log that it is of."""
+    """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
     from replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
@@ -376,9 +389,12 @@ def _draw_log(
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
         source = LogSource(open_log(_source_path(log), recover=recover))
-    with Drawing(source, identity=str(path), focus=focus, save=rrd, connect=connect) as drawing:
+    shown = span_of(source, *span, "publish_time")
+    identity = f"{path} {span}"
+    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
+        judged = [replace(estimates, start_ns=shown.start_ns, end_ns=shown.end_ns)]
         judge = judge_logs(
-            [estimates] if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
+            judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
         )
     for sentence in judge.unjudged:
         warn(sentence)

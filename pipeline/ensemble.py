@@ -161,7 +161,7 @@ def replay_parts(
                 from replay.timeline.show import Drawing  # which takes long to import
 
                 asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
-                first = Drawing(part.sources[0], identity=asked, save=save, connect=connect)
+                first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)
                 drawing = stack.enter_context(first)
             blocks = replay_blocks(
                 part.sources,

@@ -232,7 +232,7 @@ class Replay:
 
         log = self.logs[run]
         identity = json.dumps([str(log.start_ns), self.settings], default=str)
-        with Drawing(log, identity=identity, focus=focus, save=rrd) as drawing:
+        with Drawing(log.whole(), identity=identity, focus=focus, save=rrd) as drawing:
             judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:

@@ -56,9 +56,9 @@ class Stroke(NamedTuple):
         return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - self.radius_px}
 
 
-def turn_up(canvas: Canvas) -> None:
-    """Let y point up below `map`."""
-    canvas.fix(ROOT, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+def turn_up(canvas: Canvas, root: str = ROOT) -> None:
+    """Let y point up below an entity."""
+    canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
 
 
 def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
@@ -92,6 +92,17 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     """A point (n, 2) at each time, such as a measurement."""
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
+def draw_scans(
+    canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
+) -> None:
+    """All points (n, 2) of a stamp together, until those of the next."""
+    times, sizes = np.unique(time_ns, return_counts=True)
+    columns = rr.Points2D.columns(positions=places)
+    canvas.send(entity, times, columns.partition(sizes))
+    radii = rr.Radius.ui_points(radius_px)
+    canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii))
 
 
 class Cloud(NamedTuple):
@@ -214,7 +225,7 @@ def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> F
 def draw_lines(
     canvas: Canvas, entity: str, time_ns: Times, lines: Floats, colours: NDArray[np.uint8]
 ) -> None:
-    """Lines (n, 2, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
+    """Lines (n, points, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
 
     They make way for the next look, and vanish where that comes later than usual.
     """
