@@ -32,6 +32,8 @@ from pipeline.surgery import merge as merge
 from pipeline.surgery import relabel as relabel
 from pipeline.trajectories import Evaluation as Evaluation
 from pipeline.trajectories import evaluate as evaluate
+from pipeline.tuning.outcome import Tuning as Tuning
+from pipeline.tuning.tuning import tune as tune
 from recorders.errors import BadInput as BadInput
 from recorders.errors import UnknownName as UnknownName
 from recorders.log import Field as Field

@@ -67,6 +67,13 @@ ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
+settings_option = click.option(
+    "--settings",
+    "settings_file",
+    type=ANY_PATH,
+    metavar="FILE",
+    help="Parameters of estimators from this TOML file, as fuselog tune writes; --set goes over it.",
+)
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
 )
@@ -262,6 +269,7 @@ def _say_written(path: Path, messages: int) -> None:
 @gap_option
 @parameters_option
 @json_option
+@settings_option
 @set_option
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
@@ -272,6 +280,64 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     from pipeline.commands import replay_logs
 
     replay_logs(list(logs), list(names), **options)
+
+
+@fuselog.command(short_help="Search the parameters of an estimator that explain logs best.")
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
+@click.option(
+    "--by",
+    type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
+    default="likelihood",
+    show_default=True,
+    help="What is best: the largest likelihood, NIS or NEES as they should be, the smallest RMSE.",
+)
+@click.option(
+    "--bound",
+    "bounds",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="Between what a parameter is searched (repeatable) [default: 1e-4 to 1e4 times its start].",
+)
+@click.option(
+    "--grid",
+    type=click.IntRange(min=1),
+    default=1,
+    help="Start from the best of so many values of each parameter between its bounds.",
+)
+@click.option(
+    "--validate",
+    "held_out",
+    multiple=True,
+    type=ANY_PATH,
+    help="A log that is held out, to judge the values by (repeatable).",
+)
+@click.option(
+    "--folds",
+    type=COUNT,
+    default=0,
+    help="Cut the logs into so many parts, and judge by each the others.",
+)
+@click.option(
+    "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def tune(logs: tuple[Path, ...], **options: Any) -> None:
+    """Search the parameters of an estimator that explain LOGS best, and say how well the logs tell them.
+
+    The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
+    but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
+    folder is for --settings of fuselog replay and run.
+    """
+    from pipeline.tuning.command import tune_logs
+
+    tune_logs(list(logs), **options)
 
 
 @fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
@@ -546,6 +612,7 @@ def view(path: Path, **options: Any) -> None:
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
 @parameters_option
 @json_option
+@settings_option
 @set_option
 def run(
     experiment: tuple[str, ...],

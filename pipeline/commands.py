@@ -4,7 +4,7 @@ Rerun and matplotlib take long to import: only what draws imports them.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +31,8 @@ from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import Log, NotMcap, open_log
-from recorders.parameters import parse_settings
-from recorders.parsing import parse_json
+from recorders.parameters import merge, parse_settings
+from recorders.parsing import parse_json, read_toml
 from replay.engine.estimator import find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
@@ -62,16 +62,22 @@ def replay_logs(
     gap_limit_s: float,
     tells_parameters: bool,
     as_json: bool,
+    settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    inputs = {"log": logs, "start": [Path(origin) for origin in origins]}
+    inputs = {
+        "log": logs,
+        "start": [Path(origin) for origin in origins],
+        "settings": [settings_file] if settings_file else [],
+    }
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     stated = {"model": model, "every_s": every_s}
     chosen = {key: value for key, value in stated.items() if value is not None}
-    estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})
+    tuned = read_settings(settings_file, names)
+    estimators = settings_of_estimators(names, {**parse_settings(settings), **chosen}, tuned)
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
@@ -113,10 +119,27 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     return paths
 
 
-def _settings_of_estimators(
-    labels: Sequence[str], settings: Mapping[str, Any]
+def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label, from the tables of a TOML file; none without a file.
+
+    Raises BadInput where the file has settings of another estimator.
+    """
+    tables = {} if path is None else read_toml(path)
+    for label, table in tables.items():
+        if label not in labels or not isinstance(table, dict):
+            raise BadInput(
+                f"{path}: has settings of {label}, and a settings file has a table for each estimator "
+                f"that is replayed: {', '.join(labels)}"
+            )
+    return tables
+
+
+def settings_of_estimators(
+    labels: Sequence[str],
+    settings: Mapping[str, Any],
+    base: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label.
+    """Parameters by estimator label: those of `base`, and settings over them.
 
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
     BadInput where none has.
@@ -128,7 +151,8 @@ def _settings_of_estimators(
         if not isinstance(own, dict):
             raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
         chosen[label] = dict(own)
-        estimator, _ = find_estimator(str(own.get("kind", label)))
+        kind = {**base.get(label, {}), **own}.get("kind", label)
+        estimator, _ = find_estimator(str(kind))
         known[label] = set(estimator.parameters.model_fields)
     for key in [each for each in settings if each not in chosen]:
         takers = [label for label in chosen if key in known[label]]
@@ -139,7 +163,7 @@ def _settings_of_estimators(
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
         for label in takers:
             chosen[label].setdefault(key, settings[key])
-    return chosen
+    return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
@@ -412,19 +436,22 @@ def run_named(
     out: Path | None,
     tells_parameters: bool,
     as_json: bool,
+    settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims."""
-    values = parse_settings(settings)
     files = [Path(each) for each in named if each.endswith(".mcap")]
     if files:
         if len(files) < len(named) or over.keys() & {"runs", "seed"} or data is not None:
             raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        values = merge(read_settings(settings_file, labels), parse_settings(settings))
         experiment = experiment_of_logs(files, labels, {**values, **over})
         label = experiment.title
     else:
         if len(named) > 1 or labels:
             raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+        estimators = load_experiment(named[0], {}, {})[1].estimators
+        values = merge(read_settings(settings_file, estimators), parse_settings(settings))
         label, experiment = load_experiment(named[0], values, over)
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
