@@ -226,6 +226,12 @@ DETECTION = _declare(
     _identifier("scan_id"),
     _vector("position_m"),
 )
+SCAN_BEARING = _declare(
+    "ScanBearing",
+    "One bearing of an unordered scan, in the sensor's frame, anticlockwise from its x axis.",
+    _identifier("scan_id"),
+    _real("bearing_rad"),
+)
 SCAN = _declare(
     "Scan",
     "One sweep of a sensor and how many detections it has; none is information too.",
