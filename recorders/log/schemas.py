@@ -414,6 +414,26 @@ TRACK_ESTIMATE = _declare(
     _vector("covariance"),
 )
 
+EXISTENCE = _declare(
+    "Existence",
+    "How probable it is that the track of the same row of another topic is that of a thing.",
+    _real("existence"),
+)
+ASSOCIATION = _declare(
+    "Association",
+    "How probable it is that a detection is a track's; the metadata lists the sensors by number.",
+    _identifier("track_id"),
+    _identifier("sensor_id"),
+    _identifier("scan_id"),
+    _identifier("detection"),
+    _real("probability"),
+)
+APPROXIMATION = _declare(
+    "Approximation",
+    "So many tracks shared so many detections of a scan that how probable each is was approximated.",
+    _identifier("tracks"),
+)
+
 SCHEMAS: dict[str, Schema] = {
     schema.full_name: schema for schema in list(globals().values()) if isinstance(schema, Schema)
 }
