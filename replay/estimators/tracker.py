@@ -95,7 +95,6 @@ class TrackerParameters(ModelParameters):
     blind_from_rad: float | None = None
     blind_to_rad: float | None = None
     interval_s: NonNegativeFloat | None = None
-    skips_ambiguous: bool | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -245,7 +244,6 @@ UNSTATED: dict[str, float] = {
     "sigma_across_m": 0.0,
     "bias_rad": 0.0,
     "interval_s": 0.0,
-    "skips_ambiguous": 0.0,
     "blind_from_rad": np.nan,
     "blind_to_rad": np.nan,
     "near_range_m": np.inf,
@@ -315,13 +313,8 @@ def settings_of(
                 given = np.nan
             if given is None:
                 needed = name not in UNSTATED
-                text = topics[scan].metadata.get(name)
-                given = (text == "True") if name == "skips_ambiguous" else None
-                if given is None:
-                    given = stated([topics[scan]], name, TrackerParameters, needed=needed)
-                if np.isnan(given) and name in UNSTATED:
-                    given = UNSTATED[name]
-            values[name] = float(given)
+                given = stated([topics[scan]], name, TrackerParameters, needed=needed)
+            values[name] = UNSTATED.get(name, np.nan) if np.isnan(given) else float(given)
         gate = float(chi2.ppf(values["gate_probability"], len(KINDS[kind].measured)))
         rows.append([*values.values(), gate])
     return (*names, "gate"), np.array(rows)
@@ -365,7 +358,8 @@ def scans_of(streams: Mapping[str, Ragged], found: Found, fixes: Fixes) -> Scans
     rows = np.lexsort((position, columns[0], run))
     runs = next(iter(streams.values())).runs
     offsets = np.searchsorted(run[rows], np.arange(runs + 1))
-    return Scans(offsets, *(each[rows] for each in columns), np.concatenate(places))
+    in_time = [each[rows] for each in columns]
+    return Scans._make([offsets, *in_time, np.concatenate(places)])
 
 
 def _by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
@@ -505,7 +499,7 @@ def _outputs(topic: str, found: Found, scans: Scans, told: Told) -> list[Ragged]
                 metadata=metadata,
                 track_id=filled(told.number, 0),
                 mean=filled(told.mean, 0),
-                covariance=filled(told.covariance, 0).reshape(rows, -1),
+                covariance=filled(told.covariance, 0).reshape(rows, TARGET.size**2),
             ),
             ends,
         ),

@@ -318,7 +318,7 @@ def comparing(kind: ScanSensor) -> Function:
 
 
 def updating(kind: ScanSensor) -> Function:
-    """`update(track, detections, mean, covariance, memory)`: by all detections, as probable as they are."""
+    """`update(track, detections, mean, covariance, memory)`: by its detections' probabilities."""
     m = len(kind.measured)
 
     def update(track: int, detections: int, mean: Floats, covariance: Floats, memory: Memory) -> None:
@@ -398,16 +398,18 @@ def judge_track(run: int, place: int, detectable: float, none: float, tracks: Tr
 def is_over(run: int, place: int, tracks: Tracks, p: Any) -> bool:
     """Whether a track ends: silent too long, improbable, or not hit often enough at first."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
-    if tracks.is_confirmed[run, place]:
-        return silent_s > p.silence_s or tracks.existence[run, place] < p.ending_existence
-    if p.hits_needed > 0:
-        return silent_s > p.tentative_silence_s or tracks.chances[run, place] >= p.chances
-    return silent_s > p.tentative_silence_s or tracks.existence[run, place] < p.ending_existence
+    is_young = not tracks.is_confirmed[run, place]
+    return (
+        silent_s > (p.tentative_silence_s if is_young else p.silence_s)
+        or tracks.existence[run, place] < p.ending_existence
+        or (is_young and p.hits_needed > 0 and tracks.chances[run, place] >= p.chances)
+    )
 
 
-def is_another(run: int, place: int, tracks: Tracks, at: tuple[int, int, int, int], p: Any) -> bool:
+def is_another(run: int, place: int, tracks: Tracks, at: tuple[int, ...], p: Any) -> bool:
     """Whether an older confirmed track is about where this confirmed one is, and moves about alike."""
-    mean, (x, y, vx, vy) = tracks.mean[run, place], at
+    x, y, vx, vy = at
+    mean = tracks.mean[run, place]
     for other in range(place if tracks.is_confirmed[run, place] else 0):
         older = tracks.mean[run, other]
         if (
@@ -476,29 +478,15 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     weights.detected[place, detection] = factor * np.exp(-0.5 * squared)
                     memory.is_free[detection] = False
 
-    def is_ambiguous(place: int, used: int, count: int, weights: Weights) -> bool:
-        """Whether a track has two detections in its gate, or shares its only one."""
-        found = 0
-        for detection in range(count):
-            if weights.detected[place, detection] > 0.0:
-                found += 1
-                for other in range(used):
-                    if other != place and weights.detected[other, detection] > 0.0:
-                        return True
-        return found > 1
-
     def correct(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
     ) -> None:
         """Update all tracks by the associations, and what is known of their existence."""
-        kind, sensor, used = scans.kind[scan], scans.sensor[scan], tracks.used[run]
-        for place in range(used):
+        kind, sensor = scans.kind[scan], scans.sensor[scan]
+        for place in range(tracks.used[run]):
             none = memory.probability[place, 0]
             waited_s = (tracks.time_ns[run] - tracks.updated_ns[run, place, sensor]) * 1e-9
-            is_due = waited_s >= p.interval_s and not (
-                p.skips_ambiguous > 0.0 and is_ambiguous(place, used, count, memory.weights)
-            )
-            if none < 1.0 and is_due:
+            if none < 1.0 and waited_s >= p.interval_s:
                 mean, covariance = tracks.mean[run, place], tracks.covariance[run, place]
                 update(kind, place, count, mean, covariance, memory)
                 tracks.updated_ns[run, place, sensor] = tracks.time_ns[run]
@@ -517,7 +505,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     def begin_tracks(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
     ) -> int:
-        """Begin a track with each detection that is far enough from all; returns how many had no room."""
+        """Begin a track with each detection far enough from all; returns how many had no room."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
             if not memory.is_free[detection]:

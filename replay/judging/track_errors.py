@@ -13,11 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.measurements import PLANE, read_vectors
+from replay.engine.sources import Source
 from replay.judging.set_distances import gospa, gospa_pairs
 
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
+# The first instant, when tracks have had time to begin, and how far apart the others are.
+SETTLE_S = 10.0
+PERIOD_S = 0.5
 NONE = -1
 
 
@@ -49,6 +56,60 @@ class TrackErrors(NamedTuple):
     track: Integers
     distance: Floats
     present: Booleans
+
+
+class Judged(NamedTuple):
+    """The instants (k,) at which the tracks of a run are judged, and the truths (things, k, 2) then."""
+
+    time_ns: Integers
+    truths: Floats
+
+
+def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PERIOD_S) -> Judged:
+    """Instants from a while after the epoch to the end of the scans or of the first truth that ends.
+
+    Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
+    they are over before the first instant.
+    """
+    of = {schemas.SCAN.full_name: [], schemas.TRUTH_STATE.full_name: []}
+    for topic in source.topics.values():
+        if topic.schema_name in of:
+            of[topic.schema_name].append(topic.name)
+    scans, truths = (source.read(topics) for topics in of.values())
+    if not scans or not truths:
+        raise BadInput(f"{source.name}: tracks are judged by scans and truths, and it lacks one of them")
+    last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
+    last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
+    first_ns = source.epoch_ns + round(settle_s * 1e9)
+    at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
+    if not len(at_ns):
+        raise BadInput(f"{source.name}: ends within {settle_s:g} s, before tracks are judged")
+    places = [
+        [np.interp(at_ns - first_ns, truth.publish_time_ns - first_ns, axis) for axis in place.T]
+        for truth in truths.values()
+        for place in [read_vectors(truth, "state", PLANE)]
+    ]
+    return Judged(at_ns, np.array(places).transpose(0, 2, 1))
+
+
+def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers) -> list[TracksAt]:
+    """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
+
+    `sizes` says how many messages of `tracks` each scan has.
+    """
+    names = tracks.components
+    place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
+    ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
+    found = []
+    for time_ns, last in zip(
+        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns, side="right"), strict=True
+    ):
+        rows = slice(ends[last - 1], ends[last]) if last else slice(0, 0)
+        later_s = (time_ns - sizes.publish_time_ns[last - 1]) * 1e-9 if last else 0.0
+        mean = tracks["mean"][rows]
+        moved = mean[:, place] + later_s * mean[:, velocity]
+        found.append(TracksAt(tracks["track_id"][rows].astype(np.int64), moved))
+    return found
 
 
 def track_errors(

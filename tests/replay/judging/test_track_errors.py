@@ -1,13 +1,21 @@
 """Tracks judged at instants: the sheet's check without a tracker; what is followed, switched, broken."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from recorders.importers.autoferry import AUTOFERRY, AutoferryParameters
 from recorders.log import Stream
-from replay.judging.track_errors import TracksAt, as_trajectories, track_errors, track_figures
+from recorders.recording import import_run
+from replay.engine.sources import memory_source
+from replay.judging.track_errors import (
+    TracksAt,
+    as_trajectories,
+    instants_of,
+    track_errors,
+    track_figures,
+)
 
 # By scenario: instants; of the radar GOSPA of all, G50, unreferenced; of the lidar the first two.
 SHEET = {
@@ -20,7 +28,7 @@ SHEET = {
 }
 
 
-def last_scans(streams: dict[str, Stream], sensor: str, at_ns: np.ndarray) -> list[TracksAt]:
+def last_scans(streams: Mapping[str, Stream], sensor: str, at_ns: np.ndarray) -> list[TracksAt]:
     """The world's places of the last scan of a sensor at each instant, numbered as they come."""
     scan, seen = streams[f"/{sensor}/scan"], streams[f"/{sensor}/detection"]
     fix = streams["/ownship/fix"]
@@ -36,23 +44,11 @@ def last_scans(streams: dict[str, Stream], sensor: str, at_ns: np.ndarray) -> li
 
 @pytest.mark.parametrize("scenario", SHEET)
 def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
-    recording = AUTOFERRY.read(autoferry / f"scenario{scenario}", AutoferryParameters())
-    streams = {stream.topic: stream for stream in recording.streams}
-    truths = [streams[f"/target{target}/truth"] for target in (1, 2)]
-    scans = [stream for topic, stream in streams.items() if topic.endswith("/scan")]
-    end_ns = min(
-        max(stream.publish_time_ns[-1].max() for stream in scans),
-        *(truth.publish_time_ns[-1] for truth in truths),
+    source = memory_source(*import_run("autoferry", autoferry / f"scenario{scenario}", {}))
+    at_ns, true = instants_of(source)
+    radar, lidar = (
+        track_errors(last_scans(source.streams, sensor, at_ns), true) for sensor in ("radar", "lidar")
     )
-    at_ns = np.arange(recording.epoch_ns + 10 * 10**9, end_ns + 1, 5 * 10**8)
-    true = np.stack(
-        [
-            [np.interp(at_ns, each.publish_time_ns, each["state"][:, axis]) for axis in (0, 1)]
-            for each in truths
-        ]
-    ).transpose(0, 2, 1)
-    radar = track_errors(last_scans(streams, "radar", at_ns), true)
-    lidar = track_errors(last_scans(streams, "lidar", at_ns), true)
     found = track_figures(radar)
     assert SHEET[scenario] == pytest.approx(
         (
