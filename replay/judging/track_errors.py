@@ -71,7 +71,7 @@ def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PE
     Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
     they are over before the first instant.
     """
-    of = {schemas.SCAN.full_name: [], schemas.TRUTH_STATE.full_name: []}
+    of: dict[str, list[str]] = {schemas.SCAN.full_name: [], schemas.TRUTH_STATE.full_name: []}
     for topic in source.topics.values():
         if topic.schema_name in of:
             of[topic.schema_name].append(topic.name)
