@@ -36,6 +36,12 @@ def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the Autoferry scenarios, unpacked once."""
+    return _unpacked(real_data / "autoferry.tar.xz", tmp_path_factory) / "autoferry"
+
+
+@pytest.fixture(scope="session")
 def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of TUM and KITTI trajectories and of evo's results, unpacked once."""
     archive = real_data / "trajectories.tar.xz"
