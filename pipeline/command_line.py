@@ -80,6 +80,14 @@ set_option = click.option(
 errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), help="Share the runs among N processes, of one core each."
+)
+scheduler_option = click.option(
+    "--scheduler",
+    metavar="ADDRESS|local:N",
+    help="Share the runs among the workers of a Dask scheduler, or of one with N on this machine.",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
     "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
@@ -610,6 +618,8 @@ def view(path: Path, **options: Any) -> None:
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@workers_option
+@scheduler_option
 @parameters_option
 @json_option
 @settings_option

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
+from pipeline.executors import crew_of
 from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
@@ -92,7 +93,7 @@ def replay_logs(
         save=save,
         connect=connect,
         progress=progress,
-    )
+    ).check()
     _state_losses(source.log for source in sources)
     if tells_parameters and not as_json:
         print_parameters(done.parameters)
@@ -434,6 +435,8 @@ def run_named(
     errors: bool,
     data: Path | None,
     out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
     tells_parameters: bool,
     as_json: bool,
     settings_file: Path | None,
@@ -456,8 +459,9 @@ def run_named(
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
+    crew = crew_of(workers, scheduler, len(files) or experiment.runs)
     result = run_experiment(
-        label, experiment, folder, data=data, logs=logs, errors=errors, progress=progress
+        label, experiment, folder, data=data, logs=logs, errors=errors, crew=crew, progress=progress
     )
     if as_json:
         print_json(result.model_dump(mode="json"))

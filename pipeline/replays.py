@@ -102,7 +102,7 @@ def replay(
             metrics=wanted,
             order=order,
             late=policy,
-        )
+        ).check()
         estimates = [LogSource(open_log(path)) for path, _ in places]
         made = Replay(sources, estimates, settings, done, gap_limit_s)
         weakref.finalize(made, stack.pop_all().close)

@@ -60,6 +60,8 @@ LEAST_SHARE = 0.995
 STEPS = 1 << 17
 # The sums over time of one run: at most so many bins, of a millisecond times a power of two.
 TIME_BINS = 64
+# Of very many runs they are fewer each: so many bins in all.
+TIME_CELLS = 1 << 18
 TIME_BIN_NS = 1_000_000
 
 
@@ -193,7 +195,7 @@ class Judge:
         columns = _columns_of(errors)
         if topic not in self._quantities:
             width = columns.shape[1]
-            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS)
+            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS, cells=TIME_CELLS)
             self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
@@ -220,6 +222,13 @@ class Judge:
             told.started.update(sentences_of(rows.stream))
         elif schema == COVERAGE:
             told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
+
+    def close(self) -> None:
+        """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
+        self._sources, self._truths, self._on_errors = (), [], None
+        self._steps.clear()
+        for each in self._quantities.values():
+            each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
 
     def merge(self, other: "Judge") -> None:
         """Take in what was judged of other runs."""
