@@ -15,6 +15,7 @@ from recorders.log import Schema, Topic, schemas
 from replay.engine.arrays import Floats, Function
 from replay.engine.channels import resolved, stated
 from replay.engine.geodetic import GEODETIC
+from replay.engine.results import named
 from replay.inference.generate import function_of
 from replay.inference.model import (
     Control,
@@ -123,7 +124,7 @@ def _found(model: Model, here: _Here) -> Found | None:
         return None
     if prior is None:
         name = schemas.GAUSSIAN_ESTIMATE.full_name
-        prior = Topic(here.place(model.prior), name, "protobuf", (), {}, 0)
+        prior = Topic(here.place(model.prior), name, "protobuf", (), named(model.state), 0)
     control = here.topic(model.control.topic, model.control.schema) if model.control else None
     if model.control is not None and control is None:
         return None
@@ -200,7 +201,8 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
         parts.append(Part(f"{words} of {', '.join(model.state)}", is_here))
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
-    maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
+    seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
+    maps = {sensor.about.topic: sensor.about for sensor in seeing if sensor.about}
     parts += [part(topic, each.schema) for topic, each in maps.items()]
     sensors = [part(each.topic, each.schema, model.system) for each in model.all_sensors]
     if sensors and model.needs_sensor:
