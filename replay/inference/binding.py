@@ -150,8 +150,13 @@ def _found(model: Model, here: _Here) -> Found | None:
 
 
 def needs_of(model: Model) -> str:
-    """What a log has to have for a model, in words."""
-    return "; ".join(part.words for part in parts_of(model, _Here({}, "...", {})))
+    """What a log has to have for a model, in words; of one that can start without, what it may have."""
+    words = [part.words for part in parts_of(model, _Here({}, "...", {}))]
+    if model.start is None or model.control is None or not model.needs_sensor:
+        return "; ".join(words)
+    control, *maps, sensors = words
+    of_maps = [f"those about a map need {each}" for each in maps]
+    return "; ".join([control, sensors.replace("one of", "any of", 1), *of_maps])
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
