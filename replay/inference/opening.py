@@ -130,8 +130,13 @@ class Beginning:
             )
             for name, number in self.assumed.items()
         ]
-        columns = (column[has_begun] for column in begun)
-        stream = gaussian_stream(self.found.prior.name, *columns, named(model.state))
+        stream = gaussian_stream(
+            self.found.prior.name,
+            begun.time_ns[has_begun],
+            begun.mean[has_begun],
+            begun.covariance[has_begun],
+            named(model.state),
+        )
         return Ragged(stream, np.append(0, np.cumsum(has_begun))), facts
 
     @property

@@ -133,6 +133,38 @@ def test_odometry_alone_begins_at_zero() -> None:
     assert bound(ROBOT, "ekf", [log(odometry(), sighting)]) == []
 
 
+def test_sightings_alone_begin_anywhere() -> None:
+    """That is said; a pose makes the beginning sure, and a prior is never overruled."""
+    landmark = make_stream(
+        "/landmarks", schemas.LANDMARK, STAMPS[:1], landmark_id=[1], position_m=[[0.0, 0.0]]
+    )
+    sighting = make_stream(
+        "/range",
+        schemas.RANGE,
+        SLOW,
+        metadata={"sigma_range_m": "0.5"},
+        target_id=[1] * 6,
+        range_m=[20.0] * 6,
+    )
+    found = outputs(ROBOT, "ekf", [log(odometry(), landmark, sighting)])
+    assert sentences_of(found["started"].stream)[0].endswith("(/prior): it begins anywhere")
+    first = found["pose"]["covariance"][0]
+    assert first[[0, 4]] == pytest.approx(1e6)
+    assert found["pose"].stream.publish_time_ns[0] == STAMPS[0]
+    prior = make_stream(
+        "/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS[:1],
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=poses()[:1],
+        covariance=[0.01 * np.eye(3).ravel()],
+    )
+    with pytest.raises(BadInput, match="does not state forward_noise_density"):
+        bound(ROBOT, "ekf", [log(odometry(), seen(), prior)])
+    stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
+    assert "started" not in outputs(ROBOT, "ekf", [log(stated, seen(), prior)])
+
+
 def test_poses_without_a_covariance() -> None:
     source = log(odometry(), seen(known=False))
     with pytest.raises(BadInput, match=r"begins nowhere: .*--set sigma_fix_m=...; give --set sigma_hea"):
