@@ -201,14 +201,19 @@ delay_s = 0.5
     assert since.tolist() == [-500000000, -375000000, -250000000]
     assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 3
     head = b"TIMETAG RTKLIB demo5".ljust(64, b"\0") + struct.pack("<Id", 1756402240, 0.25)
-    pairs = struct.pack("<6I", 0, 0, 500, 10, 2002, 20)
-    (tmp_path / "table.csv.tag").write_bytes(head + pairs)
+    (tmp_path / "raw.csv.tag").write_bytes(head + struct.pack("<6I", 0, 0, 500, 10, 2002, 20))
+    (tmp_path / "raw.csv").write_text("80\n1,5000\n2,5500\n3,7000\n4,70")  # both ends are cut
     tagged = mapping.replace(
         'rate_hz = 8, zero = "2026-01-01"', 'column = "tick", unit = "ms", tag = ".tag"'
-    )
-    found = imported(tmp_path / "table.csv", tagged.replace("0.5", "0.0"))[0]["/x"]
-    since = found.publish_time_ns - 1756402240_250000000
+    ).replace("[[tables]]", '[[tables]]\ncolumns = ["x", "tick"]', 1)
+    streams, notes = imported(tmp_path / "raw.csv", tagged.replace("0.5", "0.0"))
+    since = streams["/x"].publish_time_ns - 1756402240_250000000
     assert since.tolist() == [0, 500_500_000, 2_002_000_000]  # 2000 ms of the counter are 2002
+    assert notes["raw.csv: rows left out, of another number of cells than 2"] == "1"
+    assert notes["raw.csv: rows without a time are left out"] == "1"
+    (tmp_path / "raw.csv.tag").write_bytes(b"no tag")
+    with pytest.raises(BadInput, match="is no time tag of RTKLIB"):
+        imported(tmp_path / "raw.csv", tagged)
 
 
 def test_many_messages_of_a_row_and_what_is_missing(imported: Callable[..., Any]) -> None:

@@ -37,7 +37,7 @@ _SUFFIXES: dict[str, Format] = {
     ".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".npz": "npz", ".pos": "rtklib",
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-_BLOCK_BYTES = 1 << 24
+_BLOCK_BYTES = 1 << 23
 _BLOCK_ROWS = 1 << 17
 _COMMENTS = (b"%", b"#")
 _DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
@@ -147,15 +147,16 @@ def _open_text(
         else:
             raise BadInput(f"{path}: holds no rows; give a table with some")
         following = file.readline().decode("utf-8")
-    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in text), " ")
+    # the first line may be cut, as that of a logger whose file began in the middle of one
+    whole = following.strip() or text
+    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in whole), " ")
     cells = _cells(text, delimiter)
+    width = max(len(cells), len(_cells(following, delimiter)))
     if has_header or (has_header is None and not any(map(_is_value, cells))):
         named, skipped = cells, skipped + 1
-        width = max(len(cells), len(_cells(following, delimiter)))
         if not following.strip():
             raise BadInput(f"{path}: has a header line but no rows; give a table with some")
     else:
-        width = len(cells)
         named = _cells(comments[-1], delimiter) if comments else []
         named = named if len(named) == width else []
     columns, left_out = _unique(names or named, width, path), Counter[str]()

@@ -28,7 +28,7 @@ from recorders.importers.tables.mapping import (
     read_mapping,
     shipped,
 )
-from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, stamps_ns, tagged
+from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
 from recorders.log import Stream, make_stream
 from recorders.models.geodesy import into_tangent_plane
@@ -63,9 +63,9 @@ class _Rows:
             delimiter=own.delimiter,
             decimal=own.decimal,
         )
+        self.count, self.messages = 0, Counter[str]()
         self._clocks = [self._clock(each) for each in (own.time, own.arrival) if each is not None]
         self._texts, self._numbers = self._wanted()
-        self.count, self.messages = 0, Counter[str]()
         self._last_ns = NOT_A_TIME
         self.span_ns: tuple[int, int] | None = None
         self._batches = self.table.batches(self._numbers, self._texts)
@@ -74,20 +74,19 @@ class _Rows:
     # What is read.
 
     def _clock(self, given: TimeMapping) -> TimeMapping:
-        """The time mapping with columns as the file names them; a counter's start is read here."""
+        """The time mapping with columns as the file names them; a counter is read here."""
         columns = [self.table.column(name) for name in given.columns]
         week = columns.pop() if given.week else None
         own = given.model_copy(update={"column": columns, "week": week})
-        if given.tag is None:
-            return own
-        ticks = (
-            stamps_ns(
-                own.model_copy(update={"zero": "1970-01-01"}), batch, 0, _size(batch), str(self.path)
+        if own.tag is not None:
+            batches = self.table.batches((), own.columns)
+            self._counter = read_counter(
+                self.path, own.tag, (self._read_ns(batch, own) for batch in batches)
             )
-            for batch in self.table.batches((), own.columns)
-        )
-        self._start_ns, self._rate = tagged(self.path, given.tag, ticks)
         return own
+
+    def _read_ns(self, batch: Batch, clock: TimeMapping) -> Stamps:
+        return stamps_ns(clock, batch, self.count, _size(batch), str(self.path))
 
     def _wanted(self) -> tuple[set[str], set[str]]:
         """The columns that are wanted as text, and as numbers."""
@@ -190,12 +189,8 @@ class _Rows:
         return int(known.min()) if len(known) else None
 
     def _stamps(self, batch: Batch, clock: TimeMapping) -> Stamps:
-        found = stamps_ns(clock, batch, self.count, _size(batch), str(self.path))
-        if clock.tag is None:
-            return found
-        ticks = np.where(found == NOT_A_TIME, 0, found - clock.zero_ns)
-        scaled = self._start_ns + np.rint(ticks * self._rate).astype(np.int64)
-        return np.where(found == NOT_A_TIME, NOT_A_TIME, scaled)
+        found = self._read_ns(batch, clock)
+        return found if clock.tag is None else self._counter.stamps_ns(found)
 
     def block(self, origin: Origin | None) -> list[Stream]:
         """The streams of the next batch."""

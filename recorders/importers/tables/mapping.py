@@ -79,7 +79,7 @@ class TableMapping(Parameters):
 
     Attributes:
         files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
-            stand for anything.
+            stand for anything, ? for one letter.
         optional: there may be none.
         format, columns, header, delimiter, decimal: what the content does not tell; see `open_table`.
         time: when a row was measured.
@@ -203,7 +203,9 @@ def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> I
         )
         parts = re.split(r"\{(\w+)\}", pattern)
         expression = "".join(
-            f"(?P<{part}>[^/]+)" if index % 2 else re.escape(part).replace(r"\*", "[^/]*")
+            f"(?P<{part}>[^/]+)"
+            if index % 2
+            else re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
             for index, part in enumerate(parts)
         )
         match = re.fullmatch(expression, name)
