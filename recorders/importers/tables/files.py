@@ -45,12 +45,13 @@ _DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowE
 
 @dataclass
 class Table:
-    """A file's table: its columns, what gives its rows, and what was left out so far, by reason."""
+    """A file's table: its columns, what gives its rows, what was left out of them, and was mended."""
 
     path: Path
     columns: list[str]
     _read: Read
     left_out: Counter[str] = field(default_factory=Counter)
+    mended: str = ""
 
     def column(self, name: str) -> str:
         """A column by its name, or by its number from 1 on; raises BadInput where there is none."""
@@ -162,7 +163,6 @@ def _open_text(
     columns, left_out = _unique(names or named, width, path), Counter[str]()
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        left_out.clear()
         with _open(path) as file:
             for _ in range(skipped):
                 file.readline()
@@ -332,8 +332,10 @@ def _open_trajectory(path: Path) -> Table:
         columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion.T, strict=True))
     whole: Batch = {} if found.time_ns is None else {"time_ns": pa.array(found.time_ns)}
     whole |= {name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()}
-    told = Counter({note.removeprefix(f"{path}: "): 0 for note in found.notes})
-    return Table(path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), told)
+    mended = "; ".join(note.removeprefix(f"{path}: ") for note in found.notes)
+    return Table(
+        path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), mended=mended
+    )
 
 
 def _by_name(batch: pa.RecordBatch) -> Batch:

@@ -41,11 +41,12 @@ class Origin(Parameters):
 
 
 class Geodetic(Parameters):
-    """Columns with a place in deg and m; with them there are columns east_m, north_m and up_m."""
+    """Columns with a place, altitudes in m; with them there are columns east_m, north_m and up_m."""
 
     latitude: str
     longitude: str
     altitude: str | None = None
+    unit: str = "deg"
 
 
 class Attitude(Parameters):
@@ -122,11 +123,13 @@ class ConstantStream(Parameters):
 class LogMapping(Parameters):
     """A mapping: what it is for, where the origin is (else the first fix), tables, and constants.
 
-    Tables whose stamps lie further apart than `clock_tolerance_s` are of several clocks.
+    The plane is tangent to the ellipsoid, or the map of a `projection` that pyproj knows, from the
+    origin on. Tables that begin further apart than `clock_tolerance_s` are of several clocks.
     """
 
     summary: str = ""
     origin: Origin | None = None
+    projection: str | None = None
     tables: list[TableMapping] = Field(min_length=1)
     constants: list[ConstantStream] = []
     clock_tolerance_s: PositiveFloat = 3600.0
