@@ -3,17 +3,21 @@
 import gzip
 import json
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
+from recorders.importers.tables import files
 from recorders.importers.tables.mapping import read_mapping, shipped
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
@@ -149,7 +153,7 @@ def test_one_table_in_many_formats(form: str, imported: Callable[..., Any], tmp_
 
 
 @pytest.mark.parametrize(
-    ("cells", "time", "expected"),
+    ("cells", "told", "expected"),
     [
         (["1.7345014855003267e+18"], 'column = "t", unit = "ns"', 1734501485_500326700),
         (["1734501485317395687"], 'column = "t", unit = "ns"', 1734501485_317395687),
@@ -171,12 +175,12 @@ def test_one_table_in_many_formats(form: str, imported: Callable[..., Any], tmp_
         (["408639.749", "2381"], 'column = "t", week = "u", leap_seconds = 18', 1756402221_749000000),
     ],
 )
-def test_times(cells: list[str], time: str, expected: int, imported: Callable[..., Any]) -> None:
+def test_times(cells: list[str], told: str, expected: int, imported: Callable[..., Any]) -> None:
     """Every way to write a time comes to the nanosecond; GPS time stays as it is written."""
     text = f"{','.join('tuvw'[: len(cells)])},x\n{','.join(cells)},1\n"
     mapping = f"""
 [[tables]]
-time = {{ {time} }}
+time = {{ {told} }}
 [[tables.streams]]
 topic = "/x"
 becomes = "VectorMeasurement"
@@ -201,14 +205,19 @@ delay_s = 0.5
     assert since.tolist() == [-500000000, -375000000, -250000000]
     assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 3
     head = b"TIMETAG RTKLIB demo5".ljust(64, b"\0") + struct.pack("<Id", 1756402240, 0.25)
-    pairs = struct.pack("<6I", 0, 0, 500, 10, 2002, 20)
-    (tmp_path / "table.csv.tag").write_bytes(head + pairs)
+    (tmp_path / "raw.csv.tag").write_bytes(head + struct.pack("<6I", 0, 0, 500, 10, 2002, 20))
+    (tmp_path / "raw.csv").write_text("80\n1,5000\n2,5500\n3,7000\n4,70")  # both ends are cut
     tagged = mapping.replace(
         'rate_hz = 8, zero = "2026-01-01"', 'column = "tick", unit = "ms", tag = ".tag"'
-    )
-    found = imported(tmp_path / "table.csv", tagged.replace("0.5", "0.0"))[0]["/x"]
-    since = found.publish_time_ns - 1756402240_250000000
+    ).replace("[[tables]]", '[[tables]]\ncolumns = ["x", "tick"]', 1)
+    streams, notes = imported(tmp_path / "raw.csv", tagged.replace("0.5", "0.0"))
+    since = streams["/x"].publish_time_ns - 1756402240_250000000
     assert since.tolist() == [0, 500_500_000, 2_002_000_000]  # 2000 ms of the counter are 2002
+    assert notes["raw.csv: rows left out, of another number of cells than 2"] == "1"
+    assert notes["raw.csv: rows without a time are left out"] == "1"
+    (tmp_path / "raw.csv.tag").write_bytes(b"no tag")
+    with pytest.raises(BadInput, match="is no time tag of RTKLIB"):
+        imported(tmp_path / "raw.csv", tagged)
 
 
 def test_many_messages_of_a_row_and_what_is_missing(imported: Callable[..., Any]) -> None:
@@ -278,6 +287,44 @@ mounting_deg = [180, 0, 0]
     assert left[2, 2] == pytest.approx(np.sin(np.radians(20)))  # the right side is down
     turned = Rotation.from_quat(streams["/turned"]["quaternion"], scalar_first=True)
     assert_allclose(turned.apply([0, 1, 1]), turn.apply([0, -1, -1]), atol=1e-15)
+
+
+def test_planes_priors_and_angles(imported: Callable[..., Any], refusal: Callable[..., str]) -> None:
+    """Places in rad on a stated plane or a map; a prior of the first row, the truth of some."""
+    text = "t,lat,lon,h,head,mode\n" + "".join(
+        f"{row},{np.radians(50 + row / 1000)},{np.radians(9)},110,{10 * row},{mode}\n"
+        for row, mode in enumerate(["fixed", "float", "fixed "])
+    )
+    mapping = FIX.replace('altitude = "h"', 'altitude = "h", unit = "rad"').replace(
+        '"h" }\n[[', '"h" }\nunits = { latitude_deg = "rad", longitude_deg = "rad" }\n[['
+    )
+    mapping += """where = { mode = "fixed" }
+[[tables.streams]]
+topic = "/prior"
+becomes = "GaussianEstimate"
+fields = { mean = ["east_m", "north_m", "head"] }
+deviations = { covariance = [1, 2, 90] }
+factors = { mean = [1, 1, -1] }
+offsets = { mean = [0, 0, 90] }
+units = { mean = ["m", "m", "deg"], covariance = ["m", "m", "deg"] }
+components = "x_m,y_m,heading_rad"
+kinds = "linear,linear,angle"
+only_first = true
+"""
+    origin = "origin = { latitude_deg = 50, longitude_deg = 9, altitude_m = 100 }\n"
+    streams, notes = imported(text, origin + mapping)
+    assert notes["origin"] == "50, 9 deg, 100 m"
+    assert_allclose(streams["/fix"]["latitude_deg"], [50, 50.001, 50.002])
+    truth, prior = streams["/truth"], streams["/prior"]
+    assert_allclose(truth["state"], [[0, 0, 10], [0, 222.459, 10 - 0.004]], atol=1e-2)
+    assert truth.metadata["origin_altitude_m"] == "100.0"
+    assert_allclose(prior["mean"], [[0, 0, np.pi / 2]], atol=1e-8)
+    assert_allclose(prior["covariance"][0, [0, 4, 8]], [1, 4, np.pi**2 / 4])
+    on_map, _ = imported(text, origin + 'projection = "EPSG:25832"\n' + mapping)
+    # UTM's scale at its middle meridian, and the heights as they are
+    assert_allclose(on_map["/truth"]["state"], [[0, 0, 10], [0, 0.9996 * 222.456, 10]], atol=1e-2)
+    assert on_map["/truth"].metadata["projection"] == "EPSG:25832"
+    assert "no projection 'EPSG:1'" in refusal(text, origin + 'projection = "EPSG:1"\n' + mapping)
 
 
 def test_the_walk(imported: Callable[..., Any], navigation: Path) -> None:
@@ -397,6 +444,43 @@ def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any],
     assert np.all(np.diff(read.publish_time_ns) > 0)
     assert_allclose(read["state"][0], [0, 0, 0], atol=1e-9)
     assert read["state"][1, 2] == pytest.approx(10, abs=1e-3)  # 111 m away the ellipsoid is 1 mm lower
+
+
+def test_blocks_make_no_difference(
+    imported: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of many blocks, whose first fix comes in a later one and whose stamps go back."""
+    rows = [
+        f"{1000 + row - 5 * (row == 70)},{50 + row / 1e4 if row > 40 else ''},8,100"
+        for row in range(100)
+    ]
+    text = "t,lat,lon,h\n" + "\n".join(rows)
+    whole, notes = imported(text, FIX)
+    monkeypatch.setattr(files, "_BLOCK_BYTES", 100)
+    parts, notes_of_parts = imported(text, FIX)
+    assert notes_of_parts == notes
+    assert notes["origin"] == "50.0041, 8 deg, 100 m, the first fix"
+    for topic, stream in whole.items():
+        assert_array_equal(parts[topic].publish_time_ns, stream.publish_time_ns)
+    assert_array_equal(parts["/truth"]["state"], whole["/truth"]["state"])
+
+
+@pytest.mark.paper
+def test_a_million_rows_in_five_seconds(tmp_path: Path) -> None:
+    """Of CPU time, all threads together, the log included."""
+    count = 1_000_000
+    numbers = np.random.default_rng(0).normal(size=(count, 6)).round(6)
+    columns = {
+        "time": 1756402240 + np.arange(count) / 200,
+        **dict(zip(("ax", "ay", "az", "gx", "gy", "gz"), numbers.T, strict=True)),
+    }
+    pyarrow.csv.write_csv(pa.table(columns), tmp_path / "million.csv")
+    (tmp_path / "mapping.toml").write_text(INERTIAL)
+    begin = time.process_time()
+    values = {"mapping": str(tmp_path / "mapping.toml")}
+    _, messages = import_log("table", tmp_path / "million.csv", values, tmp_path / "log.mcap")
+    assert messages == count
+    assert time.process_time() - begin < 5
 
 
 BAD = [

@@ -37,7 +37,7 @@ _SUFFIXES: dict[str, Format] = {
     ".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".npz": "npz", ".pos": "rtklib",
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-_BLOCK_BYTES = 1 << 24
+_BLOCK_BYTES = 1 << 23
 _BLOCK_ROWS = 1 << 17
 _COMMENTS = (b"%", b"#")
 _DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
@@ -45,12 +45,13 @@ _DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowE
 
 @dataclass
 class Table:
-    """A file's table: its columns, what gives its rows, and what was left out so far, by reason."""
+    """A file's table: its columns, what gives its rows, what was left out of them, and was mended."""
 
     path: Path
     columns: list[str]
     _read: Read
     left_out: Counter[str] = field(default_factory=Counter)
+    mended: str = ""
 
     def column(self, name: str) -> str:
         """A column by its name, or by its number from 1 on; raises BadInput where there is none."""
@@ -147,21 +148,21 @@ def _open_text(
         else:
             raise BadInput(f"{path}: holds no rows; give a table with some")
         following = file.readline().decode("utf-8")
-    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in text), " ")
+    # the first line may be cut, as that of a logger whose file began in the middle of one
+    whole = following.strip() or text
+    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in whole), " ")
     cells = _cells(text, delimiter)
+    width = max(len(cells), len(_cells(following, delimiter)))
     if has_header or (has_header is None and not any(map(_is_value, cells))):
         named, skipped = cells, skipped + 1
-        width = max(len(cells), len(_cells(following, delimiter)))
         if not following.strip():
             raise BadInput(f"{path}: has a header line but no rows; give a table with some")
     else:
-        width = len(cells)
         named = _cells(comments[-1], delimiter) if comments else []
         named = named if len(named) == width else []
     columns, left_out = _unique(names or named, width, path), Counter[str]()
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        left_out.clear()
         with _open(path) as file:
             for _ in range(skipped):
                 file.readline()
@@ -331,8 +332,10 @@ def _open_trajectory(path: Path) -> Table:
         columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion.T, strict=True))
     whole: Batch = {} if found.time_ns is None else {"time_ns": pa.array(found.time_ns)}
     whole |= {name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()}
-    told = Counter({note.removeprefix(f"{path}: "): 0 for note in found.notes})
-    return Table(path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), told)
+    mended = "; ".join(note.removeprefix(f"{path}: ") for note in found.notes)
+    return Table(
+        path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), mended=mended
+    )
 
 
 def _by_name(batch: pa.RecordBatch) -> Batch:

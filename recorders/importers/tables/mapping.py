@@ -41,11 +41,12 @@ class Origin(Parameters):
 
 
 class Geodetic(Parameters):
-    """Columns with a place in deg and m; with them there are columns east_m, north_m and up_m."""
+    """Columns with a place, altitudes in m; with them there are columns east_m, north_m and up_m."""
 
     latitude: str
     longitude: str
     altitude: str | None = None
+    unit: str = "deg"
 
 
 class Attitude(Parameters):
@@ -79,7 +80,7 @@ class TableMapping(Parameters):
 
     Attributes:
         files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
-            stand for anything.
+            stand for anything, ? for one letter.
         optional: there may be none.
         format, columns, header, delimiter, decimal: what the content does not tell; see `open_table`.
         time: when a row was measured.
@@ -122,11 +123,13 @@ class ConstantStream(Parameters):
 class LogMapping(Parameters):
     """A mapping: what it is for, where the origin is (else the first fix), tables, and constants.
 
-    Tables whose stamps lie further apart than `clock_tolerance_s` are of several clocks.
+    The plane is tangent to the ellipsoid, or the map of a `projection` that pyproj knows, from the
+    origin on. Tables that begin further apart than `clock_tolerance_s` are of several clocks.
     """
 
     summary: str = ""
     origin: Origin | None = None
+    projection: str | None = None
     tables: list[TableMapping] = Field(min_length=1)
     constants: list[ConstantStream] = []
     clock_tolerance_s: PositiveFloat = 3600.0
@@ -203,7 +206,9 @@ def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> I
         )
         parts = re.split(r"\{(\w+)\}", pattern)
         expression = "".join(
-            f"(?P<{part}>[^/]+)" if index % 2 else re.escape(part).replace(r"\*", "[^/]*")
+            f"(?P<{part}>[^/]+)"
+            if index % 2
+            else re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
             for index, part in enumerate(parts)
         )
         match = re.fullmatch(expression, name)

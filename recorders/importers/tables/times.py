@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -162,11 +162,24 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
     return dates.dt.tz_localize(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
 
 
-def tagged(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> tuple[int, float]:
-    """When a file's counter started, in ns, and how much time is in a second of its own.
+class Counter(NamedTuple):
+    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes."""
 
-    A time tag of RTKLIB has from byte 64 on a time_t and a fraction of a second, and from byte 76 on
-    pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are the counter's readings.
+    first_ns: int
+    start_ns: int
+    rate: float
+
+    def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
+        """The stamps (n,) of readings; a reading before the first is of a line that was cut off."""
+        since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
+        return np.where(ticks_ns < self.first_ns, NOT_A_TIME, self.start_ns + since)
+
+
+def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
+    """The counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
+
+    A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
+    76 on pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are all readings.
 
     Raises BadInput where there is no such file, or it is none.
     """
@@ -179,10 +192,8 @@ def tagged(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> tuple[int, fl
         raise BadInput(f"{tag}: is no time tag of RTKLIB; {path.name} needs one for its start")
     seconds, fraction = struct.unpack_from("<Id", data, 64)
     last_ms = np.frombuffer(data, "<u4", (len(data) - 76) // 8 * 2, 76)[-2]
-    known = [ticks[ticks != NOT_A_TIME] for ticks in ticks_ns]
-    every = np.concatenate(known) if known else np.empty(0, np.int64)
-    if len(every) < 2 or every[-1] <= every[0]:
+    every = np.concatenate([ticks[ticks != NOT_A_TIME] for ticks in ticks_ns] or [np.empty(0, np.int64)])
+    if len(every) < 2 or every.max() <= every[0]:
         raise BadInput(f"{path}: its counter does not go on; {tag.name} cannot tell its times")
-    rate = float(last_ms) * 1e6 / float(every[-1] - every[0])
-    start_ns = seconds * 10**9 + round(fraction * 1e9)
-    return start_ns - round(rate * float(every[0])), rate
+    rate = float(last_ms) * 1e6 / float(every.max() - every[0])
+    return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate)
