@@ -62,7 +62,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 def _place(scene: Scene, sensor: int) -> Floats:
     """Where a sensor stands (2,): by the truth, else by its first fix; NaN where it has none."""
-    for truth in filter(len, scene.truths_of(CASE)):
+    for truth in scene.truths_of(CASE):
         columns = [truth.components.index(name) for name in sensor_components(sensor)]
         return truth["state"][0, columns]
     fixes: Floats = scene.read(f"/sensor{sensor}/position")["position_m"]

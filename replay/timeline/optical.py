@@ -77,7 +77,7 @@ def _sensors(scene: Scene) -> Iterator[Sensor]:
 
 def _targets(scene: Scene) -> Floats:
     """The true places (n, 3) of all targets."""
-    for truth in filter(len, scene.truths_of("")):
+    for truth in scene.truths_of(""):
         names = [name for name in truth.components if name.startswith("target_")]
         columns = [truth.components.index(name) for name in names]
         return truth["state"][0, columns].reshape(-1, 3)
