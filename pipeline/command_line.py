@@ -117,6 +117,13 @@ late_option = click.option(
 )
 
 
+foxglove_option = click.option(
+    "--foxglove",
+    is_flag=True,
+    help="Write messages of Foxglove beside the streams, so that its viewers show them.",
+)
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
@@ -136,6 +143,7 @@ def fuselog() -> None:
     show_default=True,
     help="Of the log's chunks.",
 )
+@foxglove_option
 @set_option
 def record(
     scenario: str | None,
@@ -144,9 +152,11 @@ def record(
     run: int | None,
     again: Path | None,
     compression: str,
+    foxglove: bool,
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
+    from pipeline.commands import companions_if
     from pipeline.experiment import load_scenario
     from pipeline.outputs import RECORDED, check_files
     from recorders.log import open_log, write_log
@@ -168,7 +178,8 @@ def record(
     path = out or Path(f"{label}.mcap")
     check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
     recording, metadata = record_run(name, values, seed or 0, run or 0)
-    write_log(path, recording.streams, metadata, compression=compression)
+    beside = companions_if(foxglove)
+    write_log(path, recording.streams, metadata, compression=compression, companions=beside)
     _say_written(path, sum(map(len, recording.streams)))
 
 
@@ -273,6 +284,7 @@ def _say_written(path: Path, messages: int) -> None:
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
+@foxglove_option
 @recover_option
 @gap_option
 @parameters_option
@@ -462,10 +474,13 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
-@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV or Parquet files.")
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV, Parquet or Foxglove files.")
 @click.argument("path", type=ANY_PATH)
 @click.option(
-    "--to", type=click.Choice(["tum", "kitti", "csv", "parquet"]), required=True, help="The format."
+    "--to",
+    type=click.Choice(["tum", "kitti", "csv", "parquet", "foxglove"]),
+    required=True,
+    help="The format.",
 )
 @click.option(
     "-o",
@@ -479,7 +494,7 @@ def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
     To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
-    parquet any stream, as a table.
+    parquet any stream, as a table; to foxglove one log of the messages that Foxglove and Rerun show.
     """
     from pipeline.exporting import export as export_log
 

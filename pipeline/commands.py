@@ -31,7 +31,7 @@ from pipeline.terminal import (
 from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Log, NotMcap, open_log
+from recorders.log import Companions, Log, NotMcap, open_log
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import parse_json, read_toml
 from replay.engine.estimator import find_estimator
@@ -59,6 +59,7 @@ def replay_logs(
     sigmas: Sequence[str],
     save: Path | None,
     connect: str | None,
+    foxglove: bool,
     recover: bool,
     gap_limit_s: float,
     tells_parameters: bool,
@@ -92,6 +93,7 @@ def replay_logs(
         late=policy,
         save=save,
         connect=connect,
+        companions=companions_if(foxglove),
         progress=progress,
     ).check()
     _state_losses(source.log for source in sources)
@@ -99,6 +101,15 @@ def replay_logs(
         print_parameters(done.parameters)
     told = {"seconds": dict(done.seconds), "parameters": done.parameters}
     _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
+
+
+def companions_if(foxglove: bool) -> Companions | None:
+    """What makes the messages for Foxglove, where they are asked for; it takes long to import."""
+    if not foxglove:
+        return None
+    from pipeline.foxglove import companions
+
+    return companions
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:

@@ -21,7 +21,7 @@ import psutil
 
 from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
-from recorders.log import Clock, LogWriter, RunMetadata
+from recorders.log import Clock, Companions, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound, bind
@@ -131,6 +131,7 @@ def replay_parts(
     connect: str | None = None,
     on_errors: Callable[[Errors], None] | None = None,
     block_messages: int = BLOCK_MESSAGES,
+    companions: Companions | None = None,
     progress: Progress = no_progress,
 ) -> Pass:
     """Replay an ensemble part by part: block by block to the estimates logs, the judge and the timeline.
@@ -148,6 +149,7 @@ def replay_parts(
         connect: the receiver that it goes to; see `Drawing`.
         on_errors: is handed the errors of every block.
         block_messages: about how many messages of a run are in memory at once.
+        companions: makes what is written beside the estimates for viewers.
         progress: is told of every block.
 
     An estimator that can follow no run of any part is told of, see `Pass.check`.
@@ -167,7 +169,13 @@ def replay_parts(
         )
         with ExitStack() as stack:
             writers = [
-                stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path, log)))
+                stack.enter_context(
+                    LogWriter(
+                        path,
+                        estimates_metadata(source, estimators, path, log),
+                        companions=companions,
+                    )
+                )
                 for (path, log), source in zip(part.estimates, part.sources, strict=False)
             ]
             drawing = None

@@ -94,8 +94,9 @@ class Scene:
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """The truth streams of a case."""
-        return [self.read(topic) for topic in self._truths if _prefix(topic) == case]
+        """The non-empty truth streams of a case."""
+        truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
+        return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
         """The run's sensor topics below a case, and those that are below none; see `unread`."""

@@ -55,7 +55,7 @@ class Track(NamedTuple):
 def _tracks(scene: Scene, case: str, width: int, rows: int) -> Iterator[Track]:
     """The truth, then every estimate of this width, thinned to what is drawn."""
     for stream in scene.truths_of(case):
-        if len(stream) and stream["state"].shape[1] == width:
+        if stream["state"].shape[1] == width:
             yield _track("truth", TRUTH, stream, "state", rows)
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if stream["mean"].shape[1] == width:

@@ -40,6 +40,8 @@ SHOWN_INTERVALS = 1.5
 # Of clouds of particles so many are drawn, those of whole stamps; the area of each is its weight.
 CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
+# What is left free beside the places, as a share of their side, or of so much of the longer one.
+MARGIN, LEAST_SIDE = 0.07, 0.3
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -268,7 +270,8 @@ def plane_view(
     extent = extent_of(places)
     low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
     step_m = nice(extent / 10.0)
-    low, high = low - 0.07 * extent, high + 0.07 * extent
+    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent)
+    low, high = low - margin, high + margin
     _draw_grid(canvas, f"{root}/grid", low - extent, high + extent, step_m)
     trail = trail_of(canvas, trail_s)
     return rrb.Spatial2DView(

@@ -91,7 +91,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     paths = [f"{ROOT}/map/{name}/{n}" for name in ("truth", *tracks) for n in range(vehicles.number)]
     places = vehicles.places.reshape(-1, 2)
     cells = CELL_M * np.array([[-0.5, -0.5], [vehicles.number - 0.5, 0.5]])
-    whole = plane_view(canvas, f"{ROOT}/map", [], paths, places)
+    run_s = (canvas.end_ns - canvas.epoch_ns) * 1e-9
+    whole = plane_view(canvas, f"{ROOT}/map", [], paths, places, trail_s=run_s)
     sensor = plane_view(canvas, SENSOR, [], [], raw.places if len(raw.places) else places)
     close = plane_view(canvas, CLOSE, [], [], cells)
     sensor.name = "Raw detections, sensor's frame"
@@ -99,14 +100,14 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     board = rrb.Vertical(
         rrb.Tabs(whole, sensor, *_geodetic_views(canvas, scene), *draw_events(canvas, scene, "")),
         close,
-        row_shares=[3, 2],
+        row_shares=[3, 1] if scene.outputs else [3, 2],
     )
+    if not scene.outputs:
+        return board
     quality = rrb.Tabs(
         *(view for case in scene.cases for view in _nees(canvas, scene, case)),
         *(view for case in scene.cases for view in _modes(canvas, scene, case)),
     )
-    if not scene.outputs:
-        return board
     plots = rrb.Vertical(*_draw_errors(canvas, scene, vehicles, tracks), quality)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
 

@@ -36,7 +36,7 @@ from replay.judging.judge import Judge
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
-from replay.timeline.show import show
+from replay.timeline.show import Drawing, show
 from replay.timeline.sinks import open_recording
 from replay.timeline.viewer import Listener, listen, screenshot, view
 
@@ -493,6 +493,19 @@ def test_poses_orientations_and_geodetic_fixes_have_their_places(tmp_path: Path)
     fixes = np.array(found["/geodetic/gps"]["GeoPoints:positions"])[:, 0]
     np.testing.assert_allclose(fixes, np.stack([*degrees.values()], axis=1))
     assert {"Frame odom, grid 1 m", "OpenStreetMap", "Orientation"} <= views(tmp_path / "bare.rrd")
+
+
+@pytest.mark.parametrize("scenario", ["acoustic-shots", "optical-los"])
+def test_a_moment_in_which_sensors_are_silent_is_drawn(scenario: str, tmp_path: Path) -> None:
+    """What is said but once, as where a sensor stands, holds for every span."""
+    source = memory_source(*record_run(scenario, {}, 1))
+    first_ns, last_ns = source.extent("publish_time")
+    middle_ns = (first_ns + last_ns) // 2
+    moment = replace(source, start_ns=middle_ns, end_ns=middle_ns + 10**6)
+    with Drawing(moment, identity="moment", save=tmp_path / "moment.rrd"):
+        pass
+    times = [stamp for columns in read(tmp_path / "moment.rrd").values() for stamp in columns["utc"]]
+    assert all(stamp < middle_ns + 10**9 for stamp in times)
 
 
 def test_a_log_with_nothing_to_draw_says_so(tmp_path: Path) -> None:
