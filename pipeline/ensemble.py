@@ -424,13 +424,14 @@ def replay_in_memory(
     estimators: Settings,
     *,
     order: Clock = "publish_time",
+    late: Late | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Ragged]:
     """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
-        blocks = replay_blocks(sources, bound, Report(), order=order)
+        blocks = replay_blocks(sources, bound, Report(), order=order, late=late)
         outputs |= collect(list(block.values()) for block in blocks)
     return outputs
 

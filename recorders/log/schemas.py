@@ -390,6 +390,11 @@ REWOUND = _declare(
     "A late measurement was used after all; so many messages after it were used again.",
     _identifier("repeated"),
 )
+WAITED = _declare(
+    "Waited",
+    "A late measurement was used in its order, since newer ones waited for it: by so much newer.",
+    _real("behind_s"),
+)
 COVERAGE = _declare(
     "Coverage",
     "For how much of a run, from this stamp to the end, there are estimates.",

@@ -89,6 +89,12 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
             for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
         ]
         yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.WAITED):
+        texts = [
+            f"came late, {behind:.3f} s behind newer ones, which waited for it"
+            for behind in stream["behind_s"].tolist()
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
         texts = [f"failed: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
