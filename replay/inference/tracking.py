@@ -12,7 +12,7 @@ map is chosen. Tracks are managed by how probable it is that they exist (Musicki
 often they were hit at first: `hits_needed` times in as many chances as `chances`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -590,6 +590,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
 BATCH = 1000
 BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
+BY_TRACK = ("number", "mean", "covariance", "existence")
 
 
 @lru_cache(maxsize=16)
@@ -642,4 +643,39 @@ def _no_told(scans: Scans, runs: int, places: int, size: int) -> Told:
         existence=np.empty((runs, rows)),
         pair=np.empty((runs, pairs, 3), np.int64),
         probability=np.empty((runs, pairs)),
+    )
+
+
+def one_scan(scans: Scans, row: int) -> Scans:
+    """One of the scans, as those of one run."""
+    first, end = scans.first[row], scans.end[row]
+    own = {name: getattr(scans, name)[row : row + 1] for name in BY_SCAN}
+    own |= {"first": np.zeros(1, np.int64), "end": np.array([end - first])}
+    return Scans(offsets=np.array([0, 1]), **own, detection=scans.detection[first:end])
+
+
+def lay(parts: Sequence[Scans]) -> Scans:
+    """Single scans, one after another, as those of one run."""
+    ends = np.cumsum([len(part.detection) for part in parts])
+    own = {name: np.concatenate([getattr(part, name) for part in parts]) for name in BY_SCAN}
+    own |= {"first": ends - own["end"], "end": ends}
+    detection = np.concatenate([part.detection for part in parts])
+    return Scans(offsets=np.array([0, len(parts)]), **own, detection=detection)
+
+
+def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
+    """The last scan of one run, and what was said of it."""
+    last = len(scans.time_ns) - 1
+    count, (end, paired) = max(int(told.confirmed[last]), 0), told.end[0]
+    pair, probability = told.pair[:, :paired], told.probability[:, :paired]
+    of_scan = pair[0, :, 1] == last
+    rows = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
+    scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
+    pair = pair[:, of_scan] - [0, last, 0]
+    return one_scan(scans, last), Told(
+        end=np.array([[count, int(of_scan.sum())]]),
+        **scan,
+        **rows,
+        pair=pair,
+        probability=probability[:, of_scan],
     )
