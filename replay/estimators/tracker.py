@@ -10,7 +10,7 @@ on the channels of their scans, see `PLACES` and `BEARINGS`. Places begin tracks
 those that are confirmed. What is in `replay.inference.tracking` does the work.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -24,7 +24,7 @@ from recorders.log import Topic, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.models.planar import Component, Components
 from recorders.models.states import PLANE_MOTION, state_metadata
-from replay.engine.arrays import Floats
+from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
@@ -40,10 +40,10 @@ from replay.inference.tracking import (
     Told,
     Tracker,
     Tracks,
-    lay,
+    in_time,
     no_tracks,
     of_last,
-    one_scan,
+    take_scans,
     track_scans,
 )
 
@@ -384,12 +384,12 @@ class Rewinding(NamedTuple):
 
     Attributes:
         base: the tracks after all scans that no late one can precede any more.
-        pending: the scans after those, each for itself, in time order.
+        pending: the scans after those, in time order.
         head: the tracks after all scans.
     """
 
     base: Tracks
-    pending: tuple[Scans, ...]
+    pending: Scans
     head: Tracks
 
 
@@ -402,14 +402,15 @@ def run_rewinding(
     again at the latest stamp.
     """
     nothing = setup.no_tracks(1)
-    before = state or _begin(block, setup, [Rewinding(nothing, (), nothing)] * _runs(block))
-    scans, fixes = _scans(before, block, setup)
+    scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
+    none = take_scans(scans, np.empty(0, np.int64))
+    runs = [Rewinding(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
     after, outputs = [], []
-    for number, rewinding in enumerate(before.tracks):
-        said: list[list[Ragged]] = []
-        for row in range(*scans.offsets[number : number + 2]):
-            rewinding, told = _take(rewinding, one_scan(scans, row), setup, back_ns)
-            said.append(told)
+    for number, before in enumerate(runs):
+        rewinding, said = before, list[list[Ragged]]()
+        for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
+            rewinding, told = _take(rewinding, take_scans(scans, rows), setup, back_ns)
+            said += told
         after.append(rewinding)
         outputs.append([join(parts) for parts in zip(*said, strict=True)])
     filled = next((each for each in outputs if each), [])
@@ -418,23 +419,34 @@ def run_rewinding(
     return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
 
 
+def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+    """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
+    newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
+    late = scans.time_ns[first:end] < newest_ns
+    cuts = np.flatnonzero(late | np.append(False, late[:-1]))
+    return (first + rows for rows in np.split(np.arange(end - first), cuts) if len(rows))
+
+
 def _take(
-    rewinding: Rewinding, scan: Scans, setup: Setup, back_ns: int
-) -> tuple[Rewinding, list[Ragged]]:
-    """One run after one more scan, and what is said then."""
+    rewinding: Rewinding, arrived: Scans, setup: Setup, back_ns: int
+) -> tuple[Rewinding, list[list[Ragged]]]:
+    """One run after scans that go on in time, or after one that is late; and what is said then."""
     base, pending, head = rewinding
-    time_ns = int(scan.time_ns[0])
-    later = sum(int(each.time_ns[0]) > time_ns for each in pending)
-    place = len(pending) - later
-    pending = (*pending[:place], scan, *pending[place:])
-    newest_ns = int(pending[-1].time_ns[0])
-    head, said = setup.track(base if later else head, lay(pending if later else (scan,)))
-    batch, told = said[-1]
-    outputs = _outputs(setup, *of_last(batch, told), repeated=later)
-    settled = sum(int(each.time_ns[0]) < newest_ns - back_ns for each in pending)
-    if settled:
-        base, _ = setup.track(base, lay(pending[:settled]))
-    return Rewinding(base, pending[settled:], head), outputs
+    repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
+    pending = in_time(pending, arrived)
+    if repeated:
+        head, said = setup.track(base, pending)
+        outputs = [_outputs(setup, *of_last(*said[-1]), repeated=repeated)]
+    else:
+        head, said = setup.track(head, arrived)
+        outputs = [_outputs(setup, batch, told) for batch, told in said]
+    rows = np.arange(len(pending.time_ns))
+    settled = pending.time_ns < pending.time_ns[-1] - back_ns
+    if settled.any():
+        base, _ = setup.track(base, take_scans(pending, rows[settled]))
+        pending = take_scans(pending, rows[~settled])
+    return Rewinding(base, pending, head), outputs
 
 
 def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[Ragged]:

@@ -12,7 +12,7 @@ map is chosen. Tracks are managed by how probable it is that they exist (Musicki
 often they were hit at first: `hits_needed` times in as many chances as `chances`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -646,36 +646,38 @@ def _no_told(scans: Scans, runs: int, places: int, size: int) -> Told:
     )
 
 
-def one_scan(scans: Scans, row: int) -> Scans:
-    """One of the scans, as those of one run."""
-    first, end = scans.first[row], scans.end[row]
-    own = {name: getattr(scans, name)[row : row + 1] for name in BY_SCAN}
-    own |= {"first": np.zeros(1, np.int64), "end": np.array([end - first])}
-    return Scans(offsets=np.array([0, 1]), **own, detection=scans.detection[first:end])
+def take_scans(scans: Scans, rows: Integers) -> Scans:
+    """Some of the scans, in this order, as those of one run."""
+    own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
+    counts = own["end"] - own["first"]
+    ends = np.cumsum(counts)
+    detections = np.arange(int(counts.sum())) + np.repeat(own["first"] - ends + counts, counts)
+    own |= {"first": ends - counts, "end": ends}
+    return Scans(np.array([0, len(rows)]), **own, detection=scans.detection[detections])
 
 
-def lay(parts: Sequence[Scans]) -> Scans:
-    """Single scans, one after another, as those of one run."""
-    ends = np.cumsum([len(part.detection) for part in parts])
-    own = {name: np.concatenate([getattr(part, name) for part in parts]) for name in BY_SCAN}
-    own |= {"first": ends - own["end"], "end": ends}
-    detection = np.concatenate([part.detection for part in parts])
-    return Scans(offsets=np.array([0, len(parts)]), **own, detection=detection)
+def in_time(first: Scans, second: Scans) -> Scans:
+    """The scans of both, of one run, in time order; of equal stamps those of the first come first."""
+    shifted = second._replace(
+        first=second.first + len(first.detection), end=second.end + len(first.detection)
+    )
+    own = {name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in BY_SCAN}
+    detection = np.concatenate([first.detection, second.detection])
+    both = Scans(np.array([0, len(own["time_ns"])]), **own, detection=detection)
+    return take_scans(both, np.argsort(both.time_ns, kind="stable"))
 
 
 def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
     """The last scan of one run, and what was said of it."""
     last = len(scans.time_ns) - 1
     count, (end, paired) = max(int(told.confirmed[last]), 0), told.end[0]
-    pair, probability = told.pair[:, :paired], told.probability[:, :paired]
-    of_scan = pair[0, :, 1] == last
-    rows = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
-    scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
-    pair = pair[:, of_scan] - [0, last, 0]
-    return one_scan(scans, last), Told(
-        end=np.array([[count, int(of_scan.sum())]]),
-        **scan,
-        **rows,
-        pair=pair,
-        probability=probability[:, of_scan],
+    is_of_it = told.pair[0, :paired, 1] == last
+    by_scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
+    by_track = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
+    return take_scans(scans, np.array([last])), Told(
+        end=np.array([[count, int(is_of_it.sum())]]),
+        **by_scan,
+        **by_track,
+        pair=told.pair[:, :paired][:, is_of_it] - [0, last, 0],
+        probability=told.probability[:, :paired][:, is_of_it],
     )

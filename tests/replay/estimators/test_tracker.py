@@ -67,9 +67,9 @@ def replay(source: MemorySource, label: str = "tracker:jipda", **settings: Any) 
     return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
 
 
-def replay_late(source: MemorySource, late: str | None) -> dict[str, Any]:
+def replay_late(source: MemorySource, late: str | None, **settings: Any) -> dict[str, Any]:
     """The same of messages as they arrive."""
-    [bound] = bind("tracker:jipda", [source], {})
+    [bound] = bind("tracker:jipda", [source], settings)
     policy = None if late is None else parse_late(late, arrival_order=True)
     outputs = collect(replaying.replay([source], [bound], order="log_time", late=policy))
     return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
@@ -301,6 +301,12 @@ def test_the_sheets_reference_trackers(autoferry: Path):
     assert mean["thing2_rmse_m"] == pytest.approx(3.92, abs=0.7)
     assert mean["thing1_coverage"] == pytest.approx(0.92, abs=0.02)
     assert mean["thing2_coverage"] == pytest.approx(0.81, abs=0.02)
+    rewound = replay_late(sources[5], "rewind:1", sensors=["radar", "lidar"])
+    assert len(rewound["rewound"]) > 30
+    last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
+    np.testing.assert_array_equal(rewound["track"]["mean"][-1], last)
+    late = track_figures(track_errors(tracks_at(rewound["set"], rewound["track"], at_ns), true))
+    assert late["gospa_m"] == pytest.approx(figures[5]["gospa_m"], abs=0.05)
     one = replay_in_memory(sources[2:3], {label: {"sensors": ["radar", "lidar"]}})
     for leaf in ("set", "track", "association"):
         both = outputs[f"/estimates/{label}/{leaf}"].of_run(2), one[f"/estimates/{label}/{leaf}"].stream
