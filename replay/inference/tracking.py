@@ -678,6 +678,6 @@ def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
         end=np.array([[count, int(is_of_it.sum())]]),
         **by_scan,
         **by_track,
-        pair=told.pair[:, :paired][:, is_of_it] - [0, last, 0],
+        pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
         probability=told.probability[:, :paired][:, is_of_it],
     )
