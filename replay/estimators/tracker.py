@@ -10,7 +10,7 @@ on the channels of their scans, see `PLACES` and `BEARINGS`. Places begin tracks
 those that are confirmed. What is in `replay.inference.tracking` does the work.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -20,16 +20,17 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Stream, Topic, make_stream, schemas
+from recorders.log import Topic, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.models.planar import Component, Components
 from recorders.models.states import PLANE_MOTION, state_metadata
 from replay.engine.arrays import Floats, Integers
-from replay.engine.blocks import Block, Ragged, join
+from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
-from replay.engine.measurements import PLANE, read_vectors
+from replay.engine.measurements import PLANE
+from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.inference.binding import number_fields
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.tracking import (
@@ -39,12 +40,17 @@ from replay.inference.tracking import (
     Told,
     Tracker,
     Tracks,
+    in_time,
     no_tracks,
+    of_last,
+    take_scans,
     track_scans,
 )
 
-ORIGIN = "origin"  # the metadata of a sensor's scans that names the topic of its own position
-NO_ROOM = "there is no room for more tracks; give --set most_tracks=..."
+UNUSED = (
+    "there is no room for more tracks; give --set most_tracks=...",
+    "the scan came after a younger one; give --late rewind:SECONDS",
+)
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -254,15 +260,6 @@ UNSTATED: dict[str, float] = {
 FOREIGN = {PLACES.leaf: ("sigma_rad", "clutter_per_rad"), BEARINGS.leaf: ("sigma_m", "clutter_per_m2")}
 
 
-class Found(NamedTuple):
-    """The sensors of a log: kind, scans, detections, and the topic of each one's own position or ""."""
-
-    kinds: tuple[int, ...]
-    scans: tuple[str, ...]
-    detections: tuple[str, ...]
-    origins: tuple[str, ...]
-
-
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
     """The sensors with scans and places or bearings.
 
@@ -320,154 +317,144 @@ def settings_of(
     return (*names, "gate"), np.array(rows)
 
 
-# Scans
-
-
-class Fix(NamedTuple):
-    """A sensor's own position (2,)."""
-
-    time_ns: int
-    place: Floats
-
-
-Fixes = dict[str, list[Fix | None]]
-
-
-def scans_of(streams: Mapping[str, Ragged], found: Found, fixes: Fixes) -> Scans:
-    """The scans of all runs and sensors in time order.
-
-    `fixes` are the last own positions of earlier blocks, by topic and run. Raises BadInput where a scan
-    has another number of detections than it says, there are two of one number, or a sensor's own
-    position is not known yet.
-    """
-    parts, places, first = [], [], 0
-    for sensor, (kind, scan, seen, origin) in enumerate(zip(*found, strict=True)):
-        scans, detections = streams[scan], streams[seen]
-        order, bounds = _by_scan(scans, detections)
-        own = np.zeros((len(scans), 2))
-        if origin:
-            own = _origins(scans, streams[origin], fixes[origin])
-        run = np.repeat(np.arange(scans.runs), np.diff(scans.offsets))
-        time_ns, position = scans.stream.publish_time_ns, scans.stream.position
-        same = np.full(len(scans), sensor), np.full(len(scans), kind)
-        number = scans["scan_id"].astype(np.int64)
-        parts.append((run, position, time_ns, *same, number, *(bounds + first), own))
-        places.append(_measured(detections.stream, KINDS[kind])[order])
-        first += len(order)
-    run, position, *columns = (np.concatenate(each) for each in zip(*parts, strict=True))
-    rows = np.lexsort((position, columns[0], run))
-    runs = next(iter(streams.values())).runs
-    offsets = np.searchsorted(run[rows], np.arange(runs + 1))
-    in_time = [each[rows] for each in columns]
-    return Scans._make([offsets, *in_time, np.concatenate(places)])
-
-
-def _by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
-    """The order of detections by scan, and which (2, scans) are those of each."""
-    keys, known = (
-        (np.repeat(np.arange(each.runs), np.diff(each.offsets)) << 32) + each["scan_id"].astype(np.int64)
-        for each in (detection, scan)
-    )
-    order = np.argsort(keys, kind="stable")
-    bounds = np.stack([np.searchsorted(keys[order], known, side=side) for side in ("left", "right")])
-    topic, number, stated_count = scan.stream.topic, scan["scan_id"], scan["detections"]
-    twice = np.flatnonzero(np.bincount(np.unique(known, return_inverse=True)[1]) > 1)
-    if len(twice):
-        number_twice = int(np.unique(known)[twice[0]] & 0xFFFFFFFF)
-        raise BadInput(f"topic {topic}: two scans have the number {number_twice}; give each its own")
-    wrong = np.flatnonzero(np.diff(bounds, axis=0)[0] != stated_count)
-    if len(wrong):
-        row = wrong[0]
-        raise BadInput(
-            f"topic {topic}: scan {number[row]} says {stated_count[row]} detections, there are "
-            f"{bounds[1, row] - bounds[0, row]}; record every scan with its count"
-        )
-    if len(keys) != stated_count.sum():
-        raise BadInput(
-            f"topic {detection.stream.topic}: detections of scans that are not there; record every "
-            "scan with its count"
-        )
-    return order, bounds
-
-
-def _measured(stream: Stream, kind: ScanSensor) -> Floats:
-    """The detections (n, 2); a bearing stands first."""
-    if kind.field == "position_m":
-        return read_vectors(stream, kind.field, PLANE)
-    return np.stack([stream[kind.field], np.zeros(len(stream))], axis=1)
-
-
-def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Where the sensor is at its scans (n, 2): at the last fix until then."""
-    found = np.empty((len(scans), 2))
-    places = read_vectors(fixes.stream, "position_m", PLANE)
-    for run, before in enumerate(known):
-        rows = slice(int(scans.offsets[run]), int(scans.offsets[run + 1]))
-        own = slice(int(fixes.offsets[run]), int(fixes.offsets[run + 1]))
-        time_ns, place = fixes.stream.publish_time_ns[own], places[own]
-        if before is not None:
-            time_ns, place = np.append(before.time_ns, time_ns), np.vstack([before.place, place])
-        order = np.argsort(time_ns, kind="stable")
-        last = np.searchsorted(time_ns[order], scans.stream.publish_time_ns[rows], side="right") - 1
-        if (last < 0).any():
-            raise BadInput(
-                f"topic {scans.stream.topic}: a scan before the first message of {fixes.stream.topic}, "
-                "so that it is not known where the sensor is; begin later, with --start"
-            )
-        found[rows] = place[order][last]
-    return found
-
-
-def _latest(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]:
-    """The last own position of every run after a block."""
-    places = read_vectors(fixes.stream, "position_m", PLANE)
-    latest = list(known)
-    for run in range(fixes.runs):
-        for row in range(int(fixes.offsets[run]), int(fixes.offsets[run + 1])):
-            time_ns, before = int(fixes.stream.publish_time_ns[row]), latest[run]
-            if before is None or time_ns >= before.time_ns:
-                latest[run] = Fix(time_ns, places[row])
-    return latest
-
-
 # The estimator
 
 
-class State(NamedTuple):
-    """What is carried from block to block: the tracks, and the last own positions."""
+class Setup(NamedTuple):
+    """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
 
-    tracks: Tracks
+    name: str
+    found: Found
+    tracker: Tracker
+    settings: Floats
+    most_tracks: int
+
+    def no_tracks(self, runs: int) -> Tracks:
+        """Runs in which nothing was met yet."""
+        return no_tracks(runs, self.most_tracks, TARGET.size, len(self.found.scans))
+
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+        """The tracks after some scans, and what is said of them."""
+        return track_scans(self.tracker, scans, self.settings, tracks)
+
+
+class State(NamedTuple):
+    """What is carried from block to block: the last own positions, and the tracks.
+
+    Attributes:
+        fixes: by topic and run.
+        tracks: of all runs; where scans may come late those of one run each, see `Rewinding`.
+    """
+
     fixes: Fixes
+    tracks: Any
 
 
 def start(_: Mapping[str, Ragged]) -> None:
     """Nothing is known before the first scan, not even how many runs there are."""
 
 
-def run(
-    state: State | None,
-    block: Block,
-    *,
-    name: str,
-    found: Found,
-    tracker: Tracker,
-    settings: Floats,
-    most: int,
-) -> tuple[State, list[Ragged]]:
+def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list[Ragged]]:
     """Track a block; see `replay.engine.estimator.Recursive`."""
-    runs = next(iter(block.streams.values())).runs
-    if state is None:
-        tracks = no_tracks(runs, most, TARGET.size, len(found.scans))
-        state = State(tracks, {topic: [None] * runs for topic in found.origins if topic})
-    scans = scans_of(block.streams, found, state.fixes)
-    after, said = track_scans(tracker, scans, settings, state.tracks)
-    fixes = {topic: _latest(block.streams[topic], known) for topic, known in state.fixes.items()}
-    outputs = [_outputs(f"/estimates/{name}", found, batch, told) for batch, told in said]
-    return State(after, fixes), [join(parts) for parts in zip(*outputs, strict=True)]
+    before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
+    scans, fixes = _scans(before, block, setup)
+    after, said = setup.track(before.tracks, scans)
+    outputs = [_outputs(setup, batch, told) for batch, told in said]
+    return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
 
 
-def _outputs(topic: str, found: Found, scans: Scans, told: Told) -> list[Ragged]:
-    """Of every scan how many tracks there are, which, what was associated, and what was not done."""
+def _runs(block: Block) -> int:
+    return next(iter(block.streams.values())).runs
+
+
+def _begin(block: Block, setup: Setup, tracks: Any) -> State:
+    unknown: list[Any] = [None] * _runs(block)
+    return State({topic: unknown for topic in setup.found.origins if topic}, tracks)
+
+
+def _scans(state: State, block: Block, setup: Setup) -> tuple[Scans, Fixes]:
+    """A block's scans, and the last own positions after it."""
+    scans = scans_of(block, setup.found, KINDS, state.fixes)
+    fixes = state.fixes.items()
+    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
+
+
+class Rewinding(NamedTuple):
+    """One run whose scans may come late.
+
+    Attributes:
+        base: the tracks after all scans that no late one can precede any more.
+        pending: the scans after those, in time order.
+        head: the tracks after all scans.
+    """
+
+    base: Tracks
+    pending: Scans
+    head: Tracks
+
+
+def run_rewinding(
+    state: State | None, block: Block, *, setup: Setup, back_ns: int
+) -> tuple[State, list[Ragged]]:
+    """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
+
+    A late scan is put in its place and those after it are used again; what was said stays, and is said
+    again at the latest stamp.
+    """
+    nothing = setup.no_tracks(1)
+    scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
+    none = take_scans(scans, np.empty(0, np.int64))
+    runs = [Rewinding(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
+    after, outputs = [], []
+    for number, before in enumerate(runs):
+        rewinding, said = before, list[list[Ragged]]()
+        for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
+            rewinding, told = _take(rewinding, take_scans(scans, rows), setup, back_ns)
+            said += told
+        after.append(rewinding)
+        outputs.append([join(parts) for parts in zip(*said, strict=True)])
+    filled = next((each for each in outputs if each), [])
+    empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
+    by_topic = zip(*(each or empty for each in outputs), strict=True)
+    return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
+
+
+def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+    """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
+    newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
+    late = scans.time_ns[first:end] < newest_ns
+    cuts = np.flatnonzero(late | np.append(False, late[:-1]))
+    return (first + rows for rows in np.split(np.arange(end - first), cuts) if len(rows))
+
+
+def _take(
+    rewinding: Rewinding, arrived: Scans, setup: Setup, back_ns: int
+) -> tuple[Rewinding, list[list[Ragged]]]:
+    """One run after scans that go on in time, or after one that is late; and what is said then."""
+    base, pending, head = rewinding
+    repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
+    pending = in_time(pending, arrived)
+    if repeated:
+        head, said = setup.track(base, pending)
+        outputs = [_outputs(setup, *of_last(*said[-1]), repeated=repeated)]
+    else:
+        head, said = setup.track(head, arrived)
+        outputs = [_outputs(setup, batch, told) for batch, told in said]
+    rows = np.arange(len(pending.time_ns))
+    settled = pending.time_ns < pending.time_ns[-1] - back_ns
+    if settled.any():
+        base, _ = setup.track(base, take_scans(pending, rows[settled]))
+        pending = take_scans(pending, rows[~settled])
+    return Rewinding(base, pending, head), outputs
+
+
+def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[Ragged]:
+    """Of every scan how many tracks there are, which, what was associated, and what was not done.
+
+    `repeated` is how many scans after a late one, the last of which these are of, were used again.
+    """
+    topic, found = f"/estimates/{setup.name}", setup.found
     used = np.flatnonzero(told.confirmed != NEVER)
     counts, time_ns = told.confirmed[used], scans.time_ns[used]
     offsets = np.searchsorted(used, scans.offsets)
@@ -483,7 +470,9 @@ def _outputs(topic: str, found: Found, scans: Scans, told: Told) -> list[Ragged]
     scan = pair[:, 1]
     pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
     sensors = ",".join(each.rpartition("/")[0].strip("/") for each in found.scans)
-    away, approximated = np.flatnonzero(told.turned_away), np.flatnonzero(told.approximated)
+    approximated = np.flatnonzero(told.approximated)
+    late = told.confirmed == NEVER
+    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
     streams = (
         (
             make_stream(
@@ -537,13 +526,22 @@ def _outputs(topic: str, found: Found, scans: Scans, told: Told) -> list[Ragged]
         ),
         (
             reason_stream(
-                f"{topic}/skipped",
+                f"{topic}/unused",
                 schemas.SKIPPED,
-                scans.time_ns[away],
-                np.zeros(len(away), np.int64),
-                [NO_ROOM],
+                scans.time_ns[unused],
+                np.where(late[unused], 1, 0),
+                UNUSED,
             ),
-            np.searchsorted(away, scans.offsets),
+            np.searchsorted(unused, scans.offsets),
+        ),
+        (
+            make_stream(
+                f"{topic}/rewound",
+                schemas.REWOUND,
+                scans.time_ns[: min(repeated, 1)],
+                repeated=[repeated] * min(repeated, 1),
+            ),
+            np.minimum(scans.offsets, repeated),
         ),
     )
     return [Ragged(stream, bounds) for stream, bounds in streams]
@@ -557,13 +555,14 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     names, settings = settings_of(topics, found, parameters)
     association = parameters.association.replace("jipda", "jpda")
     tracker = Tracker(TARGET, KINDS, association, names)
-    most = parameters.most_tracks
-    advance = partial(run, name=name, found=found, tracker=tracker, settings=settings, most=most)
-    read = dict.fromkeys(
-        [*(topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)]
-        + [origin for origin in found.origins if origin]
-    )
-    return [Recursive(name, tuple(read), (), start, advance)]
+    setup = Setup(name, found, tracker, settings, parameters.most_tracks)
+    seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
+    read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
+
+    def rewinding(back_ns: int) -> Recursive:
+        return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
+
+    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
 
 
 TRACKER = Estimator(

@@ -590,6 +590,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
 BATCH = 1000
 BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
+BY_TRACK = ("number", "mean", "covariance", "existence")
 
 
 @lru_cache(maxsize=16)
@@ -642,4 +643,41 @@ def _no_told(scans: Scans, runs: int, places: int, size: int) -> Told:
         existence=np.empty((runs, rows)),
         pair=np.empty((runs, pairs, 3), np.int64),
         probability=np.empty((runs, pairs)),
+    )
+
+
+def take_scans(scans: Scans, rows: Integers) -> Scans:
+    """Some of the scans, in this order, as those of one run."""
+    own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
+    counts = own["end"] - own["first"]
+    ends = np.cumsum(counts)
+    detections = np.arange(int(counts.sum())) + np.repeat(own["first"] - ends + counts, counts)
+    own |= {"first": ends - counts, "end": ends}
+    return Scans(np.array([0, len(rows)]), **own, detection=scans.detection[detections])
+
+
+def in_time(first: Scans, second: Scans) -> Scans:
+    """The scans of both, of one run, in time order; of equal stamps those of the first come first."""
+    shifted = second._replace(
+        first=second.first + len(first.detection), end=second.end + len(first.detection)
+    )
+    own = {name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in BY_SCAN}
+    detection = np.concatenate([first.detection, second.detection])
+    both = Scans(np.array([0, len(own["time_ns"])]), **own, detection=detection)
+    return take_scans(both, np.argsort(both.time_ns, kind="stable"))
+
+
+def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
+    """The last scan of one run, and what was said of it."""
+    last = len(scans.time_ns) - 1
+    count, (end, paired) = max(int(told.confirmed[last]), 0), told.end[0]
+    is_of_it = told.pair[0, :paired, 1] == last
+    by_scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
+    by_track = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
+    return take_scans(scans, np.array([last])), Told(
+        end=np.array([[count, int(is_of_it.sum())]]),
+        **by_scan,
+        **by_track,
+        pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
+        probability=told.probability[:, :paired][:, is_of_it],
     )

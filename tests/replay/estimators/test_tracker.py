@@ -1,6 +1,7 @@
 """The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,10 @@ from pipeline.ensemble import replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
+from replay.engine import replaying
+from replay.engine.estimator import bind
+from replay.engine.late import parse_late
+from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference import tracking
 from replay.inference.association import existence_after, marginals
@@ -59,6 +64,14 @@ def log(*streams: list[Stream]) -> MemorySource:
 def replay(source: MemorySource, label: str = "tracker:jipda", **settings: Any) -> dict[str, Any]:
     """The columns of each output."""
     outputs = replay_in_memory([source], {label: settings})
+    return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
+
+
+def replay_late(source: MemorySource, late: str | None, **settings: Any) -> dict[str, Any]:
+    """The same of messages as they arrive."""
+    [bound] = bind("tracker:jipda", [source], settings)
+    policy = None if late is None else parse_late(late, arrival_order=True)
+    outputs = collect(replaying.replay([source], [bound], order="log_time", late=policy))
     return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
 
 
@@ -138,8 +151,8 @@ def test_a_second_target_needs_distance_and_room(uncompiled: None):
     assert replay(source, birth_distance_m=20.0)["set"]["elements"].max() == 2
     crowded = replay(source, birth_distance_m=20.0, most_tracks=1)
     assert crowded["set"]["elements"].max() == 1
-    assert len(crowded["skipped"]) == 21
-    assert "most_tracks" in crowded["skipped"].metadata["reasons"]
+    assert len(crowded["unused"]) == 21
+    assert "most_tracks" in crowded["unused"].metadata["reasons"]
 
 
 def test_detections_of_one_hull_are_joined(uncompiled: None):
@@ -192,6 +205,46 @@ def test_a_lag_is_of_the_measurement(uncompiled: None):
     late: Places = [[(2.0 * second - 4.0, 100.0)] for second in range(20)]
     found = replay(log(sensor("radar", {**RADAR, "lag_s": "2"}, range(20), late)))
     assert found["track"]["mean"][-1] == pytest.approx([38, 2, 100, 0], abs=1.0)
+
+
+def late_log() -> MemorySource:
+    """A radar, and a lidar every other scan of which comes 1.2 s late; it is one radar scan behind."""
+    radar = sensor("radar", RADAR, range(16), passing(16))
+    times = np.arange(15) + 0.5
+    lidar = sensor("lidar", RADAR, times, [[(2.0 * time, 100.5)] for time in times])
+    delayed = []
+    for stream in lidar:
+        late_ns = np.where(np.arange(len(stream)) % 2 == 0, 1_200_000_000, 0)
+        delayed.append(replace(stream, log_time_ns=stream.publish_time_ns + late_ns))
+    return log(radar, delayed)
+
+
+@pytest.mark.parametrize("late", ["wait:2", "rewind:2"])
+def test_late_scans_in_their_place(uncompiled: None, late: str):
+    """What is known after the last one is what is known in order, to the last bit."""
+    source = late_log()
+    in_order = replay(source)
+    found = replay_late(source, late)
+    state = [each["track"]["mean"][-1] for each in (found, in_order)]
+    np.testing.assert_array_equal(*state)
+    assert not len(found["skipped"])
+    rewound = found.get("rewound")
+    if late == "rewind:2":
+        assert rewound is not None
+        assert rewound["repeated"].tolist() == [2] * 7 + [1]
+        assert len(found["set"]) == len(in_order["set"])
+    else:
+        assert found["set"]["elements"].tolist() == in_order["set"]["elements"].tolist()
+
+
+def test_late_scans_are_left_out_and_counted(uncompiled: None):
+    source = late_log()
+    dropped = replay_late(source, "drop")
+    assert len(dropped["skipped"]) == 16  # scans, and their detections
+    plain = replay_late(source, None)
+    assert len(plain["unused"]) == 8
+    assert "rewind" in plain["unused"].metadata["reasons"]
+    np.testing.assert_array_equal(dropped["track"]["mean"], plain["track"]["mean"])
 
 
 def _without(streams: list[Stream], *topics: str) -> list[Stream]:
@@ -248,6 +301,12 @@ def test_the_sheets_reference_trackers(autoferry: Path):
     assert mean["thing2_rmse_m"] == pytest.approx(3.92, abs=0.7)
     assert mean["thing1_coverage"] == pytest.approx(0.92, abs=0.02)
     assert mean["thing2_coverage"] == pytest.approx(0.81, abs=0.02)
+    rewound = replay_late(sources[5], "rewind:1", sensors=["radar", "lidar"])
+    assert len(rewound["rewound"]) == 5
+    last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
+    np.testing.assert_array_equal(rewound["track"]["mean"][-1], last)
+    late = track_figures(track_errors(tracks_at(rewound["set"], rewound["track"], at_ns), true))
+    assert late["gospa_m"] == pytest.approx(figures[5]["gospa_m"], abs=0.05)
     one = replay_in_memory(sources[2:3], {label: {"sensors": ["radar", "lidar"]}})
     for leaf in ("set", "track", "association"):
         both = outputs[f"/estimates/{label}/{leaf}"].of_run(2), one[f"/estimates/{label}/{leaf}"].stream
