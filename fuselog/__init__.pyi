@@ -17,6 +17,7 @@ from pipeline.door import open as open  # noqa: A004
 from pipeline.door import record as record
 from pipeline.door import run as run
 from pipeline.door import scenarios as scenarios
+from pipeline.door import sweep as sweep
 from pipeline.door import write as write
 from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting

@@ -12,6 +12,7 @@ import pickle
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ class Cell(NamedTuple):
         experiment: all of it; nothing that decides lies in another file, but for its logs.
         first, end: the runs.
         logs: of how many of them the logs are kept.
+        draws: whether the timeline of the first is drawn.
         errors: whether every single error is kept.
         place: where the experiment's result will be.
     """
@@ -43,13 +45,14 @@ class Cell(NamedTuple):
     first: int
     end: int
     logs: int
+    draws: bool
     errors: bool
     place: Path
 
     @property
     def writes(self) -> bool:
-        """Whether there will be files; the first cell draws the timeline."""
-        return self.first == 0 or self.logs > 0 or self.errors
+        """Whether there will be files."""
+        return self.draws or self.logs > 0 or self.errors
 
     @property
     def key(self) -> str:
@@ -57,14 +60,16 @@ class Cell(NamedTuple):
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         states = [file.stat() for file in self.experiment.files[self.first : self.end]]
         data = [(state.st_size, state.st_mtime_ns) for state in states]
-        runs = [self.first, self.end, self.logs, self.errors]
+        runs = [self.first, self.end, self.logs, self.draws, self.errors]
         said = [experiment, data, runs, str(self.place.absolute()), version_of_code()]
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
         """Record or open the runs, replay and judge them; files go to the folder."""
-        stated = Setting(folder, self.place, logs=self.first + self.logs, errors=self.errors)
-        return Runner(self.experiment, setting or stated).judge(slice(self.first, self.end))
+        if setting is None:
+            logs = self.first + self.logs
+            setting = Setting(folder, self.place, logs=logs, draws=self.draws, errors=self.errors)
+        return Runner(self.experiment, setting).judge(slice(self.first, self.end))
 
     def packed(self, folder: Path) -> bytes:
         """The same as bytes, which any process can take; BadInput where a metric stands against that."""
@@ -83,26 +88,39 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
 
     Raises BadInput where there is an estimator that can follow no run, or workers die again and again.
     """
-    require_memory(f"the rows of {experiment.runs} runs", experiment.runs * KEPT_BYTES)
     cells = cells_of(experiment, setting)
     if len(cells) == 1 or setting.kept is None:  # nothing to share, and nothing to go on with
         return cells[0].work_off(setting.folder, setting).check()
-    whole, hashes = None, hashlib.sha256()
-    results = work_off(cells, setting.crew or here, setting.kept)
-    for done in setting.progress(results, f"replaying {experiment.runs} runs", len(cells)):
-        hashes.update(done.input_sha256.encode())
-        if whole is None:
-            whole = done
-        else:
-            whole.merge(done)
-    assert whole is not None
-    whole.input_sha256 = hashes.hexdigest()
+    (done,) = judge_all([experiment], setting)
     setting.kept.hand_over([cell.key for cell in cells], setting.folder)
-    return whole.check()
+    return done
+
+
+def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[Pass]:
+    """What replaying and judging leaves of each experiment, in their order; see `judge`.
+
+    Files stay where cells are kept.
+    """
+    assert setting.kept is not None
+    parts = [cells_of(experiment, setting) for experiment in experiments]
+    cells = list(chain.from_iterable(parts))
+    runs = sum(experiment.runs for experiment in experiments)
+    results = work_off(cells, setting.crew or here, setting.kept)
+    told = iter(setting.progress(results, f"replaying {runs} runs", len(cells)))
+    for part in parts:
+        whole = next(told)
+        hashes = hashlib.sha256(whole.input_sha256.encode())
+        for done in islice(told, len(part) - 1):
+            hashes.update(done.input_sha256.encode())
+            whole.merge(done)
+        if len(part) > 1:
+            whole.input_sha256 = hashes.hexdigest()
+        yield whole.check()
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
     """The cells: a cut that only the number of runs decides."""
+    require_memory(f"the rows of {experiment.runs} runs", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)
         parameters = merge(values, experiment.record.parameters)
@@ -111,7 +129,8 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
     cells = []
     for now in parts_of(experiment.runs):
         logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
-        cells.append(Cell(experiment, now.start, now.stop, logs, setting.errors, setting.place))
+        draws = setting.draws and now.start == 0
+        cells.append(Cell(experiment, now.start, now.stop, logs, draws, setting.errors, setting.place))
     return cells
 
 

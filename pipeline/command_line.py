@@ -662,6 +662,49 @@ def run(
     run_named(experiment, labels, over, **options)
 
 
+@fuselog.command(short_help="Run an experiment at many points of its parameters.")
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.option(
+    "--over",
+    "swept",
+    multiple=True,
+    required=True,
+    metavar="KEY=LOW:HIGH:N|logN or KEY=A,B,...",
+    help="A parameter and its values, evenly between two ends, or evenly in the logarithm (repeatable).",
+)
+@click.option(
+    "--samples", type=click.IntRange(min=1), help="So many points from the ranges in place of the grid."
+)
+@click.option("--sampling", type=click.Choice(["sobol", "random"]), default="sobol", show_default=True)
+@click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
+@click.option("--seed", type=int, help="Seed of the random numbers.")
+@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT-sweep].")
+@workers_option
+@scheduler_option
+@json_option
+@settings_option
+@set_option
+def sweep(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    **options: Any,
+) -> None:
+    """Run EXPERIMENT, or replay logs, at all points of a grid of parameters, or at samples of it.
+
+    fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --over robots=1,2
+
+    A table has every metric at every point, and within what nine in ten runs lie; figures show them as
+    curves, or as heat maps over two parameters. A key is as --set has it.
+    """
+    from pipeline.commands import sweep_named
+
+    over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    sweep_named(experiment, labels, over, **options)
+
+
 @fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)

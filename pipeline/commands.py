@@ -12,11 +12,19 @@ from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.executors import crew_of
-from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
+from pipeline.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
+from pipeline.results import (
+    ErrorTables,
+    in_order,
+    plain,
+    result_folder,
+    split_metric,
+    write_outcome,
+)
 from pipeline.starting import check_same_run, order_of, origins_of, span_of
 from pipeline.studies.localization import summarise, summary_table
+from pipeline.sweeps import DRAWN, Sampling, nested, parse_over, points_of, run_sweep
 from pipeline.terminal import (
     print_claims,
     print_json,
@@ -454,23 +462,13 @@ def run_named(
     settings: Sequence[str],
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims."""
-    files = [Path(each) for each in named if each.endswith(".mcap")]
-    if files:
-        if len(files) < len(named) or over.keys() & {"runs", "seed"} or data is not None:
-            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
-        values = merge(read_settings(settings_file, labels), parse_settings(settings))
-        experiment = experiment_of_logs(files, labels, {**values, **over})
-        label = experiment.title
-    else:
-        if len(named) > 1 or labels:
-            raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
-        estimators = load_experiment(named[0], {}, {})[1].estimators
-        values = merge(read_settings(settings_file, estimators), parse_settings(settings))
-        label, experiment = load_experiment(named[0], values, over)
+    label, experiment = _experiment_of(named, labels, over, settings_file, parse_settings(settings))
+    if experiment.logs and data is not None and named[0].endswith(".mcap"):
+        raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
-    crew = crew_of(workers, scheduler, len(files) or experiment.runs)
+    crew = crew_of(workers, scheduler, len(experiment.files) or experiment.runs)
     result = run_experiment(
         label, experiment, folder, data=data, logs=logs, errors=errors, crew=crew, progress=progress
     )
@@ -482,3 +480,67 @@ def run_named(
     print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")
+
+
+def _experiment_of(
+    named: Sequence[str],
+    labels: Sequence[str],
+    over: Mapping[str, Any],
+    settings_file: Path | None,
+    values: Mapping[str, Any],
+) -> tuple[str, Experiment]:
+    """The experiment of a name or a TOML file, or that of logs, with settings; and what it is called."""
+    files = [Path(each) for each in named if each.endswith(".mcap")]
+    if files:
+        if len(files) < len(named) or over.keys() & {"runs", "seed"}:
+            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        values = merge(read_settings(settings_file, labels), values)
+        experiment = experiment_of_logs(files, labels, {**values, **over})
+        return experiment.title, experiment
+    if len(named) > 1 or labels:
+        raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+    estimators = load_experiment(named[0], {}, {})[1].estimators
+    return load_experiment(named[0], merge(read_settings(settings_file, estimators), values), over)
+
+
+def sweep_named(
+    named: Sequence[str],
+    labels: Sequence[str],
+    over: Mapping[str, Any],
+    *,
+    swept: Sequence[str],
+    samples: int | None,
+    sampling: Sampling,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
+    overs = [parse_over(text) for text in swept]
+    values = parse_settings(settings)
+
+    def at(point: Mapping[str, Any]) -> Experiment:
+        return _experiment_of(named, labels, over, settings_file, merge(values, nested(point)))[1]
+
+    label, experiment = _experiment_of(named, labels, over, settings_file, values)
+    points = points_of(overs, samples, sampling, experiment.seed)
+    folder = out or Path("out") / f"{label}-sweep"
+    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
+    check_folder(folder, {"input": inputs})
+    crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
+    result = run_sweep(label, overs, points, list(map(at, points)), folder, crew=crew, progress=progress)
+    if as_json:
+        print_json(result.model_dump(mode="json"))
+        return
+    drawn = {key: value for key, value in result.metrics.items() if split_metric(key)[1] in DRAWN}
+    lists = {key: value for key, value in drawn.items() if isinstance(value, list)}
+    shown = {key: value for key, value in lists.items() if len({*value}) > 1} or lists
+    rows = [
+        [*point.values(), *(value[number] for value in shown.values())]
+        for number, point in enumerate(points)
+    ]
+    print_table([*points[0], *shown], rows)
+    say(f"{folder}: the table of all metrics, figures, result.json")

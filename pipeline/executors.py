@@ -62,6 +62,16 @@ def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
     return here if workers == 1 else processes(workers)
 
 
+def of_executor(executor: Executor) -> Crew:
+    """An executor that is there; it is given as much work at a time as there are cores."""
+
+    @contextmanager
+    def begin() -> Iterator[Team]:
+        yield Team(executor, os.cpu_count() or 1)
+
+    return begin
+
+
 class Here(Executor):
     """Does the work when it is submitted, in the calling thread."""
 

@@ -103,6 +103,7 @@ class Setting:
         place: where the folder will be when it is whole.
         data: what is imported.
         logs: of how many runs the logs are kept.
+        draws: whether the first run's timeline is drawn.
         errors: whether every single error is kept too.
         options: of the study's own type.
         progress: is told how it goes.
@@ -114,6 +115,7 @@ class Setting:
     place: Path
     data: Path | None = None
     logs: int = 20
+    draws: bool = True
     errors: bool = False
     options: Any = None
     progress: Progress = no_progress
@@ -290,7 +292,17 @@ def run_experiment(
     ):
         # of runs that all failed there is no mean: a null in the results, not a warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
-        setting = Setting(part, folder, data, logs, errors, options, progress, crew, kept)
+        setting = Setting(
+            folder=part,
+            place=folder,
+            data=data,
+            logs=logs,
+            errors=errors,
+            options=options,
+            progress=progress,
+            crew=crew,
+            kept=kept,
+        )
         outcome = study.run(experiment, setting)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:

@@ -169,7 +169,7 @@ class Runner:
                 metrics=experiment.metrics,
                 order=order,
                 late=late,
-                save=setting.folder / "timeline.rrd",
+                save=setting.folder / "timeline.rrd" if setting.draws else None,
                 on_errors=errors.add if errors else None,
                 progress=setting.progress,
             )
