@@ -65,12 +65,27 @@ def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the Autoferry scenarios, unpacked once."""
+    return _unpacked(real_data / "autoferry.tar.xz", tmp_path_factory) / "autoferry"
+
+
+@pytest.fixture(scope="session")
 def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of TUM and KITTI trajectories and of evo's results, unpacked once."""
     archive = real_data / "trajectories.tar.xz"
     if not archive.exists():
         pytest.skip(f"no {archive}")
     return _unpacked(archive, tmp_path_factory) / "trajectories"
+
+
+@pytest.fixture(scope="session")
+def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of GNSS, inertial and UWB recordings, unpacked once."""
+    archive = real_data / "navigation.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    return _unpacked(archive, tmp_path_factory) / "navigation"
 
 
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -22,8 +22,8 @@ from replay.engine.sources import Ensemble, LogSource, MemorySource, Source, mem
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 
 # Late messages (latency with jitter, so that they overtake one another), equal stamps of odometry and
-# sensors (20, 5 and 10 Hz), messages before the prior (a sensor that stamps early). All sensors,
-# as in the tests of localization: another choice of them is another kernel.
+# sensors (20, 5 and 10 Hz), messages before the prior (a sensor that stamps early). All kinds of sensors
+# as in the tests of localization, since another choice of them is another kernel.
 LATE = {
     "duration_s": 15.0,
     "odometry_latency_s": 0.03,
