@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Topic, make_stream, schemas
+from recorders.log import Clock, Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.blocks import Block, Ragged, merge_events, ragged_rows
+from replay.engine.blocks import Block, Ragged, merge_events
 from replay.engine.estimator import Opened, Opening
 from replay.engine.failures import reason_stream
 from replay.engine.geodetic import origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
 from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
-from replay.inference.happenings import World, happenings_of, sensor_table
+from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
 from replay.inference.model import Sensor, Start
 from replay.inference.recursion import CONTROL, Happenings
 from replay.inference.steps import Stage
@@ -81,8 +81,8 @@ class Beginning:
     def _aligns(self) -> bool:
         """Whether fixes alone have to tell the whole state, and can."""
         model = self.stage.model
-        is_whole = any(len(sensor.measured) == model.size for _, sensor, _ in self._measuring)
-        return bool(model.start and model.start.align and self._measuring) and not is_whole
+        sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
+        return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
     def find(self, first: Mapping[str, Ragged], clock: Clock) -> Opened:
         """What is found in the first messages; raises BadInput where none of them can be used."""
@@ -92,11 +92,11 @@ class Beginning:
         origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
-            origins = origins_of(fixes)
-            whole[topic.name] = _first_rows(fixes)
+            time_ns, has_one, rows = _first_of(fixes, clock, None)
+            whole[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            origins = origins_of(whole[topic.name])
             told.append(self._told_origin(whole[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
-            time_ns, has_one, _ = _first_of(fixes, clock, None)
             facts.append(_Fact(what, time_ns, has_one))
         if not self.found.has_prior:
             prior, found = self._prior(first, clock, origins)
@@ -137,7 +137,7 @@ class Beginning:
             begun.covariance[has_begun],
             named(model.state),
         )
-        return Ragged(stream, np.append(0, np.cumsum(has_begun))), facts
+        return _of_runs(stream, has_begun), facts
 
     @property
     def _without(self) -> str:
@@ -225,6 +225,7 @@ class Beginning:
         places: list[Floats] = []
         spreads: list[Floats] = []
         begin, end = happenings.offsets[run : run + 2]
+        _, first = data_columns(stage)
         before_ns = first_ns = 0
         for event in range(begin, end):
             time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
@@ -233,7 +234,7 @@ class Beginning:
                 state = model.motion.move(state, tuple(control), duration_s, parameters)
             before_ns, data = time_ns, happenings.data[event]
             if source == CONTROL:
-                own = data[: len(control)]
+                own = data[first : first + len(control)]
                 control = np.where(np.isnan(own), control, own)
             elif source >= 0:
                 size = len(stage.sensors[source].measured)
@@ -334,8 +335,6 @@ def _first_of(
     return time_ns, has_one, rows
 
 
-def _first_rows(ragged: Ragged) -> Ragged:
-    """The first message of every run that has one."""
-    is_first = np.zeros(len(ragged), bool)
-    is_first[ragged.offsets[:-1][np.diff(ragged.offsets) > 0]] = True
-    return Ragged(ragged.stream.take(is_first), ragged_rows(is_first, ragged.offsets))
+def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
+    """A stream of one message for each of some runs."""
+    return Ragged(stream, np.append(0, np.cumsum(has_one)))

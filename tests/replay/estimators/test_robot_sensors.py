@@ -1,5 +1,6 @@
 """A robot with odometry and what else a bag may have: poses, fixes, headings, a gyro; no prior."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
+from pipeline.starting import start_from
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.log.run import RunMetadata
@@ -111,6 +113,16 @@ def test_a_robot_begins_at_its_first_pose() -> None:
     assert_array_equal(found["innovation"]["accepted"], 1)
 
 
+def test_a_span_begins_at_its_own_first_pose() -> None:
+    source = log(odometry(), seen())
+    later = replace(source, start_ns=int(SLOW[2]) + 1)
+    estimates = outputs(ROBOT, "ekf", [later])["pose"].stream
+    assert estimates.publish_time_ns[0] == SLOW[3]
+    (filtering,) = bound(ROBOT, "ekf", [later])
+    with pytest.raises(BadInput, match=r"no prior in this log .*leave out --start-from"):
+        start_from(filtering, [later], [], "publish_time")
+
+
 def test_what_a_log_states_is_not_assumed() -> None:
     stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
     found = outputs(ROBOT, "ekf", [log(stated, seen())])
@@ -206,6 +218,8 @@ def test_headings_are_a_sensor() -> None:
         metadata={"covariance_rad2": "0.01,0,0,0,0.01,0,0,0,0.0004"},
         quaternion=np.column_stack([np.cos(half), np.zeros((n, 2)), np.sin(half)]),
     )
+    with_fixes = outputs(ROBOT, "ekf", [log(odometry(), fix(), heading)])
+    assert "at the first message of /heading" in sentences_of(with_fixes["started"].stream)[1]
     found = outputs(ROBOT, "ekf", [log(odometry(), seen(), heading)])["pose"]
     variance = found["covariance"][found.stream.publish_time_ns == SLOW[0], 8]
     assert_allclose(variance, 1 / (1 / 0.0025 + 1 / 0.0004), rtol=2e-3)
