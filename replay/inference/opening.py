@@ -21,7 +21,13 @@ from replay.engine.failures import reason_stream
 from replay.engine.geodetic import origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
-from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
+from replay.inference.binding import (
+    Found,
+    complaint_of,
+    measures_state,
+    number_fields,
+    reading_settings,
+)
 from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
 from replay.inference.model import Sensor, Start
 from replay.inference.recursion import CONTROL, Happenings
@@ -60,12 +66,11 @@ class Beginning:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """The sensors that measure components of the state by their names, with their numbers."""
-        state = self.stage.model.state
+        """The sensors that measure the state itself, with their numbers; none of a thing without."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
-            if sensor.covariance and sensor.measured.items() <= state.items()
+            if measures_state(self.stage.model, sensor)
         ]
 
     @property
@@ -73,9 +78,8 @@ class Beginning:
         """The topics whose first message is where to begin."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.instead)]
-        if self._measuring:
-            return [*(drives if self._aligns else []), *(topic for _, _, topic in self._measuring)]
-        return [*drives, *(topic for _, topic in self.found.sensors)]
+        needs_drives = self._aligns or not self._measuring
+        return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
 
     @property
     def _aligns(self) -> bool:
@@ -109,13 +113,13 @@ class Beginning:
     ) -> tuple[Ragged, list["_Fact"]]:
         """The priors of all runs, and what is to be told of them."""
         model, runs = self.stage.model, _runs(first)
-        mean, sigma = _anywhere(model.state, model.start)
+        mean, sigma = _unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
         facts = (
             self._at_first(first, clock, origins, begun)
             if self._measuring
-            else self._anywhere(first, clock, begun)
+            else self._at_zero(first, clock, begun)
         )
         if self._aligns:
             aligned = self._aligned(first, clock, origins, begun)
@@ -143,15 +147,13 @@ class Beginning:
     def _without(self) -> str:
         return f"the log has no prior ({self.found.prior.name}): it begins"
 
-    def _anywhere(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
-        """Begin all runs at their first message, for nothing measures the state itself."""
+    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+        """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
         for topic in self._starting:
             found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
-        where = "anywhere"
-        if not self.found.sensors:
-            begun.covariance[:] *= CERTAIN**2
-            where = "at zero, where its frame is"
+        begun.covariance[:] *= CERTAIN**2
+        where = "at zero, where its frame is"
         return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
 
     def _at_first(
@@ -179,7 +181,7 @@ class Beginning:
     def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
         """The mean and the much wider sigmas of a state that one message tells of."""
         model, sensor = self.stage.model, self.stage.sensors[number]
-        mean, sigma = _anywhere(model.state, model.start)
+        mean, sigma = _unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
@@ -309,7 +311,7 @@ def _runs(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
-def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
     """The mean (n,) and standard deviations (t,) of a state of which nothing is known."""
     assert start is not None
     kinds = list(state.values())

@@ -145,8 +145,8 @@ def test_odometry_alone_begins_at_zero() -> None:
     assert bound(ROBOT, "ekf", [log(odometry(), sighting)]) == []
 
 
-def test_sightings_alone_begin_anywhere() -> None:
-    """That is said; a pose makes the beginning sure, and a prior is never overruled."""
+def test_sightings_need_a_prior_which_nothing_overrules() -> None:
+    """They do not say where to begin, unless there are poses as well."""
     landmark = make_stream(
         "/landmarks", schemas.LANDMARK, STAMPS[:1], landmark_id=[1], position_m=[[0.0, 0.0]]
     )
@@ -158,11 +158,8 @@ def test_sightings_alone_begin_anywhere() -> None:
         target_id=[1] * 6,
         range_m=[20.0] * 6,
     )
-    found = outputs(ROBOT, "ekf", [log(odometry(), landmark, sighting)])
-    assert sentences_of(found["started"].stream)[0].endswith("(/prior): it begins anywhere")
-    first = found["pose"]["covariance"][0]
-    assert first[[0, 4]] == pytest.approx(1e6)
-    assert found["pose"].stream.publish_time_ns[0] == STAMPS[0]
+    assert bound(ROBOT, "ekf", [log(odometry(), landmark, sighting)]) == []
+    assert len(bound(ROBOT, "ekf", [log(odometry(), landmark, sighting, seen())])) == 1
     prior = make_stream(
         "/prior",
         schemas.GAUSSIAN_ESTIMATE,
