@@ -1,7 +1,6 @@
 """A robot with odometry and what else a bag may have: poses, fixes, headings, a gyro; no prior."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from recorders.recording import Recording
 from replay.engine.failures import sentences_of
 from replay.engine.sources import MemorySource, memory_source
 from replay.estimators.landmarks import RECKONING, ROBOT
-from replay.inference import estimators
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]
@@ -27,13 +25,7 @@ SLOW = STAMPS[7::10]
 SIGMA = np.array([0.3, 0.2, 0.05])
 
 
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Loops in plain Python, of which none is left to the next test."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    estimators._compiled.cache_clear()
-    yield
-    estimators._compiled.cache_clear()
+pytestmark = pytest.mark.usefixtures("uncompiled")
 
 
 def poses() -> Floats:
