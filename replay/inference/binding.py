@@ -115,8 +115,8 @@ def topics_of(
 def _found(model: Model, here: _Here) -> Found | None:
     """What there is of a model under one prefix; None where it does not fit.
 
-    A log without the prior fits a model that can start without, and one without sensors does if it has
-    nothing of them: no sightings whose map is missing, say.
+    A log without the prior fits a model that can start without, if a sensor measures the state itself.
+    One without sensors does if it has nothing of them: no sightings whose map is missing, say.
     """
     prior = here.topic(model.prior, schemas.GAUSSIAN_ESTIMATE)
     has_prior = prior is not None
@@ -140,6 +140,8 @@ def _found(model: Model, here: _Here) -> Found | None:
     is_alone = model.start is not None and control is not None and not any(map(here.has, parts))
     if not sensors and model.needs_sensor and not is_alone:
         return None
+    if not has_prior and sensors and not any(measures_state(model, sensor) for sensor, _ in sensors):
+        return None
     instead = tuple(
         (each, topic)
         for each in (model.control.instead if model.control else ())
@@ -147,6 +149,11 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     truth = here.place(model.truth)
     return Found(here.prefix, prior, truth, control, sensors, has_prior, instead)
+
+
+def measures_state(model: Model, sensor: Sensor) -> bool:
+    """Whether a sensor measures components of the state by their names, with their covariance."""
+    return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
 
 
 def needs_of(model: Model) -> str:
@@ -199,7 +206,9 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
         return Part(words, is_here=is_of)
 
     parts = []
-    if model.start is None or here.has(model.prior):
+    sensing = [sensor for sensor in model.all_sensors if here.has(sensor.topic)]
+    starts = not sensing or any(measures_state(model, sensor) for sensor in sensing)
+    if model.start is None or here.has(model.prior) or not starts:
         words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
         if is_here:
             is_here = names_state(here.topics[here.place(model.prior)], model)

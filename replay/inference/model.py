@@ -199,9 +199,9 @@ class Start:
     """What is assumed of a log that has no prior: it was not made for the model.
 
     It begins at the first message that measures components of the state by their names, a fix or a pose
-    with its covariance. What that does not measure is zero, and as uncertain as is said here. Where
-    nothing measures the state, so is everything; with no sensor at all, the thing begins at zero, which
-    is where its frame is.
+    with its covariance. What that does not measure is zero, and as uncertain as is said here. With no
+    sensor at all the thing begins at zero, which is where its frame is. Sensors that do not measure the
+    state itself need a prior.
 
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
