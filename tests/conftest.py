@@ -3,6 +3,7 @@
 import os
 import sys
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,34 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip("signals, limits, links and owners of files as Unix has them")
 
 
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Loops in plain Python, of which none is left to the next test.
+
+    A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
+    """
+    from replay.engine import blocks, supervision
+    from replay.inference import estimators, imm, iterated, observability, rewinding, smoothers
+
+    loops = (
+        blocks._merge,
+        supervision._over_runs,
+        estimators._compiled,
+        rewinding._compiled,
+        iterated._search,
+        smoothers._way_back,
+        smoothers._sliding,
+        imm._smoothing,
+        observability._summing,
+    )
+    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    for each in loops:
+        each.cache_clear()
+    yield
+    for each in loops:
+        each.cache_clear()
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real data sets that are not part of the project; tests without it are skipped."""
@@ -33,6 +62,12 @@ def real_data() -> Path:
 def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of MRCLAM data set 6, unpacked once."""
     return _unpacked(real_data / "mrclam6.tar.xz", tmp_path_factory) / "mrclam6"
+
+
+@pytest.fixture(scope="session")
+def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the Autoferry scenarios, unpacked once."""
+    return _unpacked(real_data / "autoferry.tar.xz", tmp_path_factory) / "autoferry"
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """Places in a local tangent plane (east, north, up) and on the WGS 84 ellipsoid."""
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from recorders.models.planar import Component, Components
 
@@ -21,6 +22,22 @@ def earth_centred(
         (normal + altitude_m) * np.cos(latitude) * np.sin(longitude),
         (normal * (1.0 - ECCENTRICITY_SQUARED) + altitude_m) * np.sin(latitude),
     )
+
+
+def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
+    """East, north and up at places (...,) as the rows of rotations (..., 3, 3) of earth-centred axes."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    zero = np.zeros_like(latitude)
+    rows = (
+        (-np.sin(longitude), np.cos(longitude), zero),
+        (
+            -np.sin(latitude) * np.cos(longitude),
+            -np.sin(latitude) * np.sin(longitude),
+            np.cos(latitude),
+        ),
+        (np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def out_of_tangent_plane(
