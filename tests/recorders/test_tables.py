@@ -501,9 +501,18 @@ BAD = [
     ("", FIX, "", "", "table.csv: holds no rows"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
 [[tables.streams]]
+topic = "/truth"
+becomes = "TruthState"
+fields = { state = ["w", "x", "y", "z"] }
+components = "a_w,a_x,a_y,a_z"
+kinds = "quaternion,quaternion,quaternion,quaternion"
+""", "table.csv: /truth: the quaternions of state: the vector at (0,) has length 1.41421356"),
+    ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
+[[tables.streams]]
 topic = "/o"
 becomes = "Orientation"
 fields = { quaternion = ["w", "x", "y", "z"] }
+mounting_deg = [180, 0, 0]
 """, "table.csv: /o: its quaternions: the vector at (0,) has length 1.41421356"),
 ]  # fmt: skip
 
