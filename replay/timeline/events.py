@@ -80,6 +80,8 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
             for target, square in zip(gated["target_id"].tolist(), squares, strict=True)
         ]
         yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.STARTED):
+        yield Happened(estimator, "INFO", stream.publish_time_ns, sentences_of(stream))
     for estimator, stream in scene.outputs_of(case, schemas.SKIPPED):
         texts = [f"not used: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "WARN", stream.publish_time_ns, texts)
@@ -88,6 +90,12 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         texts = [
             f"came {delay:.3f} s late: went back and used {repeated} after it again"
             for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.WAITED):
+        texts = [
+            f"came late, {behind:.3f} s behind newer ones, which waited for it"
+            for behind in stream["behind_s"].tolist()
         ]
         yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):

@@ -50,8 +50,8 @@ class Squares(NamedTuple):
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Errors, NEES and NIS of a case: no plots where there is nothing to judge."""
-    parts = (draw_errors, draw_nees, draw_nis)
+    """Errors, NEES, NIS and effective particles of a case: no plots where there is nothing to judge."""
+    parts = (draw_errors, draw_nees, draw_nis, draw_effective)
     return [view for part in parts for view in part(canvas, scene, case)]
 
 
@@ -169,6 +169,15 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
             plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, 1.05))
         )
     return views
+
+
+def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """What share of each filter's particles is effective."""
+    plot, found = entity_path("plots", case, "effective"), False
+    for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
+        share, found = stream["effective"] / stream["particles"], True
+        draw_curve(canvas, plot, estimator, scene.colour(estimator), stream.publish_time_ns, share, LINE)
+    return [plot_view(plot, "Effective share of the particles", (-0.05, 1.05))] if found else []
 
 
 def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:

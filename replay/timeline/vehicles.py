@@ -44,7 +44,14 @@ from replay.timeline.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.plots import LINE, draw_curve, draw_modes, draw_nees, plot_view
+from replay.timeline.plots import (
+    LINE,
+    draw_curve,
+    draw_effective,
+    draw_modes,
+    draw_nees,
+    plot_view,
+)
 
 CLOSE = f"{ROOT}/close"
 SENSOR = f"{ROOT}/sensor"
@@ -106,7 +113,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         return board
     quality = rrb.Tabs(
         *(view for case in scene.cases for view in _nees(canvas, scene, case)),
-        *(view for case in scene.cases for view in _modes(canvas, scene, case)),
+        *(view for case in scene.cases for view in _own(canvas, scene, case)),
     )
     plots = rrb.Vertical(*_draw_errors(canvas, scene, vehicles, tracks), quality)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
@@ -120,9 +127,9 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     return views
 
 
-def _modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Mode probabilities of a case, named by it."""
-    views = draw_modes(canvas, scene, case)
+def _own(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """Mode probabilities and effective particles of a case, named by it."""
+    views = [*draw_modes(canvas, scene, case), *draw_effective(canvas, scene, case)]
     for view in views:
         view.name = f"{view.name}, {case}"
     return views

@@ -192,6 +192,7 @@ def test_vehicles_have_their_particles_and_a_tab_for_their_modes(tmp_path: Path)
             curve = found[f"/plots/{case}/{topic}/imm/stand"]["Scalars:scalars"]
             assert np.array_equal(np.ravel(curve), probability[:, 2])
         tabs = {f"Modes of imm, {case}", f"Smoothed modes of imm, {case}"}
+        tabs.add(f"Effective share of the particles, {case}")
         assert tabs <= views(tmp_path / "run.rrd")
     assert 0 < left_out < 250
 
@@ -240,6 +241,9 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
             log_time_ns=[begin_ns + 2 * 10**9 + 250_000_000],
             repeated=[3],
         ),
+        make_stream(
+            "/estimates/ekf/robot1/waited", schemas.WAITED, [begin_ns + 3 * 10**9], behind_s=[0.125]
+        ),
     ]
     outputs = {each.topic: gather([each]) for each in told}
     show(ensemble.sources[0], outputs, [], save=tmp_path / "late.rrd")
@@ -247,6 +251,7 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
     assert dict(zip(events["utc"], events["TextLog:text"], strict=True)) == {
         begin_ns + 10**9: ["ekf: not used: too late"],
         begin_ns + 2 * 10**9: ["ekf: came 0.250 s late: went back and used 3 after it again"],
+        begin_ns + 3 * 10**9: ["ekf: came late, 0.125 s behind newer ones, which waited for it"],
     }
 
 
