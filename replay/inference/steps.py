@@ -424,8 +424,8 @@ def linear_innovation(sensor: Sensor, number: int) -> Function:
     return compare
 
 
-def weighing(sensor: Sensor, number: int) -> Function:
-    """`weigh(data, parameters, work)`: a linearised measurement's residual in units of its noise.
+def whitening(sensor: Sensor, number: int) -> Function:
+    """`whiten_residual(data, parameters, work)`: a linearised measurement in units of its noise.
 
     From the workspace's `predicted` and `rows`, with R = L L': the innovation's difference becomes
     L^-1 (y - h), its cross-covariance H' L^-T. Returns how many components were measured, and the square
@@ -434,7 +434,7 @@ def weighing(sensor: Sensor, number: int) -> Function:
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
 
-    def weigh(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
+    def whiten_residual(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
         innovation = work.innovations[number]
         difference, noise, turned = innovation
         for i in range(m):
@@ -449,7 +449,7 @@ def weighing(sensor: Sensor, number: int) -> Function:
         kalman_step(innovation, size, work.step)
         return size, squared
 
-    return weigh
+    return whiten_residual
 
 
 def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:
