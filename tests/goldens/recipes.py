@@ -37,9 +37,11 @@ class Recipe:
         scenario: recorded in place of the experiment's.
         parameters: over those of the scenario.
         estimators: settings by label, over the experiment's.
+        alone: whether these are all estimators.
         run: which run of the experiment's seed.
         span_s: so many seconds of the log.
         part: of the imported data, the folder that is one log.
+        late: what is done about late messages, in the order of their arrival.
         over: entries over those of an experiment without logs; its metrics are the golden.
     """
 
@@ -47,9 +49,11 @@ class Recipe:
     scenario: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     estimators: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    alone: bool = False
     run: int = 0
     span_s: float = np.inf
     part: str = ""
+    late: str = ""
     over: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -60,6 +64,8 @@ class Recipe:
     @property
     def settings(self) -> dict[str, dict[str, Any]]:
         """Every estimator's settings by label; those that the experiment keeps for few runs as well."""
+        if self.alone:
+            return {label: dict(values) for label, values in self.estimators.items()}
         experiment = self.loaded
         return merge(experiment.estimators | experiment.options.get("few", {}), self.estimators)
 
@@ -75,6 +81,17 @@ class Recipe:
 
 
 SHORT = {"duration_s": 40.0}
+AUGMENTED = {
+    "estimate": ["bias_range_m"],
+    "estimate_sigma": {"bias_range_m": 0.5},
+    "estimate_drift": {"bias_range_m": 0.02},
+}
+# by which messages overtake one another, some by more than a window of 0.4 s
+OVERTAKING = {
+    "duration_s": 20.0,
+    "odometry_latency_s": 0.03,
+    "range_bearing": {"latency_s": 0.2, "latency_jitter_s": 0.3},
+}
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
@@ -94,6 +111,19 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
         {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
+    # the ranges' bias as a part of the state
+    "landmarks-augmented": Recipe(
+        "landmarks",
+        parameters=SHORT,
+        estimators=dict.fromkeys(("ekf", "iekf", "ukf"), AUGMENTED),
+        alone=True,
+    ),
+    **{
+        f"landmarks-late-{late.partition(':')[0]}": Recipe(
+            "landmarks", parameters=OVERTAKING, estimators={"ekf": {}, "ukf": {}}, alone=True, late=late
+        )
+        for late in ("rewind:0.4", "wait:0.4")
+    },
     "landmarks-particles": Recipe(
         "landmarks",
         parameters={"duration_s": 10.0},
