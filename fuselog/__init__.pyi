@@ -17,6 +17,7 @@ from pipeline.door import open as open  # noqa: A004
 from pipeline.door import record as record
 from pipeline.door import run as run
 from pipeline.door import scenarios as scenarios
+from pipeline.door import sweep as sweep
 from pipeline.door import write as write
 from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting
@@ -85,6 +86,7 @@ from replay.inference.model import Model as Model
 from replay.inference.model import ModelParameters as ModelParameters
 from replay.inference.model import Motion as Motion
 from replay.inference.model import Sensor as Sensor
+from replay.inference.model import Start as Start
 from replay.inference.model import Switching as Switching
 from replay.judging.evaluation import Errors as Errors
 from replay.judging.evaluation import Innovations as Innovations

@@ -102,9 +102,9 @@ def replay(
             metrics=wanted,
             order=order,
             late=policy,
-        )
+        ).check()
         estimates = [LogSource(open_log(path)) for path, _ in places]
-        made = Replay(sources, estimates, settings, done, gap_limit_s)
+        made = Replay(sources, estimates, settings, done, gap_limit_s, arrival_order, late)
         weakref.finalize(made, stack.pop_all().close)
     return made
 
@@ -119,6 +119,7 @@ class Replay:
         settings: the estimators by label, as they were given.
         done: the pass: its judge, all parameters, and how long each estimator worked.
         gap_limit_s: the truth is not interpolated over longer gaps.
+        arrival_order, late: as they were given.
     """
 
     logs: Sequence[LogSource | MemorySource]
@@ -126,6 +127,8 @@ class Replay:
     settings: Settings
     done: Pass
     gap_limit_s: float
+    arrival_order: bool = False
+    late: str | None = None
 
     @property
     def judge(self) -> Judge:
@@ -232,7 +235,7 @@ class Replay:
 
         log = self.logs[run]
         identity = json.dumps([str(log.start_ns), self.settings], default=str)
-        with Drawing(log, identity=identity, focus=focus, save=rrd) as drawing:
+        with Drawing(log.whole(), identity=identity, focus=focus, save=rrd) as drawing:
             judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
@@ -249,6 +252,8 @@ class Replay:
             "parameters": self.done.parameters,
             "gap_limit_s": self.gap_limit_s,
         }
+        stated = {"arrival_order": self.arrival_order or None, "late": self.late}
+        settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
             outcome = summarise(self.judge)
             outcome.input_sha256 = self.input_sha256
