@@ -71,7 +71,6 @@ def happenings_of(
     tables: list[_Table] = []
     if control is not None and found.control is not None:
         tables.append(_control_table(control, block.streams[found.control.name], width, start))
-    first = len(tables)
     parameters = reading_settings(number_fields(stage.model.parameters))
     for number, (sensor, topic) in enumerate(found.sensors):
         own = parameters(settings, number + 1)
@@ -85,12 +84,52 @@ def happenings_of(
     if lacking.any():  # as if these had not come
         happenings = of_rows(happenings, ~lacking)
         happenings = happenings._replace(is_due=last_of_stamps(happenings))
-    if first and not (control is not None and control.estimates) and found.sensors:
-        stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
-        sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-        sensed[stamp[happenings.source != CONTROL]] = True
-        happenings = happenings._replace(is_due=happenings.is_due & sensed[stamp])
-    return happenings, lacking
+    return happenings._replace(is_due=_wanted(stage, happenings)), lacking
+
+
+def _wanted(stage: Stage, happenings: Happenings) -> Booleans:
+    """Which of the last events of their stamps want an estimate: not where the control's are all."""
+    control = stage.model.control
+    if control is None or control.estimates or not stage.sensors:
+        return happenings.is_due
+    stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
+    sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+    sensed[stamp[happenings.source != CONTROL]] = True
+    return happenings.is_due & sensed[stamp]
+
+
+def delays_of(stage: Stage, settings: Floats) -> Integers:
+    """How long before their stamps messages were measured, in ns, by an event's source.
+
+    (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
+    """
+    names, control = number_fields(stage.model.parameters), stage.model.control
+    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
+    asked += [(0, ""), (0, control.delay if control else "")]
+    delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
+    return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
+
+
+def as_measured(
+    stage: Stage, happenings: Happenings, delays_ns: Integers, *, is_end: bool
+) -> tuple[Happenings, Happenings]:
+    """Events at the times at which they were measured, in order; and those still to wait.
+
+    What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
+    something older may come.
+    """
+    runs = len(happenings.offsets) - 1
+    run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
+    time_ns = happenings.time_ns - delays_ns[happenings.source]
+    last_ns = np.append(happenings.time_ns, 0)[happenings.offsets[1:] - 1]
+    settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
+    waiting = of_rows(happenings, ~settled)
+    measured = of_rows(happenings._replace(time_ns=time_ns), settled)
+    order = np.lexsort((measured.time_ns, run[settled]))
+    columns: Any = (column[order] for column in measured[1:])
+    measured = Happenings(measured.offsets, *columns)
+    measured = measured._replace(is_due=last_of_stamps(measured))
+    return measured._replace(is_due=_wanted(stage, measured)), waiting
 
 
 def last_of_stamps(happenings: Happenings) -> Booleans:
@@ -150,6 +189,9 @@ def _sensor_table(
         rows = places.rows(run, target)
         source[rows < 0] = NOTHING
         parts.insert(1, places.at(rows))
+    if sensor.control is not None:  # see `with_control`
+        unknown = np.full((len(stream), len(sensor.control.components)), np.nan)
+        parts.insert(2 if sensor.about else 1, unknown)
     source[lacking] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
@@ -230,6 +272,17 @@ def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Hap
         ready[inside], waiting[begin : at[-1]] = True, False
     again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
     return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
+
+
+def with_control(stage: Stage, happenings: Happenings) -> Happenings:
+    """Events whose control is known, with its numbers where sensors read them."""
+    data = happenings.data.copy()
+    for number, sensor in enumerate(stage.sensors):
+        if sensor.control is not None:
+            rows, controls = happenings.source == number, len(sensor.control.components)
+            end = len(sensor.measured) + sensor.about_size
+            data[rows, end - controls : end] = data[rows, -controls:]
+    return happenings._replace(data=data)
 
 
 def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:

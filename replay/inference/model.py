@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream
@@ -31,6 +31,9 @@ class ModelParameters(Parameters):
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
     """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+    gate_reopens_s: PositiveFloat | None = None
+    """The gate is open where a sensor's last measurement that was let in is older, so that a filter that
+    has lost its way, as in an outage, does not keep out all that would bring it back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +75,7 @@ class Control:
         interpolated: the control is linear between two messages, and the motion over a step gets the
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
+        delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
     """
 
@@ -81,6 +85,7 @@ class Control:
     read: Callable[[Stream], Floats] | None = None
     interpolated: bool = False
     initial: tuple[float, ...] = ()
+    delay: str = ""
     estimates: bool = False
 
 
@@ -143,8 +148,11 @@ class Sensor:
             every component is a field of its own.
         covariance: the field that holds the vector's covariance.
         about: what the message is about.
+        control: the model's, which has to be interpolated, where what is measured depends on it:
+            `about` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
+        delay: the parameter that says how long before its stamp, in s, a message was measured.
         linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
             moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
             measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
@@ -161,11 +169,19 @@ class Sensor:
     vector: str = ""
     covariance: str = ""
     about: Map | None = None
+    control: Control | None = None
     read: Callable[[Stream], Floats] | None = None
+    delay: str = ""
     linear: bool = False
     jacobian: Function | None = None
     moments: Function | None = None
     log_likelihood: Function | None = None
+
+    @property
+    def about_size(self) -> int:
+        """How many numbers `measure` gets as `about`: those of the point, then those of the control."""
+        controls = len(self.control.components) if self.control else 0
+        return (self.about.size if self.about else 0) + controls
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +343,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
-    state, about = trial_state(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
+    state, about = trial_state(model.kinds), (1.0,) * sensor.about_size
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):

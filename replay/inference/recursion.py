@@ -65,12 +65,14 @@ class Carried(NamedTuple):
         belief: the method's own.
         control: (runs, controls), what drives the state.
         time_ns: (runs,), of the belief.
+        accepted_ns: (runs, sensors), of the last measurement that the gate let in, or of the start.
         failure: (runs,), ALL_WELL or an index of `steps.FAILURES`.
     """
 
     belief: Any
     control: Floats
     time_ns: Integers
+    accepted_ns: Integers
     failure: Integers
 
 
@@ -188,12 +190,14 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
             parameters = settings_of(settings, source + 1)
-            told = update(
-                source, run, carried.belief, data, parameters, gates[source], event, memory, note
-            )
+            waited_s = (happenings.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
+            gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
+            told = update(source, run, carried.belief, data, parameters, gate, event, memory, note)
             if told >= 0:
                 return told
             if told == ALL_WELL:
+                if note.numbers[2] > 0.0:
+                    carried.accepted_ns[run, source] = happenings.time_ns[event]
                 innovations.time_ns[row] = happenings.time_ns[event]
                 innovations.target_id[row] = happenings.target_id[event]
                 innovations.end[run] = row + 1

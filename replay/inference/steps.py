@@ -329,7 +329,7 @@ class Reading(NamedTuple):
 
 def reading(sensor: Sensor) -> Reading:
     """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
-    m, about = len(sensor.measured), sensor.about.size if sensor.about else 0
+    m, about = len(sensor.measured), sensor.about_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
 

@@ -1,0 +1,167 @@
+"""Inertial navigation, corrected by what a log has of position and velocity.
+
+The state of 15 components, with an inertial unit for its control: position and velocity in a local
+plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro
+and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems,
+2nd edition, 2013, chapter 14; the error of the orientation is one in the body's axes.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.log import Stream, schemas
+from recorders.models.inertial import cross, from_mounting, into_plane, strapdown
+from recorders.models.planar import Components
+from replay.engine.arrays import Floats
+from replay.engine.tangent import Kind
+from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+
+POSITION: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "z_m": "linear"}
+VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear", "vz_mps": "linear"}
+ORIENTATION: Mapping[str, Kind] = {f"orientation_{part}": "quaternion" for part in "wxyz"}
+GYRO_BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}
+FORCE_BIAS: Mapping[str, Kind] = {f"accelerometer_bias_{axis}_mps2": "linear" for axis in "xyz"}
+LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
+MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
+NAVIGATION: Mapping[str, Kind] = {**POSITION, **VELOCITY, **ORIENTATION, **GYRO_BIAS, **FORCE_BIAS}
+
+
+class NavigationParameters(ModelParameters):
+    """The inertial unit, how it is mounted, and where; None takes what the log's channels state.
+
+    Noise densities are per square root of hertz, those of the biases' random walks per square root of a
+    second. The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about
+    left, of roll about forward. Biases are those of the turned axes. The lever arm is where fixes are
+    of, from the unit, in the body's axes. A message was measured its topic's delay before its stamp.
+    Latitude and height are those of the plane's origin.
+    """
+
+    force_noise_density: NonNegativeFloat | None = None
+    gyro_noise_density: NonNegativeFloat | None = None
+    force_bias_density: NonNegativeFloat | None = None
+    gyro_bias_density: NonNegativeFloat | None = None
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    height_m: float = 0.0
+    mounting_roll_rad: float = 0.0
+    mounting_pitch_rad: float = 0.0
+    mounting_yaw_rad: float = 0.0
+    lever_x_m: float = 0.0
+    lever_y_m: float = 0.0
+    lever_z_m: float = 0.0
+    fix_delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    inertial_delay_s: float = 0.0
+    sigma_fix_m: PositiveFloat | None = None
+    sigma_velocity_mps: PositiveFloat | None = None
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.9999986
+    gate_reopens_s: PositiveFloat | None = 1.0
+
+
+def read_inertial(stream: Stream) -> Floats:
+    """Specific force and turn rate (n, 6) of inertial samples."""
+    return np.hstack([stream["specific_force_mps2"], stream["turn_rate_radps"]])
+
+
+def mounted(sample: Components, parameters: Any) -> Components:
+    """What the unit measures, in the body's axes."""
+    roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
+    return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
+
+
+def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """The state after a step with the mean of both ends' samples."""
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    fx, fy, fz = mounted(control[:3], parameters)
+    wx, wy, wz = mounted(control[3:], parameters)
+    moved = strapdown(
+        (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
+        (fx - bx, fy - by, fz - bz),
+        (wx - gx, wy - gy, wz - gz),
+        duration_s,
+        (parameters.latitude_deg, parameters.height_m),
+    )
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz = moved
+    return px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz
+
+
+def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that white noise of the samples, and the walks of their biases, add."""
+    force = parameters.force_noise_density**2 * duration_s
+    rate = parameters.gyro_noise_density**2 * duration_s
+    gyro_bias = parameters.gyro_bias_density**2 * duration_s
+    force_bias = parameters.force_bias_density**2 * duration_s
+    placed, moved, turned = (0.0, 0.0, 0.0), (force, force, force), (rate, rate, rate)
+    gyro, accelerometer = (gyro_bias, gyro_bias, gyro_bias), (force_bias, force_bias, force_bias)
+    return placed + moved + turned + gyro + accelerometer
+
+
+def position(state: Components, about: Any, parameters: Any) -> Components:
+    """Where the end of the lever arm is."""
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    x, y, z = into_plane((qw, qx, qy, qz), lever)
+    return px + x, py + y, pz + z
+
+
+def velocity(state: Components, samples: Components, parameters: Any) -> Components:
+    """How fast the end of the lever arm moves, which turns with the body."""
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
+    wx, wy, wz = mounted(samples[3:], parameters)
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    x, y, z = into_plane((qw, qx, qy, qz), cross((wx - gx, wy - gy, wz - gz), lever))
+    return vx + x, vy + y, vz + z
+
+
+def fix_noise(parameters: Any) -> Components:
+    """The variances of a fix that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
+
+
+def velocity_noise(parameters: Any) -> Components:
+    """The variances of a velocity that does not state them."""
+    variance = parameters.sigma_velocity_mps**2
+    return variance, variance, variance
+
+
+UNIT = Control(
+    "inertial",
+    schemas.INERTIAL_SAMPLE,
+    tuple(f"force_{axis}_mps2" for axis in "xyz") + tuple(f"rate_{axis}_radps" for axis in "xyz"),
+    read_inertial,
+    interpolated=True,
+    delay="inertial_delay_s",
+)
+INERTIAL = Model(
+    "position, velocity and orientation from an inertial unit, and its biases",
+    NAVIGATION,
+    NavigationParameters,
+    (
+        Sensor(
+            "fix",
+            schemas.POSITION_FIX,
+            POSITION,
+            position,
+            fix_noise,
+            vector="position_m",
+            covariance="covariance_m2",
+            delay="fix_delay_s",
+        ),
+        Sensor(
+            "velocity",
+            schemas.VELOCITY_FIX,
+            VELOCITY,
+            velocity,
+            velocity_noise,
+            vector="velocity_mps",
+            covariance="covariance_m2ps2",
+            delay="velocity_delay_s",
+            control=UNIT,
+        ),
+    ),
+    Motion(move, move_noise),
+    control=UNIT,
+    estimable={**LEVER, **MOUNTING},
+)
