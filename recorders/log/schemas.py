@@ -199,7 +199,8 @@ SHOT_DETECTION = _declare(
 )
 POSITION_FIX = _declare(
     "PositionFix",
-    "A position in the log's Cartesian frame with its covariance, row-major.",
+    "A position in the log's Cartesian frame, of two or three numbers, with its covariance, row-major "
+    "or diagonal.",
     _vector("position_m"),
     _vector("covariance_m2", may_be_nan=True),
 )
@@ -211,7 +212,9 @@ VELOCITY_FIX = _declare(
 )
 GEODETIC_FIX = _declare(
     "GeodeticFix",
-    "A position on the WGS 84 ellipsoid; its covariance, row-major, in m^2 east, north, up.",
+    "A position on the WGS 84 ellipsoid; its covariance, row-major or diagonal, in m^2 east, north and "
+    "perhaps up. Channels of a log may state the origin of its plane: origin_latitude_deg, "
+    "origin_longitude_deg and origin_altitude_m above the ellipsoid.",
     _real("latitude_deg"),
     _real("longitude_deg"),
     _real("altitude_m", may_be_nan=True),
@@ -368,6 +371,12 @@ FAILURE = _declare(
 SKIPPED = _declare(
     "Skipped",
     "A measurement was not used; the channel's metadata lists the reasons by number, as JSON.",
+    _identifier("reason"),
+)
+STARTED = _declare(
+    "Started",
+    "The estimator assumed something that the log does not say, such as where to begin; the channel's "
+    "metadata lists what by number, as JSON.",
     _identifier("reason"),
 )
 REWOUND = _declare(

@@ -50,9 +50,10 @@ from replay.judging.truths import Truths
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP, MODES = schemas.BOUND_STEP.full_name, schemas.MODE_PROBABILITIES.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
+STARTED = schemas.STARTED.full_name
 COVERAGE = schemas.COVERAGE.full_name
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
-TOLD = ("failure", "skipped", "coverage")
+TOLD = ("failure", "skipped", "started", "coverage")
 # Less than this share of a span is said; a run's first measurements may well be before the prior.
 LEAST_SHARE = 0.995
 # A table has at most so many steps; of more, neighbours share a row.
@@ -95,12 +96,14 @@ class Told:
     failed: dict[int, str] = field(default_factory=dict)
     speaking: set[int] | None = None
     skipped: Counter[str] = field(default_factory=Counter)
+    started: Counter[str] = field(default_factory=Counter)
     covered: Sums = field(default_factory=dict)
 
     def merge(self, other: "Told") -> None:
         """Take in what was said of other runs."""
         self.failed |= other.failed
         self.skipped.update(other.skipped)
+        self.started.update(other.started)
         if other.speaking is not None:
             self.speaking = other.speaking | (self.speaking or set())
         self.covered = plus(self.covered, other.covered)
@@ -213,6 +216,8 @@ class Judge:
                 told.failed.setdefault(self._first_run + run, sentence)
         elif schema == SKIPPED:
             told.skipped.update(sentences_of(rows.stream))
+        elif schema == STARTED:
+            told.started.update(sentences_of(rows.stream))
         elif schema == COVERAGE:
             told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
 
@@ -290,8 +295,15 @@ class Judge:
 
     @property
     def losses(self) -> list[str]:
-        """A sentence for every case that was not estimated throughout, and for measurements not used."""
+        """A sentence for every case that was not estimated throughout, and for measurements not used.
+
+        Those for what was assumed, as of where to begin, come first.
+        """
         said = []
+        for topic, told in self._told.items():
+            for reason, count in told.started.items():
+                runs = f" (in {count} runs)" if count > 1 else ""
+                said.append(f"{_what(topic)}: {reason}{runs}")
         for topic, told in self._told.items():
             share = estimated_share(told.covered)
             if share is not None and share < LEAST_SHARE:
