@@ -18,8 +18,6 @@ from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
-# Of a run, those that an opening looks at.
-FIRST_MESSAGES = 1 << 12
 # The state of what can start in no run.
 _REFUSED = object()
 
@@ -122,7 +120,7 @@ def _open(bound: Bound, ensemble: Ensemble[Source], order: Clock, stamps: Clock)
         return Opened({}, [])
     topics = bound.opening.topics
     nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
-    first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
+    first = next(ensemble.blocks(topics, order, bound.opening.messages), nothing)
     with code_of(bound.name):
         return bound.opening.find(first, stamps)
 

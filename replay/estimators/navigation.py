@@ -13,11 +13,12 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, from_mounting, into_plane, strapdown
+from recorders.models.inertial import cross, into_plane, strapdown
 from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.tangent import Kind
-from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.estimators.alignment import AlignmentParameters, align, mounted
+from replay.inference.model import Control, Model, Motion, Sensor, Start
 
 POSITION: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "z_m": "linear"}
 VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear", "vz_mps": "linear"}
@@ -29,32 +30,23 @@ MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("ro
 NAVIGATION: Mapping[str, Kind] = {**POSITION, **VELOCITY, **ORIENTATION, **GYRO_BIAS, **FORCE_BIAS}
 
 
-class NavigationParameters(ModelParameters):
+class NavigationParameters(AlignmentParameters):
     """The inertial unit, how it is mounted, and where; None takes what the log's channels state.
 
     Noise densities are per square root of hertz, those of the biases' random walks per square root of a
-    second. The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about
-    left, of roll about forward. Biases are those of the turned axes. The lever arm is where fixes are
-    of, from the unit, in the body's axes. A message was measured its topic's delay before its stamp.
-    Latitude and height are those of the plane's origin.
+    second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
+    the body's axes. Gravity and the turn of the earth are those of the plane's origin.
     """
 
     force_noise_density: NonNegativeFloat | None = None
     gyro_noise_density: NonNegativeFloat | None = None
     force_bias_density: NonNegativeFloat | None = None
     gyro_bias_density: NonNegativeFloat | None = None
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    height_m: float = 0.0
-    mounting_roll_rad: float = 0.0
-    mounting_pitch_rad: float = 0.0
-    mounting_yaw_rad: float = 0.0
+    origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    origin_altitude_m: float | None = None
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     lever_z_m: float = 0.0
-    fix_delay_s: float = 0.0
-    velocity_delay_s: float = 0.0
-    inertial_delay_s: float = 0.0
-    sigma_fix_m: PositiveFloat | None = None
     sigma_velocity_mps: PositiveFloat | None = None
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.9999986
     gate_reopens_s: PositiveFloat | None = 1.0
@@ -63,12 +55,6 @@ class NavigationParameters(ModelParameters):
 def read_inertial(stream: Stream) -> Floats:
     """Specific force and turn rate (n, 6) of inertial samples."""
     return np.hstack([stream["specific_force_mps2"], stream["turn_rate_radps"]])
-
-
-def mounted(sample: Components, parameters: Any) -> Components:
-    """What the unit measures, in the body's axes."""
-    roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
-    return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
@@ -81,7 +67,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
         (fx - bx, fy - by, fz - bz),
         (wx - gx, wy - gy, wz - gz),
         duration_s,
-        (parameters.latitude_deg, parameters.height_m),
+        (parameters.origin_latitude_deg, parameters.origin_altitude_m),
     )
     px, py, pz, vx, vy, vz, qw, qx, qy, qz = moved
     return px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz
@@ -126,6 +112,15 @@ def velocity_noise(parameters: Any) -> Components:
     return variance, variance, variance
 
 
+# Of a log that was not made for this model: a small unit that is carried about, somewhere on earth.
+HANDHELD = {
+    "force_noise_density": 0.05,
+    "gyro_noise_density": 0.001,
+    "force_bias_density": 3e-4,
+    "gyro_bias_density": 2e-6,
+    "origin_latitude_deg": 45.0,
+    "origin_altitude_m": 0.0,
+}
 UNIT = Control(
     "inertial",
     schemas.INERTIAL_SAMPLE,
@@ -163,5 +158,6 @@ INERTIAL = Model(
     ),
     Motion(move, move_noise),
     control=UNIT,
+    start=Start({}, HANDHELD, align),
     estimable={**LEVER, **MOUNTING},
 )

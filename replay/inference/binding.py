@@ -136,7 +136,8 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     parts = {each.topic for each in model.all_sensors}
     parts |= {each.about.topic for each in model.all_sensors if each.about}
-    is_alone = model.start is not None and control is not None and not any(map(here.has, parts))
+    starts_alone = model.start is not None and model.start.align is None
+    is_alone = starts_alone and control is not None and not any(map(here.has, parts))
     if not sensors and model.needs_sensor and not is_alone:
         return None
     instead = tuple(

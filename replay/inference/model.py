@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, PositiveFloat
@@ -222,10 +222,23 @@ class Start:
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
         parameters: numbers that no channel of such a log states.
+        align: what finds the start of a run where that takes more than one message: (first messages by
+            the model's names for their topics, parameters) -> `Aligned`. Raises BadInput where they do
+            not tell. The sensors of such a model are needed.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
+    align: "Callable[[Mapping[str, Stream], Any], Aligned] | None" = None
+
+
+class Aligned(NamedTuple):
+    """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found, in words."""
+
+    time_ns: int
+    mean: Floats
+    covariance: Floats
+    how: str
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,15 +18,16 @@ from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Ragged, ragged_rows
 from replay.engine.estimator import Opened, Opening
 from replay.engine.failures import reason_stream
-from replay.engine.geodetic import origins_of
+from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
-from replay.inference.binding import Found, complaint_of
+from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
 from replay.inference.happenings import World, sensor_table
-from replay.inference.model import Sensor, Start
+from replay.inference.model import Aligned, Sensor, Start
 from replay.inference.steps import Stage
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
+ALIGNING = 1 << 16  # messages of a run that an alignment looks at: ten minutes at 100 Hz
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
 
 
@@ -54,7 +55,15 @@ class Beginning:
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         wanted = [*needs_origin, *(() if self.found.has_prior else self._starting)]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        return Opening(topics, self.find) if topics else None
+        if not topics:
+            return None
+        return Opening(topics, self.find, ALIGNING if self._aligns else Opening.messages)
+
+    @property
+    def _aligns(self) -> bool:
+        """Whether the start takes more than one message."""
+        start = self.stage.model.start
+        return not self.found.has_prior and start is not None and start.align is not None
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
@@ -69,7 +78,7 @@ class Beginning:
     @property
     def _starting(self) -> list[Topic]:
         """The topics whose first message is where to begin."""
-        if self._measuring:
+        if self._measuring and not self._aligns:
             return [topic for _, _, topic in self._measuring]
         control = [] if self.found.control is None else [self.found.control]
         return [*control, *(topic for _, topic in self.found.sensors)]
@@ -90,7 +99,10 @@ class Beginning:
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
             reasons.append((what, time_ns, has_one))
         if not self.found.has_prior:
-            prior, found = self._prior(first, clock, origins)
+            if self._aligns:
+                prior, found = self._aligned(first, origins)
+            else:
+                prior, found = self._prior(first, clock, origins)
             whole[self.found.prior.name] = prior
             reasons += found
         return Opened(whole, [*told, *self._told(reasons)])
@@ -130,7 +142,61 @@ class Beginning:
                 (f"{without} at the first message of {topic.name}", time_ns, chosen == number)
                 for number, _, topic in self._measuring
             ]
-        reasons += [
+        reasons += self._assumed(time_ns, begun)
+        covariance = (sigma**2)[:, :, None] * np.eye(sigma.shape[1])
+        stream = gaussian_stream(
+            self.found.prior.name, time_ns[begun], mean[begun], covariance[begun], named(model.state)
+        )
+        return Ragged(stream, np.append(0, np.cumsum(begun))), reasons
+
+    def _aligned(
+        self, first: Mapping[str, Ragged], origins: Floats | None
+    ) -> tuple[Ragged, list[tuple[str, Integers, Booleans]]]:
+        """The priors of all runs that an alignment finds, and what is to be told of them.
+
+        Raises BadInput where it finds none.
+        """
+        model, runs = self.stage.model, _runs(first)
+        assert model.start is not None
+        assert model.start.align is not None
+        assert model.control is not None
+        assert self.found.control is not None
+        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
+        given = {model.control.topic: first[self.found.control.name]}
+        for sensor, topic in self.found.sensors:
+            own = first[topic.name]
+            is_geodetic = topic in self.found.geodetic and origins is not None
+            given[sensor.topic] = in_plane(own, origins) if is_geodetic else own
+        starts: dict[int, Aligned] = {}
+        for run in range(runs):
+            try:
+                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+                starts[run] = model.start.align(streams, parameters)
+            except BadInput as error:
+                if run == runs - 1 and not starts:
+                    raise BadInput(f"estimator {self.name}: {error}") from error
+        time_ns, begun = np.zeros(runs, np.int64), np.zeros(runs, bool)
+        for run, start in starts.items():
+            time_ns[run], begun[run] = start.time_ns, True
+        without = f"the log has no prior ({self.found.prior.name}): it begins"
+        reasons = [
+            (
+                f"{without} {how}",
+                time_ns,
+                np.array([run in starts and starts[run].how == how for run in range(runs)]),
+            )
+            for how in dict.fromkeys(start.how for start in starts.values())
+        ]
+        reasons += self._assumed(time_ns, begun)
+        mean = np.array([start.mean for start in starts.values()])
+        covariance = np.array([start.covariance for start in starts.values()])
+        name, components = self.found.prior.name, named(model.state)
+        stream = gaussian_stream(name, time_ns[begun], mean, covariance, components)
+        return Ragged(stream, np.append(0, np.cumsum(begun))), reasons
+
+    def _assumed(self, time_ns: Integers, begun: Booleans) -> list[tuple[str, Integers, Booleans]]:
+        """What is to be told of the parameters that no channel states."""
+        return [
             (
                 f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it",
                 time_ns,
@@ -138,11 +204,6 @@ class Beginning:
             )
             for name, number in self.assumed.items()
         ]
-        covariance = (sigma**2)[:, :, None] * np.eye(sigma.shape[1])
-        stream = gaussian_stream(
-            self.found.prior.name, time_ns[begun], mean[begun], covariance[begun], named(model.state)
-        )
-        return Ragged(stream, np.append(0, np.cumsum(begun))), reasons
 
     def _narrow(
         self,

@@ -12,21 +12,22 @@ from recorders.log.run import RunMetadata
 from recorders.models.geodesy import into_tangent_plane
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
-from replay.estimators.alignment import AlignmentParameters, aligned
-from replay.estimators.navigation import NAVIGATION
 
 Floats = NDArray[np.float64]
 
-VELOCITY_LAG_S = 0.125
 # Its rows lie 1 ms before multiples of .25 s; moved there, `every_s` gives estimates at all of them.
 TO_WHOLE_NS = 10**6
-MOUNTING_RAD = (0.0, 0.0, 0.5 * np.pi)
-SETTINGS = {
+# The sheet's.
+SETTINGS: dict[str, float] = {
     "force_noise_density": 0.05,
     "gyro_noise_density": 0.001,
     "force_bias_density": 3e-4,
     "gyro_bias_density": 2e-6,
-    "mounting_yaw_rad": MOUNTING_RAD[2],
+    "mounting_yaw_rad": 0.5 * np.pi,
+    "velocity_delay_s": 0.125,
+    "tilt_sigma_rad": np.radians(3.0),
+    "heading_sigma_rad": np.radians(20.0),
+    "gyro_bias_sigma_radps": np.radians(0.2),
 }
 
 
@@ -94,8 +95,15 @@ def log_of(walk: Walk, withheld: NDArray[np.bool_] | None = None) -> MemorySourc
     if withheld is not None:
         used &= ~withheld
 
+    latitude, longitude, altitude = map(repr, walk.origin)
+    origin = {
+        "origin_latitude_deg": latitude,
+        "origin_longitude_deg": longitude,
+        "origin_altitude_m": altitude,
+    }
+
     def rows(topic: str, schema: schemas.Schema, **columns: Floats) -> Stream:
-        return make_stream(topic, schema, walk.time_ns[used], **columns)
+        return make_stream(topic, schema, walk.time_ns[used], metadata=origin, **columns)
 
     fix = rows(
         "/walk/fix",
@@ -109,27 +117,8 @@ def log_of(walk: Walk, withheld: NDArray[np.bool_] | None = None) -> MemorySourc
         velocity_mps=walk.velocity[used],
         covariance_m2ps2=_diagonal(walk.sigma_velocity[used]),
     )
-    start = aligned(walk.inertial, fix, velocity, MOUNTING_RAD, AlignmentParameters())
-    latitude = walk.origin[0]
-    prior = make_stream(
-        "/walk/prior",
-        schemas.GAUSSIAN_ESTIMATE,
-        [start.time_ns],
-        metadata={
-            "components": ",".join(NAVIGATION),
-            "kinds": ",".join(NAVIGATION.values()),
-            "latitude_deg": repr(latitude),
-        },
-        mean=start.mean[None],
-        covariance=start.covariance.reshape(1, -1),
-    )
     run = RunMetadata(scenario="walk", parameters={}, seed=0, run=0, epoch_ns=int(walk.time_ns[0]))
-    return memory_source(Recording([prior, walk.inertial, fix, velocity]), run)
-
-
-def settings_of(walk: Walk, **others: float) -> dict[str, float]:
-    """The sheet's settings, with the height of the origin."""
-    return {**SETTINGS, "height_m": walk.origin[2], "velocity_delay_s": VELOCITY_LAG_S, **others}
+    return memory_source(Recording([walk.inertial, fix, velocity]), run)
 
 
 def _diagonal(sigma: Floats) -> Floats:
