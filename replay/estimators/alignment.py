@@ -67,7 +67,7 @@ def mounted(sample: Any, parameters: Any) -> Any:
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
-    """Where to start from: the first fix, and velocity where there are any, within the unit's samples.
+    """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
 
     Args:
         streams: `inertial` samples, `fix`, positions in the plane (east, north, up), and perhaps
@@ -83,12 +83,9 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
     fix, moving = streams["fix"], streams.get("velocity")
     fix_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
     usable = (fix_ns >= begin_ns) & (fix_ns <= samples.time_ns[-1])
-    if moving is not None:
-        usable &= np.isin(fix.publish_time_ns, moving.publish_time_ns)
     if not usable.any():
-        told = f"{fix.topic} and {moving.topic}" if moving is not None else fix.topic
         raise BadInput(
-            f"no message of {told} within the span of {streams['inertial'].topic}; do their clocks "
+            f"no message of {fix.topic} within the span of {streams['inertial'].topic}; do their clocks "
             "agree? fix_delay_s and inertial_delay_s move them"
         )
     first = int(np.flatnonzero(usable)[0])
@@ -105,8 +102,9 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
         3,
     )
     sigma[8], heading, how = np.pi, 0.0, "levelled, its heading unknown"
-    if moving is not None:
-        row = int(np.searchsorted(moving.publish_time_ns, fix.publish_time_ns[first]))
+    if moving is not None and len(moving):
+        velocity_ns = moving.publish_time_ns - round(parameters.velocity_delay_s / _NS)
+        row = int(np.argmin(np.abs(velocity_ns - fix_ns[first])))
         mean[3:6], sigma[3:6] = moving["velocity_mps"][row], parameters.start_sigma_mps
         mean[10:13] = _bias(samples, moving, row, parameters)
         found = _heading(samples, int(fix_ns[first]), moving, row, tilt, mean[10:13], parameters)

@@ -15,19 +15,17 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from recorders.log import Stream, schemas
 from recorders.models.inertial import cross, into_plane, strapdown
 from recorders.models.planar import Components
+from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
+from replay.engine.components import components_of
 from replay.engine.tangent import Kind
 from replay.estimators.alignment import AlignmentParameters, align, mounted
 from replay.inference.model import Control, Model, Motion, Sensor, Start
 
-POSITION: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "z_m": "linear"}
-VELOCITY: Mapping[str, Kind] = {"vx_mps": "linear", "vy_mps": "linear", "vz_mps": "linear"}
-ORIENTATION: Mapping[str, Kind] = {f"orientation_{part}": "quaternion" for part in "wxyz"}
-GYRO_BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}
-FORCE_BIAS: Mapping[str, Kind] = {f"accelerometer_bias_{axis}_mps2": "linear" for axis in "xyz"}
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
-NAVIGATION: Mapping[str, Kind] = {**POSITION, **VELOCITY, **ORIENTATION, **GYRO_BIAS, **FORCE_BIAS}
+STATE = components_of(NAVIGATION)
+POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6])
 
 
 class NavigationParameters(AlignmentParameters):
@@ -131,7 +129,7 @@ UNIT = Control(
 )
 INERTIAL = Model(
     "position, velocity and orientation from an inertial unit, and its biases",
-    NAVIGATION,
+    STATE,
     NavigationParameters,
     (
         Sensor(

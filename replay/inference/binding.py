@@ -212,9 +212,10 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
     return parts
 
 
-def names_state(prior: Topic, model: Model) -> bool:
-    """Whether a prior's channel names all components of a model's state."""
-    return set(model.state) <= set(prior.metadata.get("components", "").split(","))
+def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
+    """Whether a prior's channel names all components of a model's state, and no others if `exactly`."""
+    named = set(prior.metadata.get("components", "").split(","))
+    return named == set(model.state) if exactly else named >= set(model.state)
 
 
 @cache

@@ -183,13 +183,14 @@ def _bind_fitting(
         for name, model in models.items()
     }
     fitting = [name for name in models if found[name]]
-    if len(fitting) > 1:  # then the prior's components tell
-        named_alike = [
-            name
-            for name in fitting
-            if any(names_state(each.prior, models[name]) for each in found[name])
-        ]
-        fitting = named_alike or fitting
+    for exactly in (False, True):  # the prior's components tell
+        if len(fitting) > 1:
+            named_alike = [
+                name
+                for name in fitting
+                if any(names_state(each.prior, models[name], exactly=exactly) for each in found[name])
+            ]
+            fitting = named_alike or fitting
     if len(fitting) > 1:
         raise BadInput(
             f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"

@@ -165,8 +165,9 @@ class Beginning:
         given = {model.control.topic: first[self.found.control.name]}
         for sensor, topic in self.found.sensors:
             own = first[topic.name]
-            is_geodetic = topic in self.found.geodetic and origins is not None
-            given[sensor.topic] = in_plane(own, origins) if is_geodetic else own
+            if origins is not None and topic in self.found.geodetic:
+                own = in_plane(own, origins)
+            given[sensor.topic] = own
         starts: dict[int, Aligned] = {}
         for run in range(runs):
             try:

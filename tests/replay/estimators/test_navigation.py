@@ -11,8 +11,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
+from recorders.recording import record_run
+from replay.engine.sources import memory_source
+from replay.engine.tangent import difference
 from replay.estimators.alignment import align
 from replay.estimators.navigation import INERTIAL, NavigationParameters
 from replay.inference.checking import check_model
@@ -231,3 +235,28 @@ def test_outages_are_bridged_as_the_sheet_says(
 def test_ignoring_the_lag_of_the_velocity_costs_half_of_what_the_smoother_gains(outages: Any):
     ignored = over(outages(15, velocity_delay_s=0.0)["smoother"])
     assert ignored == pytest.approx(0.216, rel=0.15)
+
+
+# --- simulated runs --------------------------------------------------------------------------------
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("method", ["ekf", "smoother"])
+def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
+    """From 8 s on, when they move, the mean NEES of 40 drives is in its 95 % interval nearly always."""
+    runs = 40
+    sources = [
+        memory_source(*record_run("navigation", {"duration_s": 40.0}, 1, run)) for run in range(runs)
+    ]
+    states = outputs(INERTIAL, method, sources)["state"]
+    nees = []
+    for run, source in enumerate(sources):
+        truth, own = source.read(["/body/truth"])["/body/truth"], states.of_run(run)
+        row = np.searchsorted(truth.publish_time_ns, own.publish_time_ns)
+        error = difference(own["mean"], truth["state"][row], INERTIAL.kinds)
+        covariance = own["covariance"].reshape(-1, 15, 15)
+        nees.append(np.sum(error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0], axis=1))
+    low, high = chi2.ppf([0.025, 0.975], 15 * runs) / runs
+    mean = np.mean(nees, axis=0)[40:]
+    assert np.mean((mean > low) & (mean < high)) > 0.9
+    assert mean.mean() == pytest.approx(15.0, abs=1.0)
