@@ -17,6 +17,8 @@ from recorders.models.inertial import from_mounting, product, rotation
 from replay.engine.arrays import Floats, Integers
 from replay.inference.model import Aligned, ModelParameters
 
+STANDARD_GRAVITY_MPS2 = 9.80665
+LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 _NS = 1e-9
 
 
@@ -74,7 +76,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
             `velocity`, velocities there.
         parameters: `AlignmentParameters`.
 
-    Raises BadInput where there is no such fix, or no specific force to level by.
+    Raises BadInput where there is no such fix, no gravity to level by, or numbers of another unit.
     """
     samples = _samples(streams["inertial"], parameters)
     begin_ns = samples.time_ns[0]
@@ -89,7 +91,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
             "agree? fix_delay_s and inertial_delay_s move them"
         )
     first = int(np.flatnonzero(usable)[0])
-    tilt = _tilt(samples, parameters)
+    tilt = _tilt(samples, streams["inertial"].topic, parameters)
     mean = np.concatenate([fix["position_m"][first], np.zeros(3), [1.0, 0.0, 0.0, 0.0], np.zeros(6)])
     sigma = np.repeat(
         [
@@ -106,7 +108,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
         velocity_ns = moving.publish_time_ns - round(parameters.velocity_delay_s / _NS)
         row = int(np.argmin(np.abs(velocity_ns - fix_ns[first])))
         mean[3:6], sigma[3:6] = moving["velocity_mps"][row], parameters.start_sigma_mps
-        mean[10:13] = _bias(samples, moving, row, parameters)
+        mean[10:13] = _bias(samples, streams["inertial"].topic, moving, row, parameters)
         found = _heading(samples, int(fix_ns[first]), moving, row, tilt, mean[10:13], parameters)
         if found is not None:
             sigma[8], heading, how = (
@@ -135,10 +137,25 @@ def _samples(inertial: Stream, parameters: Any) -> _Samples:
     return _Samples(time_ns, force, rate)
 
 
-def _tilt(samples: _Samples, parameters: Any) -> tuple[float, float]:
-    """Roll and pitch, rad, under which the mean of the first specific forces points up."""
+def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]:
+    """Roll and pitch, rad, under which the mean of the first specific forces points up.
+
+    Raises BadInput where that is not gravity in m/s2, or points down.
+    """
     until_ns = samples.time_ns[0] + round(parameters.level_s / _NS)
     x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
+    length = float(np.sqrt(x * x + y * y + z * z))
+    if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
+        in_g = "; it looks like g: import it with that unit" if 0.8 < length < 1.25 else ""
+        raise BadInput(
+            f"topic {topic}: the specific force of the first {parameters.level_s:g} s is {length:.3g}, "
+            f"where gravity is 9.8 m/s2{in_g}"
+        )
+    if z < -0.5 * length:
+        raise BadInput(
+            f"topic {topic}: the specific force of the first {parameters.level_s:g} s points down "
+            f"(z = {z:.3g} m/s2): is the unit mounted upside down? mounting_roll_rad=3.14159 turns it"
+        )
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
 
@@ -149,13 +166,23 @@ def _first_above(moving: Stream, row: int, limit_mps: float) -> int | None:
     return row + int(faster[0]) if len(faster) else None
 
 
-def _bias(samples: _Samples, moving: Stream, row: int, parameters: Any) -> Floats:
-    """The mean turn rate (3,) at rest; zeros where there was none."""
+def _bias(samples: _Samples, topic: str, moving: Stream, row: int, parameters: Any) -> Floats:
+    """The mean turn rate (3,) at rest; zeros where there was none.
+
+    Raises BadInput where it is more than a gyro errs.
+    """
     moved = _first_above(moving, row, parameters.still_mps)
     end_ns = samples.time_ns[-1] if moved is None else moving.publish_time_ns[moved]
     margin_s = parameters.rest_margin_s + parameters.velocity_delay_s
     at_rest = samples.time_ns < end_ns - round(margin_s / _NS)
-    return samples.rate[at_rest].mean(axis=0) if at_rest.any() else np.zeros(3)
+    bias = samples.rate[at_rest].mean(axis=0) if at_rest.any() else np.zeros(3)
+    largest = float(np.abs(bias).max())
+    if largest > LARGEST_BIAS_RADPS:
+        raise BadInput(
+            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than any gyro errs; it looks "
+            "like deg/s: import it with that unit"
+        )
+    return bias
 
 
 def _heading(

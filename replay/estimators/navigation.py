@@ -33,7 +33,8 @@ class NavigationParameters(AlignmentParameters):
 
     Noise densities are per square root of hertz, those of the biases' random walks per square root of a
     second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
-    the body's axes. Gravity and the turn of the earth are those of the plane's origin.
+    the body's axes. Gravity and the turn of the earth are those of the plane's origin. Where the unit is
+    silent for longer than `inertial_gap_s`, all is unknown.
     """
 
     force_noise_density: NonNegativeFloat | None = None
@@ -42,6 +43,7 @@ class NavigationParameters(AlignmentParameters):
     gyro_bias_density: NonNegativeFloat | None = None
     origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     origin_altitude_m: float | None = None
+    inertial_gap_s: PositiveFloat = 1.0
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     lever_z_m: float = 0.0
@@ -125,6 +127,7 @@ UNIT = Control(
     tuple(f"force_{axis}_mps2" for axis in "xyz") + tuple(f"rate_{axis}_radps" for axis in "xyz"),
     read_inertial,
     interpolated=True,
+    gap="inertial_gap_s",
     delay="inertial_delay_s",
 )
 INERTIAL = Model(

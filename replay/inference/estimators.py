@@ -440,18 +440,22 @@ class Filter:
             happenings = joined(state.waiting, happenings)
         control = self.stage.model.control
         if control is not None and control.interpolated:
-            happenings, waiting = interpolated(happenings, len(control.components))
+            happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
             happenings = with_control(self.stage, happenings)
         state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
         return self.follow(state, happenings)
 
     def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""
-        if not any(sensor.covariance for sensor in self.stage.sensors):
+        control = self.stage.model.control
+        drops_controls = control is not None and control.interpolated
+        if not drops_controls and not any(sensor.covariance for sensor in self.stage.sensors):
             return []
         sensors = {topic.name: sensor for sensor, topic in self.found.sensors}
         reasons = [
-            complaint_of(self.stage.model, sensors[topic], topic) if topic in sensors else ""
+            complaint_of(self.stage.model, sensors[topic], topic)
+            if topic in sensors
+            else f"topic {topic}: it is not finite"
             for topic in block.streams
         ]
         events = block.events
@@ -476,9 +480,18 @@ class Filter:
             state, made = self.through(state, no_more, is_end=True)
         if state.waiting is None:
             return state, made
-        tail = with_control(self.stage, held(state.waiting, self.initial))
+        tail = with_control(self.stage, held(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
+
+    @property
+    def gap_ns(self) -> float:
+        """How long an interpolated control may be silent."""
+        control = self.stage.model.control
+        if control is None or not control.gap:
+            return np.inf
+        names = number_fields(self.stage.model.parameters)
+        return 1e9 * float(self.settings[0, names.index(control.gap)])
 
     @cached_property
     def delays_ns(self) -> Integers:

@@ -168,7 +168,10 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
+    lacking = np.zeros(count, bool)
+    if control.interpolated:  # one that is not finite is as if it had not come
+        lacking |= ~np.isfinite(read).all(axis=1)
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), lacking)
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settings: Floats) -> Table:
@@ -279,10 +282,13 @@ def of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
     return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
 
 
-def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Happenings]:
+def interpolated(
+    happenings: Happenings, controls: int, gap_ns: float = np.inf
+) -> tuple[Happenings, Happenings]:
     """Events with the control at their stamps, linear between messages; and those still to wait.
 
-    What comes after a run's last control message waits for the next, with that message before it.
+    What comes after a run's last control message waits for the next, with that message before it. From
+    one message that comes more than a gap before the next, up to that, the control is NaN.
     """
     data, is_control = happenings.data.copy(), happenings.source == CONTROL
     ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
@@ -297,6 +303,8 @@ def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Hap
         )
         for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
+        for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
+            data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
         ready[inside], waiting[begin : at[-1]] = True, False
     again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
     return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
@@ -313,8 +321,8 @@ def with_control(stage: Stage, happenings: Happenings) -> Happenings:
     return happenings._replace(data=data)
 
 
-def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
-    """Events that wait for a control message that does not come: the last one holds.
+def held(happenings: Happenings, initial: Sequence[float], gap_ns: float = np.inf) -> Happenings:
+    """Events that wait for a control message that does not come: the last one holds, for up to a gap.
 
     `initial` holds in a run in which there was none.
     """
@@ -324,6 +332,8 @@ def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
             is_control = happenings.source[begin] == CONTROL
             control = data[begin, -len(initial) :].copy() if is_control else initial
             data[begin:end, -len(initial) :] = control
+            late = happenings.time_ns[begin:end] - happenings.time_ns[begin] > gap_ns
+            data[begin:end][late & is_control, -len(initial) :] = np.nan
     return happenings._replace(data=data)
 
 

@@ -80,6 +80,8 @@ class Control:
         interpolated: the control is linear between two messages, and the motion over a step gets the
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
+        gap: the parameter that says how long, in s, an interpolated control may be silent: what is
+            estimated ends there.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
         instead: other topics that the components of these names are taken from where the log has them,
@@ -92,6 +94,7 @@ class Control:
     read: Callable[[Stream], Floats] | None = None
     interpolated: bool = False
     initial: tuple[float, ...] = ()
+    gap: str = ""
     delay: str = ""
     estimates: bool = False
     instead: tuple["Control", ...] = ()

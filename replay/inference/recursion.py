@@ -18,6 +18,7 @@ from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
 from replay.inference.model import Model
 from replay.inference.steps import (
+    NOT_DRIVEN,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -139,6 +140,7 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
+    has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: Carried) -> None:
@@ -180,6 +182,8 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         source, data = happenings.source[event], happenings.data[event]
         duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
+            if has_gaps and np.isnan(data[len(data) - 1]):
+                return NOT_DRIVEN
             carried.time_ns[run] = happenings.time_ns[event]
             if not advance(run, event, duration_s, happenings, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE

@@ -43,8 +43,10 @@ FAILURES = (
     "the estimate is no longer finite",
     "no particle explains what was measured",
     "the truth is not known here",
+    "what drives the motion is silent for too long",
 )
-NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH = 0, 1, 2, 3  # indices of FAILURES
+# indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 

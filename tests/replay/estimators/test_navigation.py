@@ -2,6 +2,7 @@
 
 import tarfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from recorders.errors import BadInput
+from recorders.log import Stream
 from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
 from recorders.models.planar import wrap_angle
 from recorders.recording import record_run
@@ -75,6 +78,69 @@ def test_a_body_on_a_circle_stays_on_it():
 
 def test_the_model_is_what_it_says():
     check_model(INERTIAL, {"origin_latitude_deg": 40.0})
+
+
+# --- where it starts -------------------------------------------------------------------------------
+
+
+def simulated(**values: Any) -> dict[str, Stream]:
+    """What an alignment is given of a simulated drive, by the model's names for the topics."""
+    recording, _ = record_run("navigation", {"duration_s": 12.0, **values}, seed=2)
+    return {stream.topic.removeprefix("/body/"): stream for stream in recording.streams}
+
+
+def changed(streams: dict[str, Stream], topic: str, **columns: Any) -> dict[str, Stream]:
+    """The streams with other columns of a topic."""
+    stream = streams[topic]
+    return {**streams, topic: replace(stream, columns={**stream.columns, **columns})}
+
+
+@pytest.mark.parametrize("carrier", ["vehicle", "pedestrian"])
+def test_a_start_is_as_near_to_the_truth_as_it_says(carrier: str):
+    """A person turns away from the course, so that the heading's is another matter."""
+    streams = simulated(carrier=carrier)
+    start = align(streams, NavigationParameters(start_sigma_m=1.0, force_bias_sigma_mps2=0.1))
+    truth = streams["truth"]
+    [row] = np.flatnonzero(truth.publish_time_ns == start.time_ns)
+    error = difference(start.mean[None], truth["state"][row : row + 1], INERTIAL.kinds)[0]
+    sigma = np.sqrt(np.diag(start.covariance))
+    if carrier == "pedestrian":
+        error[8] = 0.0
+    assert np.abs(error / sigma).max() < 4.0
+    assert np.abs(error[9:12]).max() < 0.001  # of a bias of .003 rad/s, from 4 s of rest
+    assert start.how == "levelled, its heading the course"
+
+
+def test_without_velocities_the_heading_is_unknown():
+    streams = simulated(gnss={"velocity_rate_hz": 0.0})
+    start = align(streams, NavigationParameters())
+    assert start.how == "levelled, its heading unknown"
+    assert start.covariance[8, 8] == np.pi**2
+    assert start.covariance[3, 3] == 100.0
+
+
+def test_numbers_of_other_units_and_clocks_are_told():
+    streams = simulated()
+    force, rate = (streams["inertial"][name] for name in ("specific_force_mps2", "turn_rate_radps"))
+    for columns, told in (
+        (
+            {"specific_force_mps2": force / 9.80665},
+            "specific force of the first 1 s is 0.98.*, .* looks like g",
+        ),
+        ({"specific_force_mps2": 3.0 * force}, "is 2.*, where gravity is 9.8 m/s2$"),
+        ({"specific_force_mps2": -force}, "points down .* mounting_roll_rad=3.14159"),
+        ({"turn_rate_radps": np.degrees(rate)}, "at rest it turns by .* looks like deg/s"),
+    ):
+        with pytest.raises(BadInput, match=f"topic /body/inertial: .*{told}"):
+            align(changed(streams, "inertial", **columns), NavigationParameters())
+    upside_down = changed(
+        streams, "inertial", specific_force_mps2=force * [1, -1, -1], turn_rate_radps=rate * [1, -1, -1]
+    )
+    right = align(streams, NavigationParameters())
+    turned = align(upside_down, NavigationParameters(mounting_roll_rad=np.pi))
+    assert_allclose(turned.mean, right.mean, atol=1e-9)
+    with pytest.raises(BadInput, match=r"no message of /body/fix within the span .* clocks agree"):
+        align(streams, NavigationParameters(fix_delay_s=3600.0))
 
 
 # --- the walk, section 2 of the sheet --------------------------------------------------------------

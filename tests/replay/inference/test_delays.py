@@ -1,5 +1,6 @@
 """What a log's stamps do not say: measurements that were older, gates that have to open again."""
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +29,7 @@ class TrolleyParameters(ModelParameters):
     fix_delay_s: float = 0.0
     unit_delay_s: float = 0.0
     give_s2: float = 0.0
+    unit_gap_s: float = 1.0
 
 
 def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
@@ -53,6 +55,7 @@ UNIT = Control(
     ("ax_mps2",),
     lambda stream: stream["value"],
     interpolated=True,
+    gap="unit_gap_s",
     delay="unit_delay_s",
 )
 TROLLEY = Model(
@@ -77,10 +80,15 @@ TROLLEY = Model(
 
 
 def trolley(
-    fix_late_s: float = 0.0, unit_late_s: float = 0.0, jump_s: float = np.inf, give_s2: float = 0.0
+    fix_late_s: float = 0.0,
+    unit_late_s: float = 0.0,
+    jump_s: float = np.inf,
+    give_s2: float = 0.0,
+    silent_s: tuple[float, float] = (np.inf, np.inf),
 ) -> MemorySource:
-    """Five seconds of it, with stamps that are late, and a jump of a kilometre at a time."""
+    """Five seconds of it: late stamps, a jump of a kilometre at a time, a unit that is silent."""
     unit_s, fix_s = np.arange(0.0, 5.0, 0.1), np.arange(0.25, 4.8, 0.25)
+    unit_s = unit_s[(unit_s <= silent_s[0]) | (unit_s >= silent_s[1])]
     push, place = np.sin(unit_s), fix_s - np.sin(fix_s) + 1000.0 * (fix_s > jump_s)
 
     def vectors(topic: str, times_s: Any, values: Any) -> Any:
@@ -154,3 +162,36 @@ def test_a_gate_opens_again_after_a_time():
     kept_out = (opened.stream.publish_time_ns - EPOCH_NS)[opened["accepted"] == 0] * 1e-9
     assert kept_out[:4] == pytest.approx([2.25, 2.5, 2.75, 3.0])
     assert opened["accepted"][12] == 1
+
+
+@pytest.mark.parametrize("block_messages", [1 << 18, 5])
+@pytest.mark.parametrize("end_s", [3.5, 100.0])
+def test_where_the_control_is_silent_for_too_long_all_is_unknown(block_messages: int, end_s: float):
+    """In a gap, and where it ends for good."""
+    log = trolley(silent_s=(2.0, end_s))
+    found = outputs(TROLLEY, "ekf", [log], block_messages)
+    last_ns = found["state"].stream.publish_time_ns[-1] - EPOCH_NS
+    assert last_ns <= (2.0 if end_s == 3.5 else 3.0) * 1e9
+    [failed] = found["failure"].stream["reason"]
+    reasons = json.loads(found["failure"].stream.metadata["reasons"])
+    assert reasons[failed] == "what drives the motion is silent for too long"
+    allowed = outputs(TROLLEY, "ekf", [log], block_messages, unit_gap_s=5.0)
+    assert len(allowed["failure"].stream) == 0
+    assert allowed["state"].stream.publish_time_ns[-1] - EPOCH_NS == 4.75e9
+
+
+def test_a_sample_that_is_not_finite_is_as_if_it_had_not_come_and_counted():
+    whole = trolley()
+    streams = whole.read(list(whole.topics))
+    value = streams["/unit"]["value"].copy()
+    value[[7, 20]] = np.nan
+    columns = {**streams["/unit"].columns, "value": value}
+    holed = [*(each for each in streams.values() if each.topic != "/unit")]
+    holed.append(replace(streams["/unit"], columns=columns))
+    run = RunMetadata(scenario="trolley", parameters={}, seed=0, run=0, epoch_ns=EPOCH_NS)
+    found = outputs(TROLLEY, "ekf", [memory_source(Recording(holed), run)])
+    assert len(found["failure"].stream) == 0
+    assert np.abs(found["innovation"]["innovation"]).max() < 0.02
+    skipped = found["skipped"].stream
+    assert len(skipped) == 2
+    assert "topic /unit: it is not finite" in skipped.metadata["reasons"]
