@@ -83,6 +83,7 @@ from replay.inference.model import Model as Model
 from replay.inference.model import ModelParameters as ModelParameters
 from replay.inference.model import Motion as Motion
 from replay.inference.model import Sensor as Sensor
+from replay.inference.model import Start as Start
 from replay.inference.model import Switching as Switching
 from replay.judging.evaluation import Errors as Errors
 from replay.judging.evaluation import Innovations as Innovations

@@ -35,13 +35,11 @@ class Opening:
 
     Attributes:
         topics: those whose first messages it is handed.
-        messages: about how many of a run.
         find: what there is to start from; by the clock by which the replay stamps estimates.
     """
 
     topics: tuple[str, ...]
     find: Callable[[Mapping[str, Ragged], Clock], Opened]
-    messages: int = 1 << 12
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.models.inertial import from_mounting, product, rotation
 from replay.engine.arrays import Floats, Integers
-from replay.inference.model import Aligned, ModelParameters
+from replay.inference.model import ModelParameters, Started
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
@@ -68,7 +68,7 @@ def mounted(sample: Any, parameters: Any) -> Any:
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
-def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
+def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
 
     Args:
@@ -119,7 +119,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Aligned:
     roll, pitch = tilt
     tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
-    return Aligned(int(fix_ns[first]), mean, np.diag(sigma**2), how)
+    return Started(int(fix_ns[first]), mean, np.diag(sigma**2), how)
 
 
 def _samples(inertial: Stream, parameters: Any) -> _Samples:

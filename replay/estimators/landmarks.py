@@ -145,11 +145,44 @@ def read_heading_covariance(stream: Stream) -> Floats:
     return np.full((len(stream), 1, 1), stated[-1])
 
 
+def align(
+    path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
+) -> tuple[Floats, Floats] | None:
+    """The pose at the last of some fixes: the path, turned and shifted to them by least squares.
+
+    To the covariance of the solution is added what the odometry errs by: the mean of a random walk over
+    a span, seen from its end, has a third of the variance that it has grown to. None while the heading
+    is less sure than `COURSE_SIGMA_RAD`. See `model.Start`.
+    """
+    weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
+    middle, centre = (np.average(each, axis=0, weights=weight) for each in (path[:, :2], places))
+    a, b = path[:, :2] - middle, places - centre
+    across, along = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)
+    turn = np.arctan2(weight @ across, weight @ along)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    turned = a @ rotation.T
+    arms = turned - turned[-1]
+    rows = np.zeros((len(path), 2, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[:, 0, 2], rows[:, 1, 2] = -arms[:, 1], arms[:, 0]
+    information = np.einsum("kia,kij,kjb->ab", rows, np.linalg.inv(covariances), rows)
+    if np.linalg.matrix_rank(information) < 3:
+        return None
+    covariance = np.linalg.inv(information)
+    densities = parameters.forward_noise_density, parameters.turn_noise_density
+    forward, turning = (density**2 * span_s / 3.0 for density in densities)
+    covariance += np.diag([forward, forward, turning])
+    if covariance[2, 2] > COURSE_SIGMA_RAD**2:
+        return None
+    return np.array([*(centre + turned[-1]), path[-1, 2] + turn]), covariance
+
+
 def read_turn_rate(stream: Stream) -> Floats:
     """Turn rates about the vertical (n, 1) of a gyro that is mounted upright."""
     return stream["turn_rate_radps"][:, 2:]
 
 
+COURSE_SIGMA_RAD = 0.1  # of a heading that is good enough to linearise at
 PLANAR = [0, 1, 5]  # x, y and the turn about z among the six of a pose
 RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
@@ -168,6 +201,7 @@ ODOMETRY = Control(
 START = Start(
     {"x_m": 1000.0, "y_m": 1000.0, "heading_rad": np.pi / np.sqrt(3.0)},
     {"forward_noise_density": 0.05, "turn_noise_density": 0.05},
+    align,
 )
 ROBOT = Model(
     "robot pose from odometry, mapped landmarks, fixes and poses",

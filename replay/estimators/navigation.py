@@ -159,6 +159,6 @@ INERTIAL = Model(
     ),
     Motion(move, move_noise),
     control=UNIT,
-    start=Start({}, HANDHELD, align),
+    start=Start({}, HANDHELD, find=align),
     estimable={**LEVER, **MOUNTING},
 )

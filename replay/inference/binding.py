@@ -15,6 +15,7 @@ from recorders.log import Schema, Topic, schemas
 from replay.engine.arrays import Floats, Function
 from replay.engine.channels import resolved, stated
 from replay.engine.geodetic import GEODETIC
+from replay.engine.results import named
 from replay.inference.generate import function_of
 from replay.inference.model import (
     Control,
@@ -123,7 +124,7 @@ def _found(model: Model, here: _Here) -> Found | None:
         return None
     if prior is None:
         name = schemas.GAUSSIAN_ESTIMATE.full_name
-        prior = Topic(here.place(model.prior), name, "protobuf", (), {}, 0)
+        prior = Topic(here.place(model.prior), name, "protobuf", (), named(model.state), 0)
     control = here.topic(model.control.topic, model.control.schema) if model.control else None
     if model.control is not None and control is None:
         return None
@@ -136,7 +137,7 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     parts = {each.topic for each in model.all_sensors}
     parts |= {each.about.topic for each in model.all_sensors if each.about}
-    starts_alone = model.start is not None and model.start.align is None
+    starts_alone = model.start is not None and model.start.find is None
     is_alone = starts_alone and control is not None and not any(map(here.has, parts))
     if not sensors and model.needs_sensor and not is_alone:
         return None
@@ -150,8 +151,13 @@ def _found(model: Model, here: _Here) -> Found | None:
 
 
 def needs_of(model: Model) -> str:
-    """What a log has to have for a model, in words."""
-    return "; ".join(part.words for part in parts_of(model, _Here({}, "...", {})))
+    """What a log has to have for a model, in words; of one that can start without, what it may have."""
+    words = [part.words for part in parts_of(model, _Here({}, "...", {}))]
+    if model.start is None or model.control is None or not model.needs_sensor:
+        return "; ".join(words)
+    control, *maps, sensors = words
+    of_maps = [f"those about a map need {each}" for each in maps]
+    return "; ".join([control, sensors.replace("one of", "any of", 1), *of_maps])
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
@@ -201,7 +207,8 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
         parts.append(Part(f"{words} of {', '.join(model.state)}", is_here))
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
-    maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
+    seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
+    maps = {sensor.about.topic: sensor.about for sensor in seeing if sensor.about}
     parts += [part(topic, each.schema) for topic, each in maps.items()]
     sensors = [part(each.topic, each.schema, model.system) for each in model.all_sensors]
     if sensors and model.needs_sensor:

@@ -225,17 +225,23 @@ class Start:
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
         parameters: numbers that no channel of such a log states.
-        align: what finds the start of a run where that takes more than one message: (first messages by
-            the model's names for their topics, parameters) -> `Aligned`. Raises BadInput where they do
-            not tell. The sensors of such a model are needed.
+        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
+            None where these do not tell it yet. The path (k, n) is where the control alone leads from
+            zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
+            The state is that at the last of them, and begins just after it: they are used up. For a
+            state of which a position tells too little.
+        find: (first messages of a run by the model's names for their topics, parameters) -> `Started`,
+            in place of all that; for a state that is found from several sensors together. Raises
+            BadInput where they do not tell it. Such a model needs a sensor.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
-    align: "Callable[[Mapping[str, Stream], Any], Aligned] | None" = None
+    align: Callable[..., tuple[Floats, Floats] | None] | None = None
+    find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
 
 
-class Aligned(NamedTuple):
+class Started(NamedTuple):
     """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found, in words."""
 
     time_ns: int

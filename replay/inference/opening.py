@@ -8,26 +8,27 @@ a plane that no channel states is the first geodetic fix. All of it is told, on 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Topic, make_stream, schemas
+from recorders.log import Clock, Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.blocks import Ragged, ragged_rows
+from replay.engine.blocks import Block, Ragged, merge_events
 from replay.engine.estimator import Opened, Opening
 from replay.engine.failures import reason_stream
 from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
 from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
-from replay.inference.happenings import World, sensor_table
-from replay.inference.model import Aligned, Sensor, Start
+from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
+from replay.inference.model import Sensor, Start
+from replay.inference.recursion import CONTROL, Happenings
 from replay.inference.steps import Stage
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
-ALIGNING = 1 << 16  # messages of a run that an alignment looks at: ten minutes at 100 Hz
+FOREVER_NS = np.iinfo(np.int64).max
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
 
 
@@ -55,15 +56,7 @@ class Beginning:
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         wanted = [*needs_origin, *(() if self.found.has_prior else self._starting)]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        if not topics:
-            return None
-        return Opening(topics, self.find, ALIGNING if self._aligns else Opening.messages)
-
-    @property
-    def _aligns(self) -> bool:
-        """Whether the start takes more than one message."""
-        start = self.stage.model.start
-        return not self.found.has_prior and start is not None and start.align is not None
+        return Opening(topics, self.find) if topics else None
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
@@ -78,158 +71,224 @@ class Beginning:
     @property
     def _starting(self) -> list[Topic]:
         """The topics whose first message is where to begin."""
-        if self._measuring and not self._aligns:
-            return [topic for _, _, topic in self._measuring]
         control = [] if self.found.control is None else [self.found.control]
-        return [*control, *(topic for _, topic in self.found.sensors)]
+        drives = [*control, *(topic for _, topic in self.found.instead)]
+        if self._measuring and not self._finds:
+            return [*(drives if self._aligns else []), *(topic for _, _, topic in self._measuring)]
+        return [*drives, *(topic for _, topic in self.found.sensors)]
+
+    @property
+    def _finds(self) -> bool:
+        """Whether the model finds the state from several sensors together."""
+        start = self.stage.model.start
+        return start is not None and start.find is not None
+
+    @property
+    def _aligns(self) -> bool:
+        """Whether fixes alone have to tell the whole state, and can."""
+        model = self.stage.model
+        sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
+        return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
     def find(self, first: Mapping[str, Ragged], clock: Clock) -> Opened:
         """What is found in the first messages; raises BadInput where none of them can be used."""
         whole: dict[str, Ragged] = {}
         told: list[Ragged] = []
-        reasons: list[tuple[str, Integers, Booleans]] = []
+        facts: list[_Fact] = []
         origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
-            origins, has_one = origins_of(fixes), np.diff(fixes.offsets) > 0
-            whole[topic.name] = _first_rows(fixes)
+            time_ns, has_one, rows = _first_of(fixes, clock, None)
+            whole[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            origins = origins_of(whole[topic.name])
             told.append(self._told_origin(whole[topic.name]))
-            time_ns = np.zeros(len(has_one), np.int64)
-            time_ns[has_one] = whole[topic.name].stream.times(clock)
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
-            reasons.append((what, time_ns, has_one))
+            facts.append(_Fact(what, time_ns, has_one))
         if not self.found.has_prior:
-            if self._aligns:
-                prior, found = self._aligned(first, origins)
-            else:
-                prior, found = self._prior(first, clock, origins)
+            prior, found = self._prior(first, clock, origins)
             whole[self.found.prior.name] = prior
-            reasons += found
-        return Opened(whole, [*told, *self._told(reasons)])
+            facts += found
+        return Opened(whole, [*told, *self._told(facts)])
 
     def _prior(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None
-    ) -> tuple[Ragged, list[tuple[str, Integers, Booleans]]]:
+    ) -> tuple[Ragged, list["_Fact"]]:
         """The priors of all runs, and what is to be told of them."""
         model, runs = self.stage.model, _runs(first)
-        start = model.start
-        assert start is not None
-        mean, sigma = _anywhere(model.state, start)
-        mean, sigma = np.tile(mean, (runs, 1)), np.tile(sigma, (runs, 1))
-        time_ns, chosen = np.full(runs, np.iinfo(np.int64).max), np.full(runs, -1)
-        without = f"the log has no prior ({self.found.prior.name}): it begins"
-        if not self._measuring:
-            for topic in self._starting:
-                found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
-                time_ns = np.where(has_one, np.minimum(time_ns, found_ns), time_ns)
-            if not self.found.sensors:
-                sigma *= CERTAIN
-            where = "anywhere" if self.found.sensors else "at zero, where its frame is"
-            begun = time_ns < np.iinfo(np.int64).max
-            reasons = [(f"{without} {where}", time_ns, begun)]
+        mean, sigma = _anywhere(model.state, model.start)
+        covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
+        begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
+        if self._finds:
+            facts = self._found(first, origins, begun)
+        elif self._measuring:
+            facts = self._at_first(first, clock, origins, begun)
         else:
-            for number, _, topic in self._measuring:
-                ragged = first[topic.name]
-                table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
-                found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
-                is_first = has_one & (found_ns < time_ns)
-                time_ns[is_first], chosen[is_first] = found_ns[is_first], number
-                self._narrow(number, table.data, rows, is_first, mean, sigma)
-            begun = chosen >= 0
-            if not begun.any():
-                raise BadInput(f"estimator {self.name}: {without} nowhere: {self._complaints()}")
-            reasons = [
-                (f"{without} at the first message of {topic.name}", time_ns, chosen == number)
-                for number, _, topic in self._measuring
-            ]
-        reasons += self._assumed(time_ns, begun)
-        covariance = (sigma**2)[:, :, None] * np.eye(sigma.shape[1])
-        stream = gaussian_stream(
-            self.found.prior.name, time_ns[begun], mean[begun], covariance[begun], named(model.state)
-        )
-        return Ragged(stream, np.append(0, np.cumsum(begun))), reasons
-
-    def _aligned(
-        self, first: Mapping[str, Ragged], origins: Floats | None
-    ) -> tuple[Ragged, list[tuple[str, Integers, Booleans]]]:
-        """The priors of all runs that an alignment finds, and what is to be told of them.
-
-        Raises BadInput where it finds none.
-        """
-        model, runs = self.stage.model, _runs(first)
-        assert model.start is not None
-        assert model.start.align is not None
-        assert model.control is not None
-        assert self.found.control is not None
-        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
-        given = {model.control.topic: first[self.found.control.name]}
-        for sensor, topic in self.found.sensors:
-            own = first[topic.name]
-            if origins is not None and topic in self.found.geodetic:
-                own = in_plane(own, origins)
-            given[sensor.topic] = own
-        starts: dict[int, Aligned] = {}
-        for run in range(runs):
-            try:
-                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
-                starts[run] = model.start.align(streams, parameters)
-            except BadInput as error:
-                if run == runs - 1 and not starts:
-                    raise BadInput(f"estimator {self.name}: {error}") from error
-        time_ns, begun = np.zeros(runs, np.int64), np.zeros(runs, bool)
-        for run, start in starts.items():
-            time_ns[run], begun[run] = start.time_ns, True
-        without = f"the log has no prior ({self.found.prior.name}): it begins"
-        reasons = [
-            (
-                f"{without} {how}",
-                time_ns,
-                np.array([run in starts and starts[run].how == how for run in range(runs)]),
-            )
-            for how in dict.fromkeys(start.how for start in starts.values())
-        ]
-        reasons += self._assumed(time_ns, begun)
-        mean = np.array([start.mean for start in starts.values()])
-        covariance = np.array([start.covariance for start in starts.values()])
-        name, components = self.found.prior.name, named(model.state)
-        stream = gaussian_stream(name, time_ns[begun], mean, covariance, components)
-        return Ragged(stream, np.append(0, np.cumsum(begun))), reasons
-
-    def _assumed(self, time_ns: Integers, begun: Booleans) -> list[tuple[str, Integers, Booleans]]:
-        """What is to be told of the parameters that no channel states."""
-        return [
-            (
+            facts = self._anywhere(first, clock, begun)
+        if self._aligns:
+            aligned = self._aligned(first, clock, origins, begun)
+            others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
+            facts = [aligned, *others]
+        has_begun = begun.time_ns < FOREVER_NS
+        facts += [
+            _Fact(
                 f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it",
-                time_ns,
-                begun,
+                begun.time_ns,
+                has_begun,
             )
             for name, number in self.assumed.items()
         ]
+        stream = gaussian_stream(
+            self.found.prior.name,
+            begun.time_ns[has_begun],
+            begun.mean[has_begun],
+            begun.covariance[has_begun],
+            named(model.state),
+        )
+        return _of_runs(stream, has_begun), facts
 
-    def _narrow(
-        self,
-        number: int,
-        data: Floats,
-        rows: Integers,
-        which: Booleans,
-        mean: Floats,
-        sigma: Floats,
-    ) -> None:
-        """Put what a sensor's rows (runs,) measure into the means and sigmas of some runs, in place."""
-        model, sensor = self.stage.model, self.stage.sensors[number]
-        start_mean, start_sigma = _anywhere(model.state, model.start)
-        mean[which], sigma[which] = start_mean, start_sigma
-        components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
-        diagonal = np.cumsum(np.arange(1, len(sensor.measured) + 1)) - 1
-        for place, name in enumerate(sensor.measured):
-            measured = data[rows[which], place]
-            own = np.sqrt(data[rows[which], len(sensor.measured) + diagonal[place]])
-            is_there = ~np.isnan(measured)
-            column, row = list(model.state).index(name), components.index(name)
-            mean[which, column] = np.where(is_there, measured, start_mean[column])
-            sigma[which, row] = np.where(
-                is_there, np.minimum(WIDER * own, start_sigma[row]), start_sigma[row]
+    @property
+    def _without(self) -> str:
+        return f"the log has no prior ({self.found.prior.name}): it begins"
+
+    def _anywhere(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+        """Begin all runs at their first message, for nothing measures the state itself."""
+        for topic in self._starting:
+            found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
+            begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
+        where = "anywhere"
+        if not self.found.sensors:
+            begun.covariance[:] *= CERTAIN**2
+            where = "at zero, where its frame is"
+        return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+
+    def _found(
+        self, first: Mapping[str, Ragged], origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs where the model finds them; raises BadInput where it finds none."""
+        model, control = self.stage.model, self.found.control
+        assert model.start is not None
+        assert model.start.find is not None
+        given = {}
+        if model.control is not None and control is not None:
+            given[model.control.topic] = first[control.name]
+        for sensor, topic in self.found.sensors:
+            ragged = first[topic.name]
+            if origins is not None and topic in self.found.geodetic:
+                ragged = in_plane(ragged, origins)
+            given[sensor.topic] = ragged
+        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
+        how = [""] * len(begun.time_ns)
+        for run in range(len(how)):
+            try:
+                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+                started = model.start.find(streams, parameters)
+            except BadInput as error:
+                if run == len(how) - 1 and not any(how):
+                    raise BadInput(f"estimator {self.name}: {error}") from error
+                continue
+            begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
+            begun.covariance[run], how[run] = started.covariance, started.how
+        return [
+            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            for words in dict.fromkeys(filter(None, how))
+        ]
+
+    def _at_first(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs at their first message that measures components of the state."""
+        chosen = np.full(len(begun.time_ns), -1)
+        for number, _, topic in self._measuring:
+            ragged = first[topic.name]
+            table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
+            found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
+            for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
+                begun.time_ns[run], chosen[run] = found_ns[run], number
+                begun.mean[run], sigma = self._about(number, table.data[rows[run]])
+                begun.covariance[run] = sigma**2 * np.eye(len(sigma))
+        if (chosen < 0).all():
+            raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
+        return [
+            _Fact(
+                f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
             )
+            for number, _, topic in self._measuring
+        ]
+
+    def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
+        """The mean and the much wider sigmas of a state that one message tells of."""
+        model, sensor = self.stage.model, self.stage.sensors[number]
+        mean, sigma = _anywhere(model.state, model.start)
+        components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+        size = len(sensor.measured)
+        for place, (name, variance) in enumerate(
+            zip(sensor.measured, data[size + _diagonal(size)], strict=True)
+        ):
+            if not np.isnan(data[place]):
+                mean[list(model.state).index(name)] = data[place]
+                row = components.index(name)
+                sigma[row] = min(WIDER * np.sqrt(variance), sigma[row])
+        return mean, sigma
+
+    def _aligned(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> "_Fact":
+        """Begin runs just after the first fixes that, with the path between them, tell all."""
+        numbers = [number for number, _, _ in self._measuring]
+        sensors = tuple(self.found.sensors[number] for number in numbers)
+        found = self.found._replace(sensors=sensors)
+        stage = self.stage._replace(sensors=tuple(sensor for sensor, _ in sensors))
+        settings = self.settings[[0, *(1 + number for number in numbers)]]
+        names = [topic.name for topic in self._starting]
+        streams = {name: first[name] for name in names}
+        block = Block(streams, merge_events(streams, clock))
+        happenings, _ = happenings_of(stage, found, block, World({}, origins), settings)
+        is_aligned = np.zeros(len(begun.time_ns), bool)
+        for run in range(len(is_aligned)):
+            solved = self._align(happenings, run, stage, settings)
+            if solved is not None:
+                begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
+                is_aligned[run] = True
+        return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+
+    def _align(
+        self, happenings: Happenings, run: int, stage: Stage, settings: Floats
+    ) -> tuple[int, Floats, Floats] | None:
+        """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
+        model = stage.model
+        assert model.start is not None
+        assert model.start.align is not None
+        parameters = reading_settings(number_fields(model.parameters))(settings, 0)
+        state, control = (0.0,) * model.size, np.zeros(model.controls)
+        path: list[Any] = []
+        places: list[Floats] = []
+        spreads: list[Floats] = []
+        begin, end = happenings.offsets[run : run + 2]
+        _, first = data_columns(stage)
+        before_ns = first_ns = 0
+        for event in range(begin, end):
+            time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
+            duration_s = (time_ns - before_ns) * 1e-9
+            if event > begin and duration_s > 0.0:
+                state = model.motion.move(state, tuple(control), duration_s, parameters)
+            before_ns, data = time_ns, happenings.data[event]
+            if source == CONTROL:
+                own = data[first : first + len(control)]
+                control = np.where(np.isnan(own), control, own)
+            elif source >= 0:
+                size = len(stage.sensors[source].measured)
+                lower = np.zeros((size, size))
+                lower[np.tril_indices(size)] = data[size : size + size * (size + 1) // 2]
+                first_ns = first_ns or time_ns
+                path.append(state)
+                places.append(data[:size])
+                spreads.append(lower + np.tril(lower, -1).T)
+                solved = model.start.align(
+                    *map(np.array, (path, places, spreads)), (time_ns - first_ns) * 1e-9, parameters
+                )
+                if solved is not None:
+                    return time_ns + 1, *solved
+        return None
 
     def _complaints(self) -> str:
         complaints = [
@@ -247,11 +306,11 @@ class Beginning:
         told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
         return Ragged(told, fixes.offsets)
 
-    def _told(self, reasons: list[tuple[str, Integers, Booleans]]) -> list[Ragged]:
+    def _told(self, facts: list["_Fact"]) -> list[Ragged]:
         """What was assumed, on the topic `started`: a message for each sentence and run."""
-        if not reasons:
+        if not facts:
             return []
-        texts, times, which = zip(*reasons, strict=True)
+        texts, times, which = zip(*facts, strict=True)
         is_said = np.stack(which, axis=1)
         stream = reason_stream(
             f"/estimates/{self.name}/started",
@@ -263,12 +322,34 @@ class Beginning:
         return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
 
 
+class _Begun(NamedTuple):
+    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+
+
+class _Fact(NamedTuple):
+    """A sentence, when it is told (runs,), and in which runs (runs,)."""
+
+    text: str
+    time_ns: Integers
+    is_so: Booleans
+
+
+def _diagonal(size: int) -> Integers:
+    """Where the diagonal stands among the rows of a lower triangle."""
+    rows = np.arange(1, size + 1)
+    return np.cumsum(rows) - 1
+
+
 def _runs(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
 def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,) of a state of which nothing is known."""
+    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state anywhere."""
     assert start is not None
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
@@ -276,7 +357,7 @@ def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Fl
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([start.sigmas[name] for name in names])
+    return mean, np.array([start.sigmas.get(name, np.nan) for name in names])
 
 
 def _first_of(
@@ -293,8 +374,6 @@ def _first_of(
     return time_ns, has_one, rows
 
 
-def _first_rows(ragged: Ragged) -> Ragged:
-    """The first message of every run that has one."""
-    is_first = np.zeros(len(ragged), bool)
-    is_first[ragged.offsets[:-1][np.diff(ragged.offsets) > 0]] = True
-    return Ragged(ragged.stream.take(is_first), ragged_rows(is_first, ragged.offsets))
+def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
+    """A stream of one message for each of some runs."""
+    return Ragged(stream, np.append(0, np.cumsum(has_one)))

@@ -1,7 +1,8 @@
 """What there is to draw (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
 
 A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
-that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`.
+that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`. Where stamps are
+no dates, as those of a simulated clock in a bag, `utc` is when they reached the recorder.
 """
 
 import re
@@ -41,6 +42,8 @@ DRAWN_ROWS = 5000
 # A stream is silent after so many of its usual intervals, but not before so long.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
+# Stamps before the year 2000 count from something else than 1970.
+DATES_FROM_NS = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,12 @@ class Scene:
         return self.source.read([topic])[topic]
 
     @property
+    def dates(self) -> "Dates | None":
+        """What stamps are as dates, by the topic with most messages; None where they are dates."""
+        streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
+        return dates_of(max(streams, key=len)) if streams else None
+
+    @property
     def _truths(self) -> list[str]:
         schema_name = schemas.TRUTH_STATE.full_name
         return [each.name for each in self.source.topics.values() if each.schema_name == schema_name]
@@ -135,6 +144,32 @@ def _natural(name: str) -> list[tuple[str, int]]:
 
 
 @dataclass(frozen=True)
+class Dates:
+    """Two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+
+    Between two stamps the difference is linear, and before the first and after the last it stays.
+    """
+
+    stamps_ns: Times
+    later_ns: Times
+
+    def of(self, time_ns: Times) -> Times:
+        """The dates of stamps (n,)."""
+        first_ns = self.later_ns[0]
+        drift_ns = np.interp(time_ns, self.stamps_ns, self.later_ns - first_ns)
+        found: Times = time_ns + first_ns + np.rint(drift_ns).astype(np.int64)
+        return found
+
+
+def dates_of(stream: Stream) -> Dates | None:
+    """The dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
+    if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
+        return None
+    return Dates(stamps_ns, logged_ns - stamps_ns)
+
+
+@dataclass(frozen=True)
 class Canvas:
     """A recording and its clocks.
 
@@ -144,6 +179,7 @@ class Canvas:
         end_ns: when the last estimate or truth is.
         steps_ns: the distinct times of estimates, which `step` counts.
         is_still: nothing that moves is sent: it is there already.
+        dates: what stamps are as dates, where they are none themselves.
     """
 
     recording: rr.RecordingStream
@@ -151,16 +187,18 @@ class Canvas:
     end_ns: int
     steps_ns: Times
     is_still: bool = False
+    dates: Dates | None = None
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
         """Send the rows of one entity, all at once."""
         if len(time_ns) == 0 or self.is_still:
             return
         step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
+        date_ns = time_ns if self.dates is None else self.dates.of(time_ns)
         index = [
             rr.TimeColumn("step", sequence=np.maximum(step, 0)),
             rr.TimeColumn("sim_time", duration=(time_ns - self.epoch_ns).astype("timedelta64[ns]")),
-            rr.TimeColumn("utc", timestamp=time_ns.astype("datetime64[ns]")),
+            rr.TimeColumn("utc", timestamp=date_ns.astype("datetime64[ns]")),
         ]
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 

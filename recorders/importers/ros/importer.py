@@ -2,7 +2,7 @@
 
 A stream is named by the namespace of its topic and by what it is: /odom gives /odometry, /robot1/imu
 gives /robot1/inertial. Where two topics would give the same name, both are named by the topic:
-/odom/odometry, /wheels/odometry.
+/odom/odometry, /wheels/odometry. So are poses without a covariance, which may be goals: /goal_pose/pose.
 """
 
 from collections import Counter, defaultdict
@@ -28,6 +28,7 @@ from recorders.importers.ros.messages import (
     TYPES,
     Part,
     Taken,
+    as_truth,
     stamps_ns,
 )
 from recorders.importers.ros.raw import Batch, Connection
@@ -61,8 +62,9 @@ class RosParameters(Parameters):
     `clock` says what the publish time is: the message's header, or the bag. Without `topics` all are
     taken that can be. `transforms` names pairs of frames, "map:base_link", whose poses are composed of
     what TF has; without any, every transform that is sent is taken as it is. `names` gives what stands
-    in place of the namespace in the streams of a topic: {"/amcl_pose" = "/robot1"}. `mapping` is a TOML
-    file for messages of one's own. `distribution` says whose definitions hold where the bag has none.
+    in place of the namespace in the streams of a topic: {"/amcl_pose" = "/robot1"}. The poses of the
+    topic `truth` are what estimates are compared with, as the stream `truth`. `mapping` is a TOML file
+    for messages of one's own. `distribution` says whose definitions hold where the bag has none.
     Headers that differ by more than `clock_tolerance_s` from one another's clock are of several clocks.
     """
 
@@ -70,6 +72,7 @@ class RosParameters(Parameters):
     topics: Names = []
     transforms: Names = []
     names: dict[str, str] = {}
+    truth: str | None = None
     mapping: str | None = None
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0
@@ -212,7 +215,8 @@ class _Import:
                 f"{mapping}: no topic of {self.path} is of type {name}; {choices(name, types)}"
             )
         asked, topics = self._parameters.topics, {each.topic for each in connections}
-        for topic in [*asked, *self._parameters.names]:
+        truth = [] if self._parameters.truth is None else [self._parameters.truth]
+        for topic in [*asked, *self._parameters.names, *truth]:
             if topic not in topics:
                 raise BadInput(f"{self.path}: has no topic {topic}; {choices(topic, topics)}")
         known: dict[tuple, _Reader | str] = {}
@@ -233,6 +237,10 @@ class _Import:
                     )
             else:
                 self._readers[each] = found
+        for topic in truth:
+            reader = next((each for of, each in self._readers.items() if of.topic == topic), None)
+            if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
+                raise BadInput(f"{self.path}: truth = {topic}: has no poses; name a topic that has some")
         if not self._readers:
             listed = (
                 ", ".join(f"{topic} ({why})" for topic, why in sorted(self._not_taken.items()))
@@ -265,16 +273,20 @@ class _Import:
 
     def _stream_names(self) -> dict[tuple[str, str], str]:
         """The name of a stream by topic and kind."""
-        given = self._parameters.names
+
+        def below(topic: str, taken: Taken) -> str:
+            own = topic if taken.is_doubtful else topic.rpartition("/")[0]
+            return self._parameters.names.get(topic, own).rstrip("/")
+
         wanted = {
-            (
-                each.topic,
-                kind,
-            ): f"{given.get(each.topic, each.topic.rpartition('/')[0]).rstrip('/')}/{kind}"
+            (each.topic, kind): f"{below(each.topic, reader.taken)}/{kind}"
             for each, reader in self._readers.items()
             if reader.taken is not None
             for kind in reader.taken.kinds
         }
+        if (truth := self._parameters.truth) is not None:
+            above = self._parameters.names.get(truth, truth.rpartition("/")[0]).rstrip("/")
+            wanted[truth, "truth"] = f"{above}/truth"
         counts = Counter(wanted.values())
         return {
             (topic, kind): name if counts[name] == 1 else f"{topic}/{kind}"
@@ -383,6 +395,8 @@ class _Import:
             for name, path in (("frame_id", reader.frame), ("child_frame_id", CHILD_FRAME))
         ]
         for part in reader.taken.parts(messages):
+            if topic == self._parameters.truth and part.schema is schemas.POSE:
+                part = as_truth(part)
             keep = self._kept(topic, part, stamp_ns)
             for frame, which in _by_frame(frames, len(messages)):
                 rows = np.flatnonzero(keep & (which if part.rows is None else which[part.rows]))

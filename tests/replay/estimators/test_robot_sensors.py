@@ -1,5 +1,6 @@
 """A robot with odometry and what else a bag may have: poses, fixes, headings, a gyro; no prior."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
+from pipeline.starting import start_from
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.log.run import RunMetadata
@@ -111,6 +113,16 @@ def test_a_robot_begins_at_its_first_pose() -> None:
     assert_array_equal(found["innovation"]["accepted"], 1)
 
 
+def test_a_span_begins_at_its_own_first_pose() -> None:
+    source = log(odometry(), seen())
+    later = replace(source, start_ns=int(SLOW[2]) + 1)
+    estimates = outputs(ROBOT, "ekf", [later])["pose"].stream
+    assert estimates.publish_time_ns[0] == SLOW[3]
+    (filtering,) = bound(ROBOT, "ekf", [later])
+    with pytest.raises(BadInput, match=r"no prior in this log .*leave out --start-from"):
+        start_from(filtering, [later], [], "publish_time")
+
+
 def test_what_a_log_states_is_not_assumed() -> None:
     stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
     found = outputs(ROBOT, "ekf", [log(stated, seen())])
@@ -131,6 +143,38 @@ def test_odometry_alone_begins_at_zero() -> None:
         assert_allclose(end, [*wanted[:2], wrap_angle(wanted[2])], atol=1e-6)
     sighting = make_stream("/bearing", schemas.BEARING, SLOW, target_id=[1] * 6, bearing_rad=[0.1] * 6)
     assert bound(ROBOT, "ekf", [log(odometry(), sighting)]) == []
+
+
+def test_sightings_alone_begin_anywhere() -> None:
+    """That is said; a pose makes the beginning sure, and a prior is never overruled."""
+    landmark = make_stream(
+        "/landmarks", schemas.LANDMARK, STAMPS[:1], landmark_id=[1], position_m=[[0.0, 0.0]]
+    )
+    sighting = make_stream(
+        "/range",
+        schemas.RANGE,
+        SLOW,
+        metadata={"sigma_range_m": "0.5"},
+        target_id=[1] * 6,
+        range_m=[20.0] * 6,
+    )
+    found = outputs(ROBOT, "ekf", [log(odometry(), landmark, sighting)])
+    assert sentences_of(found["started"].stream)[0].endswith("(/prior): it begins anywhere")
+    first = found["pose"]["covariance"][0]
+    assert first[[0, 4]] == pytest.approx(1e6)
+    assert found["pose"].stream.publish_time_ns[0] == STAMPS[0]
+    prior = make_stream(
+        "/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS[:1],
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=poses()[:1],
+        covariance=[0.01 * np.eye(3).ravel()],
+    )
+    with pytest.raises(BadInput, match="does not state forward_noise_density"):
+        bound(ROBOT, "ekf", [log(odometry(), seen(), prior)])
+    stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
+    assert "started" not in outputs(ROBOT, "ekf", [log(stated, seen(), prior)])
 
 
 def test_poses_without_a_covariance() -> None:
@@ -174,6 +218,8 @@ def test_headings_are_a_sensor() -> None:
         metadata={"covariance_rad2": "0.01,0,0,0,0.01,0,0,0,0.0004"},
         quaternion=np.column_stack([np.cos(half), np.zeros((n, 2)), np.sin(half)]),
     )
+    with_fixes = outputs(ROBOT, "ekf", [log(odometry(), fix(), heading)])
+    assert "at the first message of /heading" in sentences_of(with_fixes["started"].stream)[1]
     found = outputs(ROBOT, "ekf", [log(odometry(), seen(), heading)])["pose"]
     variance = found["covariance"][found.stream.publish_time_ns == SLOW[0], 8]
     assert_allclose(variance, 1 / (1 / 0.0025 + 1 / 0.0004), rtol=2e-3)
