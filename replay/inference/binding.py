@@ -137,7 +137,8 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     parts = {each.topic for each in model.all_sensors}
     parts |= {each.about.topic for each in model.all_sensors if each.about}
-    is_alone = model.start is not None and control is not None and not any(map(here.has, parts))
+    starts_alone = model.start is not None and model.start.find is None
+    is_alone = starts_alone and control is not None and not any(map(here.has, parts))
     if not sensors and model.needs_sensor and not is_alone:
         return None
     if not has_prior and sensors and not any(measures_state(model, sensor) for sensor, _ in sensors):
@@ -227,9 +228,10 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
     return parts
 
 
-def names_state(prior: Topic, model: Model) -> bool:
-    """Whether a prior's channel names all components of a model's state."""
-    return set(model.state) <= set(prior.metadata.get("components", "").split(","))
+def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
+    """Whether a prior's channel names all components of a model's state, and no others if `exactly`."""
+    named = set(prior.metadata.get("components", "").split(","))
+    return named == set(model.state) if exactly else named >= set(model.state)
 
 
 @cache

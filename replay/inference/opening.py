@@ -18,7 +18,7 @@ from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged, merge_events
 from replay.engine.estimator import Opened, Opening
 from replay.engine.failures import reason_stream
-from replay.engine.geodetic import origins_of
+from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
 from replay.inference.binding import (
@@ -78,8 +78,16 @@ class Beginning:
         """The topics whose first message is where to begin."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.instead)]
+        if self._finds:
+            return [*drives, *(topic for _, topic in self.found.sensors)]
         needs_drives = self._aligns or not self._measuring
         return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
+
+    @property
+    def _finds(self) -> bool:
+        """Whether the model finds the state from several sensors together."""
+        start = self.stage.model.start
+        return start is not None and start.find is not None
 
     @property
     def _aligns(self) -> bool:
@@ -116,11 +124,12 @@ class Beginning:
         mean, sigma = _unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
-        facts = (
-            self._at_first(first, clock, origins, begun)
-            if self._measuring
-            else self._at_zero(first, clock, begun)
-        )
+        if self._finds:
+            facts = self._found(first, origins, begun)
+        elif self._measuring:
+            facts = self._at_first(first, clock, origins, begun)
+        else:
+            facts = self._at_zero(first, clock, begun)
         if self._aligns:
             aligned = self._aligned(first, clock, origins, begun)
             others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
@@ -155,6 +164,38 @@ class Beginning:
         begun.covariance[:] *= CERTAIN**2
         where = "at zero, where its frame is"
         return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+
+    def _found(
+        self, first: Mapping[str, Ragged], origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs where the model finds them; raises BadInput where it finds none."""
+        model, control = self.stage.model, self.found.control
+        assert model.start is not None
+        assert model.start.find is not None
+        given = {}
+        if model.control is not None and control is not None:
+            given[model.control.topic] = first[control.name]
+        for sensor, topic in self.found.sensors:
+            ragged = first[topic.name]
+            if origins is not None and topic in self.found.geodetic:
+                ragged = in_plane(ragged, origins)
+            given[sensor.topic] = ragged
+        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
+        how = [""] * len(begun.time_ns)
+        for run in range(len(how)):
+            try:
+                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+                started = model.start.find(streams, parameters)
+            except BadInput as error:
+                if run == len(how) - 1 and not any(how):
+                    raise BadInput(f"estimator {self.name}: {error}") from error
+                continue
+            begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
+            begun.covariance[run], how[run] = started.covariance, started.how
+        return [
+            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            for words in dict.fromkeys(filter(None, how))
+        ]
 
     def _at_first(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
@@ -312,7 +353,7 @@ def _runs(first: Mapping[str, Ragged]) -> int:
 
 
 def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,) of a state of which nothing is known."""
+    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state not known at all."""
     assert start is not None
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
@@ -320,7 +361,7 @@ def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Flo
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([start.sigmas[name] for name in names])
+    return mean, np.array([start.sigmas.get(name, np.nan) for name in names])
 
 
 def _first_of(
