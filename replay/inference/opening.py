@@ -353,7 +353,7 @@ def _runs(first: Mapping[str, Ragged]) -> int:
 
 
 def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state that nobody knows."""
+    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
     assert start is not None
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
