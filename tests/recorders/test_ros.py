@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
@@ -506,6 +507,32 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     written = read_streams(open_log(tmp_path / "out.mcap"), ["/fix"])["/fix"]
     assert (np.diff(written.publish_time_ns) >= 0).all()
     assert run.notes == notes
+
+
+def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
+    """Attachments and metadata of an MCAP bag; an attachment whose name is not whole is a loss."""
+    make, name, path = Maker(), "std_msgs/msg/Float64", tmp_path / "bag.mcap"
+    definition, _ = make.store.generate_msgdef(name, ros_version=2)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(name, "ros2msg", definition.encode())
+        channel = writer.register_channel("/level", "cdr", schema)
+        level = bytes(make.store.serialize_cdr(make(name, data=0.75), name))
+        writer.add_message(channel, START_NS, level, START_NS)
+        writer.add_metadata("vendor", {"firmware": "7"})
+        for words in (b"one", b"two"):
+            writer.add_attachment(0, 0, "camera.yaml", "text/plain", words)
+        writer.finish()
+    streams, notes = imported(path)
+    assert streams["/value"]["value"].tolist() == [[0.75]]
+    assert notes["not taken, attachment camera.yaml"] == "2, which is no topic"
+    assert notes["not taken, metadata vendor"] == "1, which is no topic"
+    head = (11).to_bytes(4, "little") + b"camera.yaml"
+    path.write_bytes(path.read_bytes().replace(head, b"\xff" * 3 + head[3:], 1))
+    _, notes = imported(path)
+    assert "its name is not whole" in notes["lost (1)"]
+    assert notes["not taken, attachment camera.yaml"].startswith("1, ")
 
 
 def test_frames_and_constants_that_change(tmp_path: Path) -> None:

@@ -561,6 +561,8 @@ class _Import:
             notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):
             notes[f"not taken, {topic}"] = f"{counts[topic]} {why}"
+        for what, count in Counter(self._bag.others).items():
+            notes[f"not taken, {what}"] = f"{count}, which is no topic"
         for number, loss in enumerate(self._bag.losses, start=1):
             notes[f"lost ({number})"] = loss.removeprefix(f"{self.path}: ")
         for topic, stated in self._bag.stated.items():
