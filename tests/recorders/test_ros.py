@@ -310,6 +310,8 @@ def test_what_the_streams_say(tmp_path: Path) -> None:
     ]
     assert streams["/detections"]["scan_id"].tolist() == [0, 0, 0]
     assert streams["/scan"]["detections"].tolist() == [3, 0]
+    left_out = "without the sizes, turns, classes and ids of their boxes"
+    assert notes[f"/boxes: detections kept {left_out}"] == "3"
     # two topics that would have one name keep their own
     assert streams["/heat/value"].metadata["components"] == "temperature_degc"
     assert streams["/level/value"]["value"].tolist() == [[0.75]]

@@ -270,6 +270,9 @@ def _detections(names: str, unit: str) -> Taken:
             },
             metadata={"components": ",".join(f"{name}_{unit}" for name in names)},
             rows=np.repeat(np.arange(size), count),
+            doubtful={
+                "without the sizes, turns, classes and ids of their boxes": np.ones(size * count, bool)
+            },
         )
 
     return Taken(("scan", "detections"), parts)
