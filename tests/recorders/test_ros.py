@@ -24,8 +24,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recorders.errors import BadInput
 from recorders.importers.ros import importer
-from recorders.importers.ros.layouts import Messages, MessageType
+from recorders.importers.ros.bags import open_bag
+from recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
 from recorders.importers.ros.messages import TYPES
+from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.sqlite_pages import missing_bytes, whole_rows
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
@@ -180,16 +182,16 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
     ]
     path = write_bag(tmp_path / "bag", form, sent, make.store)
     checked = 0
-    with AnyReader([path]) as theirs, importer.open_bag(path) as ours:
+    with AnyReader([path]) as theirs, open_bag(path) as ours:
         readers: dict[str, MessageType] = {}
         found: dict[str, list[Messages]] = {}
         for batch in ours.batches(lambda _: True):
             each = batch.connection
-            definitions = importer.definitions_of(each.type_name, each.definition, "ros2_humble")
+            definitions = definitions_of(each.type_name, each.definition, "ros2_humble")
             reader = readers.setdefault(
                 each.topic, MessageType(each.type_name, definitions, each.encoding)
             )
-            for which, raw in importer.by_size(batch.data, batch.begins, batch.lengths):
+            for which, raw in by_size(batch.data, batch.begins, batch.lengths):
                 for messages in reader.read(raw, which):
                     assert isinstance(messages, Messages), messages
                     stamps = batch.log_time_ns[messages.rows]
@@ -688,7 +690,7 @@ def test_a_bag_is_imported_block_by_block(tmp_path: Path, monkeypatch: pytest.Mo
     path = write_bag(tmp_path / "bag", "bag", sent, make.store)
     whole, notes = imported(path, transforms="map:base_link")
     monkeypatch.setattr(importer, "_BLOCK_MESSAGES", 50)
-    found = importer.read(path, importer.RosParameters(transforms=["map:base_link"]))
+    found = importer.read(path, RosParameters(transforms=["map:base_link"]))
     sizes = [max(map(len, block)) for block in found.blocks if block]
     assert len(sizes) > 10
     assert max(sizes) < 100

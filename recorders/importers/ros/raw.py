@@ -51,7 +51,7 @@ class BagFile(Protocol):
 
     path: Path
     connections: list[Connection]
-    others: Sequence[str]
+    others: list[str]
     losses: list[str]
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
