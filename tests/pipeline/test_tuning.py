@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
@@ -306,3 +307,17 @@ def test_what_need_not_be_positive_is_found_too() -> None:
     for row in found.parameters.to_dict("records"):
         assert row["low"] < true[row["parameter"]] < row["high"], row
         assert row["high"] - row["low"] < 0.2
+
+
+def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:
+    """Values of every run and parameter, and over the runs how often their intervals hold the truth."""
+    out = tmp_path / "tuning"
+    short = ("--set", "options.durations_s=[20.0]", "--runs", "2", "--logs", "0")
+    told = fuselog("run", "tuning", *short, "--out", out, "--json")
+    assert told.code == 0
+    table = pd.read_csv(out / "tables" / "tuned.csv")
+    assert len(table) == 2 * len(FREE)
+    assert (np.abs(np.log(table["value"] / table["true"])) < 4 * table["standard_error"]).all()
+    covered = table.groupby("parameter")["is_covered"].mean()
+    for name in FREE:
+        assert told.json["metrics"][f"ekf.covered_share.{name}-20s"] == covered[name]
