@@ -17,7 +17,7 @@ from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
 from replay.engine.estimator import Estimator
 from replay.inference.all_methods import METHODS
-from replay.inference.binding import needs_of
+from replay.inference.binding import needs_of, serving
 from replay.inference.estimators import registered_models
 from replay.inference.model import Model
 from replay.judging.metrics import Metric
@@ -130,11 +130,12 @@ def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
 
 def _model(name: str, model: Model) -> Entry:
     facts = {"state": _listed(model.state)}
-    for sensor in model.sensors:
+    for sensor in model.all_sensors:
         of = f" of {sensor.about.topic}" if sensor.about else ""
-        facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({sensor.schema.full_name})"
-    if model.control:
-        facts[f"control {model.control.topic}"] = ", ".join(model.control.components)
+        taken = " or ".join(serving(sensor.schema))
+        facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({taken})"
+    for control in [model.control, *model.control.instead] if model.control else []:
+        facts[f"control {control.topic}"] = ", ".join(control.components)
     if model.modes:
         facts["modes"] = ", ".join(model.modes)
     if model.estimable:

@@ -6,15 +6,20 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pipeline.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, open_log, read_span
+from recorders.log import Log, RunMetadata, Topic, open_log, read_span
 from recorders.parameters import describe
 from recorders.recording import Recorder
 from recorders.registry import load
 from replay.engine.cache import cache_folder, kept_files
+from replay.engine.estimator import Bound
+from replay.inference.all_methods import METHODS
+from replay.inference.binding import names_state, nearest_parts, topics_of
+from replay.inference.estimators import bind_model, combined, registered_models
+from replay.inference.model import Model
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
@@ -40,10 +45,56 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
         for topic in log.topics.values()
     ]
     print_table(["topic", "schema", "messages", "per second"], rows)
+    if log.companions:
+        count = sum(topic.messages for topic in log.companions.values())
+        say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
+    elif log.topics:
+        _say_what_fits(path, log)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+class Fitting(NamedTuple):
+    """Whether a model fits a log: the topics that it would use, the methods, or what is missing."""
+
+    topics: list[str]
+    methods: list[str]
+    lacks: list[str]
+
+
+def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
+    """How every registered model fits a log, by name."""
+    return {name: _fitting(model, topics) for name, model in registered_models().items()}
+
+
+def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
+    found = topics_of(model, topics)
+    if not any(names_state(each.prior, model) for each in found):
+        parts = nearest_parts(model, topics)
+        return Fitting([], [], [part.words.replace(".../", "") for part in parts if not part.is_here])
+    bound: dict[str, list[Bound]] = {}
+    lacks: list[str] = []
+    for name, method in METHODS.items():
+        if not method.lacks(model):
+            try:
+                parameters = combined(model, method)()
+                bound[name] = bind_model(name, topics, parameters, model=model, method=method)
+            except BadInput as error:
+                lacks.append(str(error).removeprefix(f"estimator {name}: "))
+    used = (topic for each in bound.values() for one in each for topic in (*one.whole, *one.streams))
+    return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
+
+
+def _say_what_fits(path: Path, log: Log) -> None:
+    """Print which models fit the log and how, and what it lacks for the others."""
+    say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
+    for name, fitting in fitting_of(log.topics).items():
+        if fitting.methods:
+            say(f"  {name}: -e {' '.join(fitting.methods)}; from {', '.join(fitting.topics)}")
+        else:
+            say(f"  {name}: needs {'; '.join(fitting.lacks)}")
 
 
 def _show_bag(path: Path, *, as_json: bool) -> None:
@@ -107,6 +158,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
+        "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "lost": log.loss_statement,
     }
 

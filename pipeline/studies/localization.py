@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 
 import pandas as pd
 
+from pipeline.campaigns import judge
 from pipeline.charts import Axis, Chart, Panel, Style, band, curve, thinned
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome, split_metric
-from pipeline.runner import Runner
 from replay.judging.evaluation import Errors
 from replay.judging.judge import Judge
 from replay.judging.means import INSERTED
@@ -19,9 +19,9 @@ from replay.judging.means import INSERTED
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    done, input_sha256 = Runner(experiment, setting).judge()
+    done = judge(experiment, setting)
     outcome = summarise(done.judge)
-    outcome.input_sha256, outcome.parameters = input_sha256, done.parameters
+    outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters
     return outcome
 
 

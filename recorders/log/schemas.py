@@ -168,6 +168,13 @@ RELATIVE_BEARING = _declare(
     _real("angle_rad"),
 )
 RANGE = _declare("Range", "The distance to one target.", _identifier("target_id"), _real("range_m"))
+ANCHOR_RANGE = _declare(
+    "AnchorRange",
+    "The distance from a tag on the body (a BodyPoint) to an anchor (a Landmark).",
+    _identifier("anchor_id"),
+    _identifier("tag_id"),
+    _real("range_m"),
+)
 RANGE_BEARING = _declare(
     "RangeBearing",
     "Distance and angle to one target in the sensor's frame.",
@@ -192,13 +199,22 @@ SHOT_DETECTION = _declare(
 )
 POSITION_FIX = _declare(
     "PositionFix",
-    "A position in the log's Cartesian frame with its covariance, row-major.",
+    "A position in the log's Cartesian frame, of two or three numbers, with its covariance, row-major "
+    "or diagonal.",
     _vector("position_m"),
     _vector("covariance_m2", may_be_nan=True),
 )
+VELOCITY_FIX = _declare(
+    "VelocityFix",
+    "A velocity in the log's Cartesian frame with its covariance, row-major.",
+    _vector("velocity_mps"),
+    _vector("covariance_m2ps2", may_be_nan=True),
+)
 GEODETIC_FIX = _declare(
     "GeodeticFix",
-    "A position on the WGS 84 ellipsoid; its covariance, row-major, in m^2 east, north, up.",
+    "A position on the WGS 84 ellipsoid; its covariance, row-major or diagonal, in m^2 east, north and "
+    "perhaps up. Channels of a log may state the origin of its plane: origin_latitude_deg, "
+    "origin_longitude_deg and origin_altitude_m above the ellipsoid.",
     _real("latitude_deg"),
     _real("longitude_deg"),
     _real("altitude_m", may_be_nan=True),
@@ -225,6 +241,12 @@ DETECTION = _declare(
     "One element of an unordered scan, in the sensor's frame.",
     _identifier("scan_id"),
     _vector("position_m"),
+)
+SCAN_BEARING = _declare(
+    "ScanBearing",
+    "One bearing of an unordered scan, in the sensor's frame, anticlockwise from its x axis.",
+    _identifier("scan_id"),
+    _real("bearing_rad"),
 )
 SCAN = _declare(
     "Scan",
@@ -277,6 +299,12 @@ COURSE_FIX = _declare(
 
 LANDMARK = _declare(
     "Landmark", "A fixed point of the map.", _identifier("landmark_id"), _vector("position_m")
+)
+BODY_POINT = _declare(
+    "BodyPoint",
+    "Where a sensor, antenna or tag sits in the body's frame: its lever arm.",
+    _identifier("point_id"),
+    _vector("position_m"),
 )
 TRUTH_STATE = _declare(
     "TruthState",
@@ -351,6 +379,12 @@ SKIPPED = _declare(
     "A measurement was not used; the channel's metadata lists the reasons by number, as JSON.",
     _identifier("reason"),
 )
+STARTED = _declare(
+    "Started",
+    "The estimator assumed something that the log does not say, such as where to begin; the channel's "
+    "metadata lists what by number, as JSON.",
+    _identifier("reason"),
+)
 REWOUND = _declare(
     "Rewound",
     "A late measurement was used after all; so many messages after it were used again.",
@@ -411,6 +445,26 @@ TRACK_ESTIMATE = _declare(
     _identifier("track_id"),
     _vector("mean"),
     _vector("covariance"),
+)
+
+EXISTENCE = _declare(
+    "Existence",
+    "How probable it is that the track of the same row of another topic is that of a thing.",
+    _real("existence"),
+)
+ASSOCIATION = _declare(
+    "Association",
+    "How probable it is that a detection is a track's; the metadata lists the sensors by number.",
+    _identifier("track_id"),
+    _identifier("sensor_id"),
+    _identifier("scan_id"),
+    _identifier("detection"),
+    _real("probability"),
+)
+APPROXIMATION = _declare(
+    "Approximation",
+    "So many tracks shared so many detections of a scan that how probable each is was approximated.",
+    _identifier("tracks"),
 )
 
 SCHEMAS: dict[str, Schema] = {

@@ -1,6 +1,7 @@
-"""Places in a local tangent plane (east, north) as latitude and longitude on the WGS 84 ellipsoid."""
+"""Places in a local tangent plane (east, north, up) and on the WGS 84 ellipsoid."""
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from recorders.models.planar import Component, Components
 
@@ -11,16 +12,32 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 
 
 def earth_centred(
-    latitude_deg: Component, longitude_deg: Component
+    latitude_deg: Component, longitude_deg: Component, altitude_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """The point of the ellipsoid in the frame that turns with the earth, in m."""
+    """A point at a height above the ellipsoid in the frame that turns with the earth, in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (
-        normal * np.cos(latitude) * np.cos(longitude),
-        normal * np.cos(latitude) * np.sin(longitude),
-        normal * (1.0 - ECCENTRICITY_SQUARED) * np.sin(latitude),
+        (normal + altitude_m) * np.cos(latitude) * np.cos(longitude),
+        (normal + altitude_m) * np.cos(latitude) * np.sin(longitude),
+        (normal * (1.0 - ECCENTRICITY_SQUARED) + altitude_m) * np.sin(latitude),
     )
+
+
+def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
+    """East, north and up at places (...,) as the rows of rotations (..., 3, 3) of earth-centred axes."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    zero = np.zeros_like(latitude)
+    rows = (
+        (-np.sin(longitude), np.cos(longitude), zero),
+        (
+            -np.sin(latitude) * np.cos(longitude),
+            -np.sin(latitude) * np.sin(longitude),
+            np.cos(latitude),
+        ),
+        (np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def out_of_tangent_plane(
@@ -55,7 +72,10 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """East, north and up (m) of a point of the ellipsoid (latitude, longitude), seen from the origin."""
+    """East, north and up (m) of a place as it is seen from the origin.
+
+    Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
+    """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     x, y, z = (
         there - here

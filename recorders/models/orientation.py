@@ -51,6 +51,12 @@ def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
     return compose(compose(orientation, pure), conjugate(orientation))[..., 1:]
 
 
+def heading(orientation: ArrayLike) -> NDArray[np.float64]:
+    """The heading in rad, anticlockwise from x, of bodies with these orientations (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(orientation, float), -1, 0)
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
 def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """The angle in rad, 0 to pi/2, between the axes of a and b (..., d), (67)-(68).
 

@@ -1,4 +1,4 @@
-"""Robots drive among landmarks: odometry, ranges, bearings and relative bearings, truth.
+"""Robots drive among landmarks: odometry, ranges, bearings, relative bearings, fixes, truth.
 
 Odometry reads the velocity that holds from its stamp to the next; the robot drives that velocity plus
 white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from recorders.log import Schema, Stream, make_stream, schemas
+from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.planar import drive, range_bearing, wrap_angle
 from recorders.parameters import Parameters
 from recorders.recording import (
@@ -23,6 +24,8 @@ from recorders.recording import (
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 FieldOfView = Annotated[float, Field(gt=0, le=360)]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
 SENSORS = {
     "range_bearing": schemas.RANGE_BEARING,
     "range": schemas.RANGE,
@@ -52,6 +55,19 @@ class Sensor(Parameters):
     bias_bearing_rad: float = 0.0
 
 
+class Fixes(Parameters):
+    """A receiver of positions; a rate of zero switches it off.
+
+    With `origin_deg`, latitude and longitude, it says where on earth it is; else where in the plane.
+    """
+
+    rate_hz: NonNegativeFloat = 0.0
+    sigma_m: PositiveFloat = 1.0
+    outages_per_minute: NonNegativeFloat = 0.0
+    outage_s: PositiveFloat = 10.0
+    origin_deg: tuple[Latitude, Longitude] | None = None
+
+
 class LandmarksParameters(Parameters):
     """The scenario; noise densities are per square root of a second."""
 
@@ -73,6 +89,7 @@ class LandmarksParameters(Parameters):
     range: Sensor = Sensor()
     bearing: Sensor = Sensor()
     relative_bearing: Sensor = Sensor()
+    fix: Fixes = Fixes()
 
 
 class Drive(NamedTuple):
@@ -119,7 +136,7 @@ def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recor
             position_m=landmarks,
         )
     ]
-    children = [robot_rng.spawn(6) for robot_rng in robot_rngs]
+    children = [robot_rng.spawn(7) for robot_rng in robot_rngs]
     drives = [_drive(parameters, number, rngs[0]) for number, rngs in enumerate(children)]
     for number, rngs in enumerate(children, start=1):
         streams += _robot_streams(parameters, number, drives, landmarks, rngs)
@@ -194,7 +211,7 @@ def _robot_streams(
         ),
     ]
     targets = _targets(parameters, number, drives, landmarks)
-    for (name, schema), sensor_rng in zip(SENSORS.items(), rngs[2:], strict=True):
+    for (name, schema), sensor_rng in zip(SENSORS.items(), rngs[2:-1], strict=True):
         sensor: Sensor = getattr(parameters, name)
         if sensor.rate_hz == 0:
             continue
@@ -211,8 +228,39 @@ def _robot_streams(
             )
         )
         if sensor.outages_per_minute > 0:
-            streams.append(_outages(f"{prefix}/{name}/outages", seen))
-    return streams
+            streams.append(_outages(f"{prefix}/{name}/outages", seen.outages_s))
+    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rngs[-1])
+
+
+def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:
+    """Positions in the plane or on earth with their covariance, and when there were none."""
+    if receiver.rate_hz == 0:
+        return []
+    times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
+    outages_s, is_dead = _dead(receiver, times_s, robot.times_s[-1], rng)
+    places = robot.pose_at(times_s)[:, :2] + receiver.sigma_m * rng.normal(size=(len(times_s), 2))
+    times_s, places = times_s[~is_dead], places[~is_dead]
+    stamps_ns, covariance = simulation_stamps_ns(times_s), receiver.sigma_m**2 * np.eye(2)
+    spread = np.tile(covariance.ravel(), (len(times_s), 1))
+    if receiver.origin_deg is None:
+        fixes = make_stream(
+            topic, schemas.POSITION_FIX, stamps_ns, position_m=places, covariance_m2=spread
+        )
+    else:
+        latitude, longitude, altitude = out_of_tangent_plane(places.T, receiver.origin_deg)
+        names = "origin_latitude_deg", "origin_longitude_deg"
+        fixes = make_stream(
+            topic,
+            schemas.GEODETIC_FIX,
+            stamps_ns,
+            metadata=dict(zip(names, map(repr, receiver.origin_deg), strict=True)),
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            altitude_m=altitude,
+            covariance_m2=spread,
+        )
+    told = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
+    return [fixes, *told]
 
 
 def _targets(
@@ -236,10 +284,7 @@ def _look(
 ) -> Sightings:
     """Everything in range and view at the sensor's rate, less dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
-    outage_count = rng.poisson(sensor.outages_per_minute * robot.times_s[-1] / 60)
-    starts_s = np.sort(rng.uniform(0, robot.times_s[-1], outage_count))
-    outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
-    dead = np.any((times_s[:, None] >= outages_s[:, 0]) & (times_s[:, None] < outages_s[:, 1]), 1)
+    outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
     pose = robot.pose_at(times_s)
     places = np.array(
         [
@@ -259,6 +304,20 @@ def _look(
     return Sightings(
         times_s, look, numbers[target], distance.T[look, target], bearing.T[look, target], outages_s
     )
+
+
+def _dead(
+    sensor: Sensor | Fixes,
+    times_s: NDArray[np.float64],
+    duration_s: float,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """A sensor's outages (k, 2), from and to, and whether it is in one of them at some times (n,)."""
+    count = rng.poisson(sensor.outages_per_minute * duration_s / 60)
+    starts_s = np.sort(rng.uniform(0, duration_s, count))
+    outages_s = np.stack([starts_s, starts_s + sensor.outage_s], axis=1)
+    is_dead = np.any((times_s[:, None] >= outages_s[:, 0]) & (times_s[:, None] < outages_s[:, 1]), 1)
+    return outages_s, is_dead
 
 
 def _range(sensor: Sensor, true_m: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -320,13 +379,13 @@ def _pairs(seen: Sightings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return start[look] + first[pair], start[look] + second[pair]
 
 
-def _outages(topic: str, seen: Sightings) -> Stream:
-    spans_ns = simulation_stamps_ns(seen.outages_s)
+def _outages(topic: str, outages_s: NDArray[np.float64]) -> Stream:
+    spans_ns = simulation_stamps_ns(outages_s)
     return make_stream(topic, schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1])
 
 
 LANDMARKS = Simulator(
-    "robots with odometry drive among landmarks; range, bearing and relative-bearing sensors",
+    "robots with odometry drive among landmarks; range, bearing and relative-bearing sensors, fixes",
     LandmarksParameters,
     simulate,
 )

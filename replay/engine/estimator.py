@@ -10,16 +10,36 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 from recorders.errors import BadInput
-from recorders.log import Topic
+from recorders.log import Clock, Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
 from replay.engine.compile import DoesNotCompile
 from replay.engine.components import Components
 from replay.engine.sources import Source, ensemble_of
+
+
+class Opened(NamedTuple):
+    """What is taken from the first messages of a log: whole topics to start from, and what is told."""
+
+    whole: dict[str, Ragged]
+    told: list[Ragged]
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How an estimator finds what a log does not state, such as where to begin.
+
+    Attributes:
+        topics: those whose first messages it is handed.
+        find: what there is to start from; by the clock by which the replay stamps estimates.
+    """
+
+    topics: tuple[str, ...]
+    find: Callable[[Mapping[str, Ragged], Clock], Opened]
 
 
 @dataclass(frozen=True)
@@ -43,6 +63,7 @@ class Recursive:
         rewinding: the same estimator for a block's messages in the order in which they came, whose
             stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
             where its parameters do not let it.
+        opening: how it finds what a log does not state; None where that states all.
     """
 
     name: str
@@ -55,6 +76,7 @@ class Recursive:
     finish: Callable[[Any], list[Ragged]] | None = None
     parameters: Parameters | None = None
     rewinding: "Callable[[int], Recursive] | None" = None
+    opening: Opening | None = None
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Vectors that sensors measure, and their covariances, by the components that their streams state."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +42,8 @@ class Vectors(NamedTuple):
 class Fixes(NamedTuple):
     """Measured vectors (n, d), their covariances (n, d, d) and what is missing (n,) of the latter.
 
-    A covariance that the log lacks (NaN) is that of the given sigma, and missing where none is given.
+    A covariance that the log lacks (NaN, or a variance of zero) is that of the given sigma, and missing
+    where none is given. Components of the vector that are NaN need none.
     """
 
     value: Floats
@@ -64,27 +66,61 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
 def read_fixes(
     stream: Stream, field: str, covariance: str, wanted: Components, sigma: float | None
 ) -> Fixes:
-    """The wanted components of a vector field and of its covariance, row-major in another.
+    """The wanted components of a vector field and of its covariance, row-major or diagonal in another.
 
-    `sigma` of every component stands where the covariance is NaN. Raises BadInput as `read_vectors`,
-    and where the covariance has another width than the vector.
+    `sigma` of every component stands where the covariance is unknown. A position in the plane serves
+    where one in space is wanted: its height is NaN. Raises BadInput as `read_vectors`, and where the
+    covariance has another width than the vector.
     """
+    stream = _in_space(stream, field, covariance, wanted)
     value = read_vectors(stream, field, wanted)
     if not len(stream):
         return Fixes(value, np.empty((0, len(wanted), len(wanted))), np.empty(0, bool))
-    size = stream[field].shape[1]
-    if stream[covariance].shape[1] != size**2:
-        raise BadInput(
-            f"topic {stream.topic}: {covariance} has {stream[covariance].shape[1]} numbers, "
-            f"{size**2} are needed for the {size} of {field}"
-        )
     rows = match_tangent(_stated(stream, field), wanted, f"topic {stream.topic}: {field}")
-    found = stream[covariance].reshape(-1, size, size)[:, rows][:, :, rows]
-    missing = np.isnan(found).any(axis=(1, 2))
+    found = matrices(stream, field, covariance)[:, rows][:, :, rows]
+    if len(rows) == len(wanted):
+        is_absent = np.isnan(value)
+        found[is_absent[:, :, None] | is_absent[:, None, :]] = 0.0
+        found[:, range(len(rows)), range(len(rows))] += is_absent
+    missing = unknown(found)
     if sigma is not None:
         found[missing] = sigma**2 * np.eye(len(rows))
         missing = np.zeros(len(stream), bool)
     return Fixes(value, found, missing)
+
+
+def unknown(covariance: Floats) -> NDArray[np.bool_]:
+    """Which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
+    smallest: Floats = np.diagonal(covariance, axis1=1, axis2=2).min(axis=1)
+    return ~(smallest > 0.0) | np.isnan(covariance.sum(axis=(1, 2)))
+
+
+def matrices(stream: Stream, field: str, covariance: str) -> Floats:
+    """The covariances (n, d, d) of a vector field of d numbers, stated whole or as their diagonals.
+
+    Raises BadInput where they have another width.
+    """
+    size, width = stream[field].shape[1], stream[covariance].shape[1]
+    if width == size**2:
+        return stream[covariance].reshape(-1, size, size)
+    if width == size:
+        return stream[covariance][:, :, None] * np.eye(size)
+    raise BadInput(
+        f"topic {stream.topic}: {covariance} has {width} numbers, {size**2} are needed for the {size} "
+        f"of {field}"
+    )
+
+
+def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -> Stream:
+    """Positions in the plane as such in space, of unknown height, where that is wanted."""
+    is_plane = field == "position_m" and len(stream) and stream[field].shape[1] == 2
+    if not is_plane or "z_m" not in wanted or "components" in stream.metadata:
+        return stream
+    spread = np.full((len(stream), 3, 3), np.nan)
+    spread[:, :2, :2] = matrices(stream, field, covariance)
+    place = np.concatenate([stream[field], np.full((len(stream), 1), np.nan)], axis=1)
+    columns = {**stream.columns, field: place, covariance: spread.reshape(-1, 9)}
+    return replace(stream, columns=columns)
 
 
 def numbers_of(

@@ -10,14 +10,16 @@ from typing import Any
 
 from recorders.errors import BadInput
 from recorders.log import Clock
-from replay.engine.blocks import Block, Ragged, join, merge_events
-from replay.engine.estimator import Batch, Bound, Recursive, code_of
+from replay.engine.blocks import Block, Ragged, gather, join, merge_events
+from replay.engine.estimator import Batch, Bound, Opened, Recursive, code_of
 from replay.engine.late import Late, taking_late
 from replay.engine.priors import start_of_runs
 from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
 
 BLOCK_MESSAGES = 1 << 18
+# Of a run, those that an opening looks at.
+FIRST_MESSAGES = 1 << 15
 # The state of what can start in no run.
 _REFUSED = object()
 
@@ -69,10 +71,14 @@ def replay(
         estimators = [taking_late(bound, late) for bound in estimators]
     ensemble = ensemble_of(sources)
     read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
-    wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
+    stamps: Clock = order if late is None else "publish_time"
+    opened = [_open(bound, ensemble, order, stamps) for bound in estimators]
+    wholes = [
+        {topic: read[topic] for topic in bound.whole} | dict(bound.given) | found.whole
+        for bound, found in zip(estimators, opened, strict=True)
+    ]
     for bound, whole in zip(estimators, wholes, strict=True):
         _refuse_old_priors(bound, ensemble, whole, order)
-    stamps: Clock = order if late is None else "publish_time"
     watches = [
         Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
@@ -80,6 +86,9 @@ def replay(
     states, refused = _start(estimators, watches, wholes)
     if refused and not is_part:
         raise next(iter(refused.values()))
+    told = [ragged for found in opened for ragged in found.told]
+    if told:
+        yield told
     for bound, watch, given in zip(estimators, watches, states, strict=True):
         if isinstance(bound, Batch):
             for block in _required(ensemble, bound.streams, order, sys.maxsize):
@@ -105,6 +114,17 @@ def replay(
                 report.refused[watch.name] = watch.refused
             report.seconds[watch.name.partition("/")[0]] += watch.seconds
             report.coverage += watch.coverage()
+
+
+def _open(bound: Bound, ensemble: Ensemble[Source], order: Clock, stamps: Clock) -> Opened:
+    """What an estimator takes from the first messages of the runs."""
+    if not isinstance(bound, Recursive) or bound.opening is None:
+        return Opened({}, [])
+    topics = bound.opening.topics
+    nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
+    first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
+    with code_of(bound.name):
+        return bound.opening.find(first, stamps)
 
 
 def _start(

@@ -145,4 +145,5 @@ EXTENDED_TARGET = Model(
     ),
     Motion(stay, drift, linear=True),
     system="extended-target",
+    takes_fixes=False,
 )

@@ -5,7 +5,7 @@ as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is l
 """
 
 from collections import namedtuple
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
@@ -13,9 +13,12 @@ import numpy as np
 
 from recorders.log import Schema, Topic, schemas
 from replay.engine.arrays import Floats, Function
-from replay.engine.channels import bindings, stated
+from replay.engine.channels import resolved, stated
+from replay.engine.geodetic import GEODETIC
+from replay.engine.results import named
 from replay.inference.generate import function_of
 from replay.inference.model import (
+    Control,
     Model,
     ModelParameters,
     Sensor,
@@ -29,85 +32,189 @@ from replay.inference.steps import Stage
 
 
 class Found(NamedTuple):
-    """Where a log has what a model needs: the prefix, and the topics of prior, control and sensors."""
+    """Where a log has what a model needs.
+
+    Attributes:
+        prefix: of the thing's topics.
+        prior: of a log without one, where it would be.
+        truth: the topic that estimates are compared with.
+        control: what drives the motion.
+        sensors: those that the log has.
+        has_prior: whether the log does; else see `replay.inference.opening`.
+        instead: topics that take the place of some components of the control.
+        origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
+    """
 
     prefix: str
     prior: Topic
+    truth: str
     control: Topic | None
     sensors: tuple[tuple[Sensor, Topic], ...]
+    has_prior: bool = True
+    instead: tuple[tuple[Control, Topic], ...] = ()
+    origin: Floats | None = None
+
+    @property
+    def geodetic(self) -> tuple[Topic, ...]:
+        """The topics of fixes that are latitude and longitude."""
+        return tuple(topic for _, topic in self.sensors if topic.schema_name == GEODETIC)
 
 
-def topics_of(model: Model, topics: Mapping[str, Topic]) -> list[Found]:
-    """Everything in a log that is of this model."""
-    needed = {model.prior: schemas.GAUSSIAN_ESTIMATE}
-    if model.control is not None:
-        needed[model.control.topic] = model.control.schema
-    senses = {sensor.topic: sensor.schema for sensor in model.sensors}
-    maps = {sensor.about.topic: sensor.about.schema for sensor in model.sensors if sensor.about}
-    found = []
-    for prefix, here in bindings(topics, {**needed, **senses, **maps}, [*senses, *maps]):
-        sensors = tuple(
-            (sensor, here[sensor.topic])
-            for sensor in model.sensors
-            if sensor.topic in here
-            and here[sensor.topic].metadata.get("system", model.system) == model.system
-            and (sensor.about is None or sensor.about.topic in here)
-        )
-        if sensors or not model.needs_sensor:
-            control = here[model.control.topic] if model.control is not None else None
-            found.append(Found(prefix, here[model.prior], control, sensors))
-    return found
+def roles_of(model: Model) -> list[str]:
+    """The topics that a model asks for, by the names that it has for them."""
+    control = [model.control, *model.control.instead] if model.control else []
+    maps = [sensor.about.topic for sensor in model.all_sensors if sensor.about]
+    sensors = [sensor.topic for sensor in model.all_sensors]
+    drives = [each.topic for each in control]
+    return list(dict.fromkeys([model.prior, model.truth, *drives, *maps, *sensors]))
+
+
+class _Here(NamedTuple):
+    """The topics under one prefix of a log; `names` says which of them stand for others."""
+
+    topics: Mapping[str, Topic]
+    prefix: str
+    names: Mapping[str, str]
+
+    def place(self, name: str) -> str:
+        """A topic's full name."""
+        return resolved(self.names.get(name, name), self.prefix)
+
+    def topic(self, name: str, schema: Schema) -> Topic | None:
+        """The topic of this name, if it has messages of the schema or such as serve for it."""
+        found = self.topics.get(self.place(name))
+        return found if found is not None and found.schema_name in serving(schema) else None
+
+    def has(self, name: str) -> bool:
+        """Whether there is a topic of this name, whatever it is."""
+        return self.place(name) in self.topics
+
+
+def serving(schema: Schema) -> tuple[str, ...]:
+    """The schemas, by their full names, whose messages a sensor of this schema takes."""
+    geodetic = (GEODETIC,) if schema is schemas.POSITION_FIX else ()
+    return (schema.full_name, *geodetic)
+
+
+def topics_of(
+    model: Model, topics: Mapping[str, Topic], names: Mapping[str, str] | None = None
+) -> list[Found]:
+    """Everything in a log that is of this model; `names` are topics by the model's names for them."""
+    names = names or {}
+    begins = [model.prior]
+    if model.start is not None:
+        begins += [model.control.topic] if model.control else [each.topic for each in model.all_sensors]
+    ends = [f"/{names.get(name, name).removeprefix('/')}" for name in begins]
+    prefixes = dict.fromkeys(
+        topic.removesuffix(end) for end in ends for topic in topics if topic.endswith(end)
+    )
+    found = (_found(model, _Here(topics, prefix, names)) for prefix in prefixes)
+    return [each for each in found if each is not None]
+
+
+def _found(model: Model, here: _Here) -> Found | None:
+    """What there is of a model under one prefix; None where it does not fit.
+
+    A log without the prior fits a model that can start without, and one without sensors does if it has
+    nothing of them: no sightings whose map is missing, say.
+    """
+    prior = here.topic(model.prior, schemas.GAUSSIAN_ESTIMATE)
+    has_prior = prior is not None
+    if not has_prior and (model.start is None or here.has(model.prior)):
+        return None
+    if prior is None:
+        name = schemas.GAUSSIAN_ESTIMATE.full_name
+        prior = Topic(here.place(model.prior), name, "protobuf", (), named(model.state), 0)
+    control = here.topic(model.control.topic, model.control.schema) if model.control else None
+    if model.control is not None and control is None:
+        return None
+    sensors = tuple(
+        (sensor, topic)
+        for sensor in model.all_sensors
+        if (topic := here.topic(sensor.topic, sensor.schema)) is not None
+        and topic.metadata.get("system", model.system) == model.system
+        and (sensor.about is None or here.topic(sensor.about.topic, sensor.about.schema) is not None)
+    )
+    parts = {each.topic for each in model.all_sensors}
+    parts |= {each.about.topic for each in model.all_sensors if each.about}
+    is_alone = model.start is not None and control is not None and not any(map(here.has, parts))
+    if not sensors and model.needs_sensor and not is_alone:
+        return None
+    instead = tuple(
+        (each, topic)
+        for each in (model.control.instead if model.control else ())
+        if (topic := here.topic(each.topic, each.schema)) is not None
+    )
+    truth = here.place(model.truth)
+    return Found(here.prefix, prior, truth, control, sensors, has_prior, instead)
 
 
 def needs_of(model: Model) -> str:
-    """What a log has to have for a model, in words."""
-    return "; ".join(part.words for part in _parts(model, {}, "..."))
+    """What a log has to have for a model, in words; of one that can start without, what it may have."""
+    words = [part.words for part in parts_of(model, _Here({}, "...", {}))]
+    if model.start is None or model.control is None or not model.needs_sensor:
+        return "; ".join(words)
+    control, *maps, sensors = words
+    of_maps = [f"those about a map need {each}" for each in maps]
+    return "; ".join([control, sensors.replace("one of", "any of", 1), *of_maps])
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
     """Which of the models comes nearest to fitting a log, and what the log lacks for it."""
-    prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
-    tried = [(name, _parts(model, topics, each)) for name, model in models.items() for each in prefixes]
-    name, parts = max(tried, key=lambda one: sum(1 if part.is_here else -1 for part in one[1]))
+    tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
+    name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
         return f"it has nothing that {' or '.join(models)} needs"
     missing = "; ".join(part.words for part in parts if not part.is_here)
     return f"model {name} comes nearest and lacks {missing}"
 
 
-class _Part(NamedTuple):
+def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
+    """What a model needs, under the prefix of a log that has most of it."""
+    prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
+    return max((parts_of(model, _Here(topics, each, {})) for each in prefixes), key=_fit)
+
+
+def _fit(parts: Sequence["Part"]) -> int:
+    return sum(1 if part.is_here else -1 for part in parts)
+
+
+class Part(NamedTuple):
     """Something that a model needs, and whether a log has it."""
 
     words: str
     is_here: bool
 
 
-def _parts(model: Model, topics: Mapping[str, Topic], prefix: str) -> list[_Part]:
+def parts_of(model: Model, here: _Here) -> list[Part]:
     """All that a model needs under one prefix."""
 
-    def part(name: str, schema: Schema, system: str = "") -> _Part:
-        place = name if name.startswith("/") else f"{prefix}/{name}"
-        found = topics.get(place)
-        if found is not None and found.schema_name != schema.full_name:
-            found = None
+    def part(name: str, schema: Schema, system: str = "") -> Part:
+        place, known = here.place(name), here.topics.get(here.place(name))
         words = f"{place} ({schema.full_name}"
         words += f" of system {system})" if system else ")"
-        if place in topics and found is None:
-            words += f", which is {topics[place].schema_name} here"
-        return _Part(words, found is not None and found.metadata.get("system", system) == system)
+        if known is not None and known.schema_name not in serving(schema):
+            return Part(f"{words}, which is {known.schema_name} here", is_here=False)
+        is_of = known is not None and known.metadata.get("system", system) == system
+        return Part(words, is_here=is_of)
 
-    words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
-    if is_here:
-        is_here = names_state(topics[f"{prefix}/{model.prior}"], model)
-    parts = [_Part(f"{words} of {', '.join(model.state)}", is_here)]
+    parts = []
+    if model.start is None or here.has(model.prior):
+        words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
+        if is_here:
+            is_here = names_state(here.topics[here.place(model.prior)], model)
+        parts.append(Part(f"{words} of {', '.join(model.state)}", is_here))
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
-    maps = {sensor.about.topic: sensor.about for sensor in model.sensors if sensor.about}
+    seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
+    maps = {sensor.about.topic: sensor.about for sensor in seeing if sensor.about}
     parts += [part(topic, each.schema) for topic, each in maps.items()]
-    sensors = [part(each.topic, each.schema, model.system) for each in model.sensors]
+    sensors = [part(each.topic, each.schema, model.system) for each in model.all_sensors]
     if sensors and model.needs_sensor:
-        words = ("one of " if len(sensors) > 1 else "") + ", ".join(each.words for each in sensors)
-        parts.append(_Part(words, any(each.is_here for each in sensors)))
+        own = len(model.sensors)
+        words = ("one of " if own > 1 else "") + ", ".join(each.words for each in sensors[:own])
+        words = ", or ".join([words, *(each.words for each in sensors[own:])])
+        parts.append(Part(words, any(each.is_here for each in sensors)))
     return parts
 
 
@@ -175,8 +282,9 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     model = stage.model
     names = number_fields(model.parameters)
     given = {name: getattr(parameters, name) for name in names}
-    everything = [topic for topic in (found.control, found.prior) if topic is not None]
-    everything += [topic for _, topic in found.sensors]
+    everything = _speaking(found)
+    assumed = assumed_of(label, stage, found, parameters)
+    given |= {name: number for name, number in assumed.items() if given[name] is None}
     needed = _needed(f"estimator {label}", stage, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
     settings = np.array(
@@ -193,6 +301,29 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     if stage.modes:
         switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
     return settings
+
+
+def _speaking(found: Found) -> list[Topic]:
+    """The topics whose channels state numbers, in the order in which they are asked."""
+    control = [] if found.control is None else [found.control]
+    instead, sensors = ([topic for _, topic in each] for each in (found.instead, found.sensors))
+    return [*instead, *control, found.prior, *sensors]
+
+
+def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
+    """The parameters that are used, and assumed since a log without a prior does not state them."""
+    start = stage.model.start
+    if found.has_prior or start is None:
+        return {}
+    names = number_fields(stage.model.parameters)
+    given = {name: getattr(parameters, name) for name in names}
+    read = set().union(*_needed(f"estimator {label}", stage, tuple(given.items())))
+    stating = _speaking(found)
+    return {
+        name: number
+        for name, number in start.parameters.items()
+        if name in read and given[name] is None and not any(name in each.metadata for each in stating)
+    }
 
 
 @lru_cache(maxsize=64)
@@ -218,4 +349,5 @@ def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
     if sensor.noise is not None:
         sensor.noise(recorder)
     mend = "".join(f"; give --set {name}=..." for name in sorted(recorder.read))
-    return f"topic {topic}: {sensor.covariance} is missing{mend}"
+    what = sensor.covariance if isinstance(sensor.covariance, str) else "its covariance"
+    return f"topic {topic}: {what} is missing{mend}"

@@ -1,6 +1,6 @@
 """Estimators made of a model and a method, as a replay takes them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
@@ -20,6 +20,7 @@ from replay.engine.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
+from replay.engine.geodetic import origins_of, stated_origin
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, innovation_stream, state_stream
 from replay.inference.augmentation import (
@@ -32,17 +33,19 @@ from replay.inference.augmentation import (
 )
 from replay.inference.binding import (
     Found,
+    assumed_of,
     complaint_of,
     names_state,
     nearest,
     needs_of,
     number_fields,
     reading_settings,
+    roles_of,
     settings_of,
     topics_of,
 )
 from replay.inference.happenings import (
-    Points,
+    World,
     data_columns,
     happenings_of,
     held,
@@ -54,6 +57,7 @@ from replay.inference.happenings import (
 )
 from replay.inference.methods import Method
 from replay.inference.model import Model, ModelParameters, Motion
+from replay.inference.opening import Beginning
 from replay.inference.recursion import (
     Carried,
     Estimates,
@@ -166,7 +170,14 @@ def _bind_fitting(
     named = given.pop("model", None)
     if named is not None:
         models = {named: load("models", named, Model)}
-    found = {name: topics_of(model, topics) for name, model in models.items()}
+    renamed = given.get("topics") or {}
+    asked = {name: roles_of(model) for name, model in models.items()}
+    for role in renamed:
+        _check_role(label, role, {each for roles in asked.values() for each in roles})
+    found = {
+        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
+        for name, model in models.items()
+    }
     fitting = [name for name in models if found[name]]
     if len(fitting) > 1:  # then the prior's components tell
         named_alike = [
@@ -208,7 +219,10 @@ def bind_model(
             f"estimator {label}: with estimate = {', '.join(names)} the model lacks {lacking}, which "
             "this method needs"
         )
-    for found in topics_of(model, topics):
+    renamed = parameters.topics or {}
+    _check_topics(label, model, topics, renamed)
+    for found in topics_of(model, topics, renamed):
+        found = found._replace(origin=_origin_of(label, model, found, topics))
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
         stage = augmented_stage(own, names)
@@ -218,14 +232,58 @@ def bind_model(
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
-        streams = (*control, *(topic.name for _, topic in found.sensors))
+        read = (*found.instead, *found.sensors)
+        streams = (*control, *(topic.name for _, topic in read))
+        assumed = assumed_of(label, own, found, parameters)
+        opening = Beginning(name, found, own, numbers, assumed).opening
         whole = filtering.whole(topics)
         priors = {found.prior.name: model.state}
         begun = begin(label, found.prior.name, own, names, numbers, parameters)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
+        made = replace(made, opening=opening)
         bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
     return bound
+
+
+def _check_role(label: str, role: str, roles: Collection[str]) -> None:
+    if role not in roles:
+        raise BadInput(f"estimator {label}: topics.{role}: no model asks for it; {choices(role, roles)}")
+
+
+def _check_topics(
+    label: str, model: Model, topics: Mapping[str, Topic], renamed: Mapping[str, str]
+) -> None:
+    """Raise BadInput where a topic stands for one that the model does not ask for, or is not there."""
+    for role, name in renamed.items():
+        _check_role(label, role, roles_of(model))
+        if name and not any(topic.endswith(f"/{name.removeprefix('/')}") for topic in topics):
+            raise BadInput(
+                f"estimator {label}: topics.{role} = {name}: the log has no such topic; "
+                f"{choices(name, topics)}"
+            )
+
+
+def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Floats | None:
+    """The origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
+
+    Raises BadInput where channels state different ones, or the first fix would have to be the origin
+    though another sensor says where the thing is in a frame of its own.
+    """
+    origin = stated_origin(topics) if found.geodetic else None
+    if not found.geodetic or origin is not None:
+        return origin
+    for sensor, topic in found.sensors:
+        if topic not in found.geodetic and "x_m" in sensor.measured and "x_m" in model.state:
+            fix = found.geodetic[0].name
+            role = next(each.topic for each, of in found.sensors if of.name == fix)
+            raise BadInput(
+                f"estimator {label}: {fix} is latitude and longitude, {topic.name} a position in "
+                f"{topic.metadata.get('frame_id', 'a frame of its own')}, and no channel states where "
+                f"on earth that is (origin_latitude_deg, origin_longitude_deg); leave one of them out "
+                f"with --set topics.{role}= or --set topics.{sensor.topic}="
+            )
+    return None
 
 
 def _rewinding(
@@ -270,7 +328,7 @@ class State(NamedTuple):
 
     Attributes:
         carried: see `recursion.Carried`.
-        points: of every map, by its topic.
+        world: what messages are read against.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         kept: what a smoother keeps for its way back, or a filter for late messages.
@@ -278,7 +336,7 @@ class State(NamedTuple):
     """
 
     carried: Carried
-    points: Mapping[str, Points]
+    world: World
     generators: tuple[Any, ...]
     waiting: Happenings | None
     tick: Integers
@@ -323,9 +381,10 @@ class Filter:
     samplers: tuple[Sampler, ...]
 
     def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
-        """The topics of a log that it starts from: the prior and the maps."""
+        """The topics of a log that it starts from: the prior, where there is one, and the maps."""
         maps = (sensor.about.topic for sensor in self.stage.sensors if sensor.about)
-        return tuple(dict.fromkeys((self.found.prior.name, *maps)))
+        prior = (self.found.prior.name,) if self.found.has_prior else ()
+        return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, whole: Mapping[str, Ragged]) -> State:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
@@ -340,11 +399,18 @@ class Filter:
         if model.control is not None and model.control.interpolated:  # what drives from there on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
             waiting = times_alone(runs, time_ns.copy(), width, is_due=False)
-        return State(carried, points, (), waiting, np.zeros(len(mean), np.int64))
+        world = World(points, self.origins(whole, len(mean)))
+        return State(carried, world, (), waiting, np.zeros(len(mean), np.int64))
+
+    def origins(self, whole: Mapping[str, Ragged], runs: int) -> Floats | None:
+        """The origins of the planes (runs, 3), see `World`: as stated, else the first fixes."""
+        if self.found.origin is not None:
+            return np.tile(self.found.origin, (runs, 1))
+        return next((origins_of(whole[topic.name]) for topic in self.found.geodetic), None)
 
     def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
         """Filter a block."""
-        happenings, lacking = happenings_of(self.stage, self.found, block, state.points, self.settings)
+        happenings, lacking = happenings_of(self.stage, self.found, block, state.world, self.settings)
         passed_over = self.passed_over(block, lacking)
         tick, waiting = state.tick, None
         if self.parameters.every_s is not None:
@@ -467,8 +533,7 @@ class Filter:
     @property
     def truth(self) -> str:
         """The topic that the estimates are compared with."""
-        truth = self.stage.model.truth
-        return truth if truth.startswith("/") else f"{self.found.prefix}/{truth}"
+        return self.found.truth
 
     def told(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
         """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""

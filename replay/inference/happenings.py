@@ -12,7 +12,8 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged, last_of_equals, ragged_rows
-from replay.engine.measurements import read_fixes, read_vectors
+from replay.engine.geodetic import GEODETIC, in_plane
+from replay.engine.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.binding import Found, number_fields, reading_settings
 from replay.inference.model import Control, Map, Sensor
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
@@ -51,6 +52,16 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
+class World(NamedTuple):
+    """What messages are read against: the points of every map by its topic, and the plane's origins.
+
+    The origins (runs, 3) are latitude, longitude and altitude; None where no fix needs them.
+    """
+
+    points: Mapping[str, Points]
+    origins: Floats | None
+
+
 @lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
     """How many numbers an event has, and the first of the control's among them."""
@@ -63,19 +74,22 @@ def data_columns(stage: Stage) -> tuple[int, int]:
 
 
 def happenings_of(
-    stage: Stage, found: Found, block: Block, points: Mapping[str, Points], settings: Floats
+    stage: Stage, found: Found, block: Block, world: World, settings: Floats
 ) -> tuple[Happenings, Booleans]:
     """A block's messages as the recursion takes them, and which of them lack their covariance."""
     events, control = block.events, stage.model.control
     width, start = data_columns(stage)
-    tables: list[_Table] = []
+    tables: list[Table] = []
     if control is not None and found.control is not None:
-        tables.append(_control_table(control, block.streams[found.control.name], width, start))
+        columns = {name: start + index for index, name in enumerate(control.components)}
+        replaced = {name for each, _ in found.instead for name in each.components}
+        own = {name: column for name, column in columns.items() if name not in replaced}
+        tables.append(_control_table(control, block.streams[found.control.name], width, own))
+        for each, topic in found.instead:
+            tables.append(_control_table(each, block.streams[topic.name], width, columns))
     first = len(tables)
-    parameters = reading_settings(number_fields(stage.model.parameters))
-    for number, (sensor, topic) in enumerate(found.sensors):
-        own = parameters(settings, number + 1)
-        tables.append(_sensor_table(sensor, number, block.streams[topic.name], points, width, own))
+    for number, (_, topic) in enumerate(found.sensors):
+        tables.append(sensor_table(stage, number, block.streams[topic.name], world, settings))
     data, source, target, lacking = (
         column[0] if len(column) == 1 else np.concatenate(column)[events.source]
         for column in zip(*tables, strict=True)
@@ -98,7 +112,7 @@ def last_of_stamps(happenings: Happenings) -> Booleans:
     return last_of_equals(happenings.offsets, happenings.time_ns, *happenings.came.T[:1])
 
 
-class _Table(NamedTuple):
+class Table(NamedTuple):
     """One topic's messages: data (n, width), source, what they are about, who lacks a covariance."""
 
     data: Floats
@@ -107,36 +121,39 @@ class _Table(NamedTuple):
     is_lacking: Booleans
 
 
-def _control_table(control: Control, ragged: Ragged, width: int, start: int) -> _Table:
-    """The control's numbers in the columns from `start` on."""
-    count = len(ragged)
+def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
+    """The numbers of a control in the columns of its components; NaN where they come from elsewhere."""
+    count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
-    names = control.components
     read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
-    data[:, start : start + len(names)] = read
-    return _Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
+    for name, numbers in zip(names, read.T, strict=True):
+        if name in columns:
+            data[:, columns[name]] = numbers
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
 
 
-def _sensor_table(
-    sensor: Sensor,
-    number: int,
-    ragged: Ragged,
-    points: Mapping[str, Points],
-    width: int,
-    parameters: Any,
-) -> _Table:
-    """A sensor's messages: measured, what it is about, its covariance; see `steps.reading`."""
-    m, stream = len(sensor.measured), ragged.stream
+def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settings: Floats) -> Table:
+    """The messages of sensor `number`: measured, what it is about, its covariance; see `steps.reading`.
+
+    A message that lacks its covariance, or of which all is NaN, is as if it had not come.
+    """
+    sensor, (width, _) = stage.sensors[number], data_columns(stage)
+    parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
+    m = len(sensor.measured)
+    if ragged.stream.schema.full_name == GEODETIC:
+        assert world.origins is not None
+        ragged = in_plane(ragged, world.origins)
+    stream = ragged.stream
     source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
     lacking = np.zeros(len(stream), bool)
     parts = []
     if sensor.covariance:
-        fixes = read_fixes(stream, sensor.vector, sensor.covariance, sensor.measured, None)
-        spread, lacking = fixes.covariance, fixes.missing
+        value, spread, lacking = _with_covariance(sensor, ragged)
         variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
         if np.isfinite(variances).all():
             spread[lacking], lacking = np.diag(variances), np.zeros(len(stream), bool)
-        parts = [fixes.value, spread[:, *np.tril_indices(m)]]
+        lacking = lacking | np.isnan(value).all(axis=1)
+        parts = [value, spread[:, *np.tril_indices(m)]]
     elif sensor.read:
         parts = [_computed(sensor.read, ragged, m)]
     elif sensor.vector:
@@ -146,7 +163,7 @@ def _sensor_table(
     if sensor.about is not None:
         target = stream[sensor.about.of].astype(np.int64)
         run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
-        places = points[sensor.about.topic]
+        places = world.points[sensor.about.topic]
         rows = places.rows(run, target)
         source[rows < 0] = NOTHING
         parts.insert(1, places.at(rows))
@@ -155,7 +172,18 @@ def _sensor_table(
     if filled < width:
         parts.append(np.full((len(stream), width - filled), np.nan))
     data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-    return _Table(np.ascontiguousarray(data), source, target, lacking)
+    return Table(np.ascontiguousarray(data), source, target, lacking)
+
+
+def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
+    """What messages measure, their covariances and which of them lack one."""
+    if isinstance(sensor.covariance, str):
+        return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
+    assert sensor.read is not None
+    m = len(sensor.measured)
+    value = _computed(sensor.read, ragged, m)
+    spread = np.array(sensor.covariance(ragged.stream), float).reshape(len(value), m, m)
+    return Fixes(value, spread, unknown(spread))
 
 
 def _fields(stream: Stream, names: Sequence[str]) -> Floats:

@@ -56,6 +56,8 @@ class MethodParameters(Parameters):
     motion to use of a model that has several. `estimate` names parameters that become part of the state:
     each starts from its value with the standard deviation that `estimate_sigma` has for it, and drifts
     at random by the density (per square root of a second) that `estimate_drift` has, by default not.
+    `topics` says which topic of the log stands for one that the model asks for, such as
+    {pose = "/amcl_pose/pose"}; an empty name leaves a sensor out.
     """
 
     every_s: PositiveFloat | None = None
@@ -63,6 +65,7 @@ class MethodParameters(Parameters):
     estimate: list[str] | None = None
     estimate_sigma: dict[str, PositiveFloat] | None = None
     estimate_drift: dict[str, NonNegativeFloat] | None = None
+    topics: dict[str, str] | None = None
 
 
 class UnscentedParameters(MethodParameters):

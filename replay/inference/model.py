@@ -7,19 +7,22 @@ every model that gives what the method needs.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import Schema, Stream
+from recorders.log import Schema, Stream, schemas
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.tangent import are_kinds
-from replay.inference.generate import tangent_size
+from replay.inference.generate import function_of, tangent_size
+
+FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 
 class ModelParameters(Parameters):
@@ -31,6 +34,8 @@ class ModelParameters(Parameters):
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
     """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+    sigma_fix_m: PositiveFloat | None = None
+    """Of each component of a position fix that does not state its covariance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +78,8 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
+        instead: other topics that the components of these names are taken from where the log has them,
+            such as a gyro's turn rate in place of the wheels'.
     """
 
     topic: str
@@ -82,6 +89,7 @@ class Control:
     interpolated: bool = False
     initial: tuple[float, ...] = ()
     estimates: bool = False
+    instead: tuple["Control", ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +139,7 @@ class Sensor:
 
     Attributes:
         topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
-        schema: of its messages.
+        schema: of its messages. A GeodeticFix serves for a PositionFix, through the log's origin.
         measured: the components by name, with their kinds ("linear" or "angle").
         measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
             empty. With `noises`, (state, noise, about, parameters). A component that says nothing of
@@ -141,7 +149,8 @@ class Sensor:
             has neither is passed over, and counted.
         vector: the field that holds what is measured as a vector, by the names of its components; else
             every component is a field of its own.
-        covariance: the field that holds the vector's covariance.
+        covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
+            where it is unknown.
         about: what the message is about.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
@@ -159,13 +168,54 @@ class Sensor:
     noise: Function | None = None
     noises: int = 0
     vector: str = ""
-    covariance: str = ""
+    covariance: str | Callable[[Stream], Floats] = ""
     about: Map | None = None
     read: Callable[[Stream], Floats] | None = None
     linear: bool = False
     jacobian: Function | None = None
     moments: Function | None = None
     log_likelihood: Function | None = None
+
+
+@lru_cache(maxsize=64)
+def fix_sensor(places: tuple[int, ...]) -> Sensor:
+    """The sensor of position fixes, of a state that has x, y and perhaps z in these places."""
+    entries = ", ".join(f"state[{place}]" for place in places)
+    variances = ", ".join(["parameters.sigma_fix_m ** 2"] * len(places))
+    return Sensor(
+        FIX,
+        schemas.POSITION_FIX,
+        dict.fromkeys(POSITION[: len(places)], "linear"),
+        function_of(f"def position(state, about, parameters):\n    return ({entries},)\n"),
+        function_of(f"def fix_noise(parameters):\n    return ({variances},)\n"),
+        vector="position_m",
+        covariance="covariance_m2",
+        linear=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What is assumed of a log that has no prior: it was not made for the model.
+
+    It begins at the first message that measures components of the state by their names, a fix or a pose
+    with its covariance. What that does not measure is zero, and as uncertain as is said here. Where
+    nothing measures the state, so is everything; with no sensor at all, the thing begins at zero, which
+    is where its frame is.
+
+    Attributes:
+        sigmas: standard deviations of the state's components, linear ones and angles.
+        parameters: numbers that no channel of such a log states.
+        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
+            None where these do not tell it yet. The path (k, n) is where the control alone leads from
+            zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
+            The state is that at the last of them, and begins just after it: they are used up. For a
+            state of which a position tells too little.
+    """
+
+    sigmas: Mapping[str, float]
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    align: Callable[..., tuple[Floats, Floats] | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +226,8 @@ class Model:
         summary: what it is, in one line.
         state: the components by name, with their kinds; the four of a quaternion side by side.
         parameters: their type.
-        sensors: all it can use; any of them makes a log fit.
+        sensors: all it can use; any of them makes a log fit. A model with a position, linear `x_m` and
+            `y_m` or these and `z_m`, takes fixes as well, see `all_sensors`.
         motion: how the state moves.
         modes: other motions by name, for methods of several; `motion` is then one of them.
         switching: how the thing changes between its modes.
@@ -185,6 +236,8 @@ class Model:
         output: the last part of the estimates' topic.
         system: what a channel's metadata has to name as its `system`, if anything.
         needs_sensor: whether a log without any of its sensors does not fit.
+        start: what is assumed of a log without the prior; None where that does not fit.
+        takes_fixes: whether position fixes are sensors of it.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -231,6 +284,19 @@ class Model:
     system: str = ""
     needs_sensor: bool = True
     estimable: Components = field(default_factory=dict)
+    start: Start | None = None
+    takes_fixes: bool = True
+
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, and that of position fixes unless the model has one of its own."""
+        names = [name for name in POSITION if self.state.get(name) == "linear"]
+        has_position = names[:2] == list(POSITION[:2])
+        has_own = any(sensor.topic == FIX for sensor in self.sensors)
+        if has_own or not (has_position and self.takes_fixes):
+            return self.sensors
+        components = list(self.state)
+        return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -332,10 +398,12 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
         raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
-    if sensor.covariance and not sensor.vector:
+    if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:
         raise BadInput(
             f"{where}: the covariance {sensor.covariance} is of no vector; give `vector`, a field"
         )
+    if callable(sensor.covariance) and sensor.read is None:
+        raise BadInput(f"{where}: reads covariances of what it does not read; give `read` as well")
     if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
         _check(where, sensor.noise, (parameters,), wanted)

@@ -140,10 +140,11 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: Carried) -> None:
-        """The control from this event on; an interpolated one stands behind the sensors' numbers."""
+        """The control from this event on, of what it has; an interpolated one stands at the end."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
-            carried.control[run, k] = data[first + k]
+            if not np.isnan(data[first + k]):
+                carried.control[run, k] = data[first + k]
 
     def advance(
         run: int,

@@ -340,9 +340,7 @@ class Rewinding:
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
         """Filter a block, its messages in the order in which they came."""
         inner, sensors = self.inner, self.inner.stage.sensors
-        happenings, lacking = happenings_of(
-            inner.stage, inner.found, block, state.points, inner.settings
-        )
+        happenings, lacking = happenings_of(inner.stage, inner.found, block, state.world, inner.settings)
         carried, before = copied(state.carried), state.kept
         history = before.with_room(2 * (_most_within(before, happenings, self.window_ns) + 3))
         runs = len(history.first)

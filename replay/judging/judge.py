@@ -50,15 +50,18 @@ from replay.judging.truths import Truths
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
+STARTED = schemas.STARTED.full_name
 COVERAGE = schemas.COVERAGE.full_name
 # What a replay says of itself, leaves of topics: no estimates, nothing to judge.
-TOLD = ("failure", "skipped", "coverage")
+TOLD = ("failure", "skipped", "started", "coverage")
 # Less than this share of a span is said; a run's first measurements may well be before the prior.
 LEAST_SHARE = 0.995
 # A table has at most so many steps; of more, neighbours share a row.
 STEPS = 1 << 17
 # The sums over time of one run: at most so many bins, of a millisecond times a power of two.
 TIME_BINS = 64
+# Of very many runs they are fewer each: so many bins in all.
+TIME_CELLS = 1 << 18
 TIME_BIN_NS = 1_000_000
 
 
@@ -95,12 +98,14 @@ class Told:
     failed: dict[int, str] = field(default_factory=dict)
     speaking: set[int] | None = None
     skipped: Counter[str] = field(default_factory=Counter)
+    started: Counter[str] = field(default_factory=Counter)
     covered: Sums = field(default_factory=dict)
 
     def merge(self, other: "Told") -> None:
         """Take in what was said of other runs."""
         self.failed |= other.failed
         self.skipped.update(other.skipped)
+        self.started.update(other.started)
         if other.speaking is not None:
             self.speaking = other.speaking | (self.speaking or set())
         self.covered = plus(self.covered, other.covered)
@@ -189,7 +194,7 @@ class Judge:
         columns = _columns_of(errors)
         if topic not in self._quantities:
             width = columns.shape[1]
-            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS)
+            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS, cells=TIME_CELLS)
             self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
@@ -212,8 +217,17 @@ class Judge:
                 told.failed.setdefault(self._first_run + run, sentence)
         elif schema == SKIPPED:
             told.skipped.update(sentences_of(rows.stream))
+        elif schema == STARTED:
+            told.started.update(sentences_of(rows.stream))
         elif schema == COVERAGE:
             told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
+
+    def close(self) -> None:
+        """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
+        self._sources, self._truths, self._on_errors = (), [], None
+        self._steps.clear()
+        for each in self._quantities.values():
+            each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
 
     def merge(self, other: "Judge") -> None:
         """Take in what was judged of other runs."""
@@ -285,8 +299,15 @@ class Judge:
 
     @property
     def losses(self) -> list[str]:
-        """A sentence for every case that was not estimated throughout, and for measurements not used."""
+        """A sentence for every case that was not estimated throughout, and for measurements not used.
+
+        Those for what was assumed, as of where to begin, come first.
+        """
         said = []
+        for topic, told in self._told.items():
+            for reason, count in told.started.items():
+                runs = f" (in {count} runs)" if count > 1 else ""
+                said.append(f"{_what(topic)}: {reason}{runs}")
         for topic, told in self._told.items():
             share = estimated_share(told.covered)
             if share is not None and share < LEAST_SHARE:

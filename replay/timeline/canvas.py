@@ -1,7 +1,8 @@
 """What there is to draw (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
 
 A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
-that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`.
+that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`. Where stamps are
+no dates, as those of a simulated clock in a bag, `utc` is when they reached the recorder.
 """
 
 import re
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, split_topic
+from replay.judging.evaluation import Errors, Floats, split_topic
 
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]
@@ -41,6 +42,8 @@ DRAWN_ROWS = 5000
 # A stream is silent after so many of its usual intervals, but not before so long.
 GAP_INTERVALS = 5.0
 GAP_S = 1.0
+# Stamps before the year 2000 count from something else than 1970.
+DATES_FROM_NS = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,9 @@ class Scene:
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """The truth streams of a case."""
-        return [self.read(topic) for topic in self._truths if _prefix(topic) == case]
+        """The non-empty truth streams of a case."""
+        truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
+        return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
         """The run's sensor topics below a case, and those that are below none; see `unread`."""
@@ -120,6 +124,12 @@ class Scene:
         return self.source.read([topic])[topic]
 
     @property
+    def dates(self) -> "Dates | None":
+        """What stamps are as dates, by the topic with most messages; None where they are dates."""
+        streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
+        return dates_of(max(streams, key=len)) if streams else None
+
+    @property
     def _truths(self) -> list[str]:
         schema_name = schemas.TRUTH_STATE.full_name
         return [each.name for each in self.source.topics.values() if each.schema_name == schema_name]
@@ -135,6 +145,32 @@ def _natural(name: str) -> list[tuple[str, int]]:
 
 
 @dataclass(frozen=True)
+class Dates:
+    """Two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+
+    Between two stamps the difference is linear, and before the first and after the last it stays.
+    """
+
+    stamps_ns: Times
+    later_ns: Times
+
+    def of(self, time_ns: Times) -> Times:
+        """The dates of stamps (n,)."""
+        first_ns = self.later_ns[0]
+        drift_ns = np.interp(time_ns, self.stamps_ns, self.later_ns - first_ns)
+        found: Times = time_ns + first_ns + np.rint(drift_ns).astype(np.int64)
+        return found
+
+
+def dates_of(stream: Stream) -> Dates | None:
+    """The dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
+    if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
+        return None
+    return Dates(stamps_ns, logged_ns - stamps_ns)
+
+
+@dataclass(frozen=True)
 class Canvas:
     """A recording and its clocks.
 
@@ -144,6 +180,7 @@ class Canvas:
         end_ns: when the last estimate or truth is.
         steps_ns: the distinct times of estimates, which `step` counts.
         is_still: nothing that moves is sent: it is there already.
+        dates: what stamps are as dates, where they are none themselves.
     """
 
     recording: rr.RecordingStream
@@ -151,16 +188,18 @@ class Canvas:
     end_ns: int
     steps_ns: Times
     is_still: bool = False
+    dates: Dates | None = None
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
         """Send the rows of one entity, all at once."""
         if len(time_ns) == 0 or self.is_still:
             return
         step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
+        date_ns = time_ns if self.dates is None else self.dates.of(time_ns)
         index = [
             rr.TimeColumn("step", sequence=np.maximum(step, 0)),
             rr.TimeColumn("sim_time", duration=(time_ns - self.epoch_ns).astype("timedelta64[ns]")),
-            rr.TimeColumn("utc", timestamp=time_ns.astype("datetime64[ns]")),
+            rr.TimeColumn("utc", timestamp=date_ns.astype("datetime64[ns]")),
         ]
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
@@ -206,9 +245,35 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
     """The rows to draw: all, or the last of each of `rows` equal spans of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
-    span_ns = max((time_ns[-1] - time_ns[0]) / rows, 1.0)
-    of_span = np.minimum((time_ns - time_ns[0]) / span_ns, rows - 1).astype(np.int64)
+    of_span = _spans(time_ns, rows)
     return np.flatnonzero(np.append(of_span[1:] != of_span[:-1], True))
+
+
+def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
+    """The rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    if len(time_ns) <= rows:
+        return np.arange(len(time_ns))
+    return extremes(_spans(time_ns, rows // 2), values)
+
+
+def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
+    """The rows of the least and of the greatest value of every span, the first where several are.
+
+    `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
+    """
+    first = np.flatnonzero(np.diff(of_span, prepend=-1))
+    sizes = np.diff(first, append=len(of_span))
+    found = []
+    for extreme in (np.fmin, np.fmax):
+        rows = np.flatnonzero(values == np.repeat(extreme.reduceat(values, first), sizes))
+        found.append(rows[np.diff(of_span[rows], prepend=-1) > 0])
+    return np.unique(np.concatenate(found))
+
+
+def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
+    """In which of so many equal spans of time each stamp is, from zero on."""
+    span_ns = max((time_ns[-1] - time_ns[0]) / spans, 1.0)
+    return np.minimum((time_ns - time_ns[0]) / span_ns, spans - 1).astype(np.int64)
 
 
 def gap_limit_ns(time_ns: Times) -> int:

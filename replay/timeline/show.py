@@ -172,7 +172,7 @@ def _canvas(
     steps_ns = np.unique(np.concatenate([none, *(each.publish_time_ns for each in estimates)]))
     truths = [truth.publish_time_ns[-1:] for case in scene.cases for truth in scene.truths_of(case)]
     end_ns = int(np.concatenate([[epoch_ns], steps_ns[-1:], *truths]).max())
-    return Canvas(recording, epoch_ns, end_ns, steps_ns, is_still)
+    return Canvas(recording, epoch_ns, end_ns, steps_ns, is_still, scene.dates)
 
 
 def _identity(outputs: Mapping[str, Stream]) -> str:

@@ -21,6 +21,7 @@ from replay.engine.sources import MemorySource, memory_source
 # Of each importer: what to give it in the folder of real data, and the archive that this is in.
 DATA = {
     "ais": ("solent_ais.csv.xz", ""),
+    "autoferry": ("autoferry", "autoferry.tar.xz"),
     "broad": ("broad", ""),
     "mrclam": ("mrclam6", "mrclam6.tar.xz"),
     "score-matrices": ("bssr1", "bssr1_set1.tar.xz"),
@@ -39,6 +40,7 @@ class Recipe:
         alone: whether these are all estimators.
         run: which run of the experiment's seed.
         span_s: so many seconds of the log.
+        part: of the imported data, the folder that is one log.
         late: what is done about late messages, in the order of their arrival.
         over: entries over those of an experiment without logs; its metrics are the golden.
     """
@@ -50,6 +52,7 @@ class Recipe:
     alone: bool = False
     run: int = 0
     span_s: float = np.inf
+    part: str = ""
     late: str = ""
     over: Mapping[str, Any] = field(default_factory=dict)
 
@@ -97,6 +100,8 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
+    # scans that come late, and vessels that go side by side
+    "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
     "extended-target-failing": Recipe("extended-target", run=117),
     # delays, outliers, outages; ranges and bearings alone; the gate that the estimators have by default
@@ -183,7 +188,8 @@ def first_log(recipe: Recipe, places: Mapping[str, Path]) -> MemorySource:
     experiment = recipe.loaded
     if experiment.import_:
         given = experiment.import_
-        recording, run = import_run(given.source, places[given.source], given.parameters)
+        place = places[given.source] / recipe.part
+        recording, run = import_run(given.source, place, given.parameters)
     else:
         assert experiment.record
         [own, *_] = experiment.options.get("scenarios", [experiment.record.scenario])

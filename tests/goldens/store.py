@@ -29,7 +29,7 @@ FOLDER = Path(__file__).parent / "stored"
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
 # Their values are numbers of sentences, which may be worded anew.
-REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name}
+REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name, schemas.STARTED.full_name}
 
 Golden = dict[str, Any]
 Floats = NDArray[np.float64]

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.testing import assert_array_equal
 
 import fuselog as fl
+from tests.replay.timeline.test_timeline import read
 
 
 def test_a_bag_becomes_a_log_and_info_says_how(
@@ -52,6 +54,45 @@ def test_info_of_a_bag_that_is_no_mcap(
         assert f"fuselog import ros {path}" in told.out
         assert fuselog("info", str(path), "--json").json["topics"][1]["messages"] == 517
     assert sorted(folder.iterdir()) == before
+
+
+def test_from_the_bag_to_a_picture(
+    fuselog: Callable[..., Any], real_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No line of own code: odometry with the poses of AMCL, and alone; both clocks on the timeline."""
+    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    log, rrd, estimates = (tmp_path / name for name in ("nav.mcap", "nav.rrd", "estimates.mcap"))
+    bag = str(real_data / "nav2_turtlebot.mcap")
+    assert fuselog("import", "ros", bag, "-o", str(log)).code == 0
+    said = fuselog("info", str(log)).out
+    assert "robot: -e ekf iekf ukf lrkf smoother particles; from /odometry, /pose" in said
+    assert "vehicle: needs prior (fuselog.GaussianEstimate) of x_m, vx_mps, y_m, vy_mps; fix" in said
+    both = ["-e", "ekf", "-e", "smoother:ekf"]
+    done = fuselog("replay", str(log), *both, "--save", str(rrd), "-o", str(estimates))
+    assert done.code == 0
+    for words in (
+        "ekf: the log has no prior (/prior): it begins at the first message of /pose",
+        "smoother:ekf: no channel states turn_noise_density: 0.05 is assumed; --set turn_noise_density=",
+    ):
+        assert words in done.out
+    source, made = fl.open(log), fl.open(estimates)
+    poses = made["/estimates/smoother:ekf/pose"]
+    seen = source["/pose"]
+    rows = np.searchsorted(poses.publish_time_ns, seen.publish_time_ns)
+    apart_m = np.hypot(*(poses["mean"][rows, :2] - seen["position_m"][:, :2]).T)
+    assert len(rows) == 135
+    assert np.median(apart_m) < 0.1
+    drawn, driven = read(rrd)["/plots/odometry/forward_mps/forward_mps"], source["/odometry"]
+    assert_array_equal(drawn["utc"], driven.log_time_ns)
+    assert_array_equal(drawn["sim_time"], driven.publish_time_ns - seen.publish_time_ns[0])
+    alone = fuselog("replay", str(log), "-e", "ekf", "--set", "topics.pose=", "-o", str(estimates))
+    assert alone.code == 0
+    assert "it begins at zero, where its frame is" in alone.out
+    own = source["/odometry_pose"]
+    steps_m = np.hypot(*np.diff(own["position_m"][:, :2], axis=0).T)
+    reckoned = fl.open(estimates)["/estimates/ekf/pose"]["mean"]
+    assert len(reckoned) == 2639
+    assert np.hypot(*np.diff(reckoned[:, :2], axis=0).T).sum() == pytest.approx(steps_m.sum(), rel=0.01)
 
 
 def test_an_imported_odometry_is_replayed(real_data: Path, tmp_path: Path) -> None:

@@ -91,6 +91,9 @@ def test_the_plane_is_where_the_earth_is():
     back = out_of_tangent_plane((east, north), origin)
     assert_allclose(back[0], latitude, atol=1e-9)
     assert_allclose(back[1], longitude, atol=1e-9)
+    assert_allclose(
+        into_tangent_plane((50.77, -1.09, 130.0), (50.77, -1.09, 30.0)), (0, 0, 100), atol=1e-8
+    )
 
 
 def test_compressed_more_columns_other_times_and_a_date_line(tmp_path: Path):

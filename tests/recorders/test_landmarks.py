@@ -8,6 +8,7 @@ from scipy.stats import chi2, expon, kstest, norm, poisson, uniform
 
 from recorders.errors import BadInput
 from recorders.log import Stream
+from recorders.models.geodesy import into_tangent_plane
 from recorders.models.planar import drive, range_bearing, wrap_angle
 from recorders.recording import SIMULATION_EPOCH_NS, record_run
 
@@ -135,6 +136,31 @@ def test_outages_come_at_their_rate_are_recorded_and_silence_the_sensor():
     perfect = visible(streams, 5.0, 8.0, 360.0)
     assert 0.8 < len(seen) / perfect < 0.97  # 60 outages of 2 s in 1200 s are a tenth
     assert "/robot1/range_bearing/outages" not in record()
+
+
+def test_fixes_err_as_stated_in_the_plane_and_on_earth():
+    """Outages silence them, and no other stream notices that there are some."""
+    receiver = {"rate_hz": 4.0, "sigma_m": 0.5, "outages_per_minute": 2.0, "outage_s": 5.0}
+    streams = record(duration_s=300.0, fix=receiver)
+    fixes, truth, outages = (streams[f"/robot1/{name}"] for name in ("fix", "truth", "fix/outages"))
+    place = truth["state"][np.searchsorted(truth.publish_time_ns, fixes.publish_time_ns), :2]
+    assert_distributed((fixes["position_m"] - place).ravel(), norm(0.0, 0.5))
+    assert_array_equal(fixes["covariance_m2"], np.tile([0.25, 0.0, 0.0, 0.25], (len(fixes), 1)))
+    assert len(outages) > 3
+    for begin_ns, end_ns in zip(outages.publish_time_ns, outages["end_time_ns"], strict=True):
+        assert not ((begin_ns <= fixes.publish_time_ns) & (fixes.publish_time_ns < end_ns)).any()
+    assert 0.6 * 1201 < len(fixes) < 1201
+    origin = (54.0, 12.0)
+    on_earth = record(duration_s=300.0, fix={**receiver, "origin_deg": origin})["/robot1/fix"]
+    assert on_earth.metadata == {"origin_latitude_deg": "54.0", "origin_longitude_deg": "12.0"}
+    geodetic = (on_earth[name] for name in ("latitude_deg", "longitude_deg", "altitude_m"))
+    east, north, up = into_tangent_plane(tuple(geodetic), origin)
+    assert_allclose(np.stack([east, north], axis=1), fixes["position_m"], atol=1e-6)
+    assert_allclose(up, 0.0, atol=1e-6)
+    for topic, stream in record(duration_s=300.0).items():
+        assert_array_equal(stream.publish_time_ns, streams[topic].publish_time_ns)
+        for name, column in stream.columns.items():
+            assert_array_equal(column, streams[topic][name])
 
 
 def test_the_three_clocks():

@@ -218,6 +218,46 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
     }
 
 
+def test_a_pose_without_a_covariance_may_be_a_goal(tmp_path: Path) -> None:
+    """It is named by its topic, so that no model takes it for a measurement; a name may be given."""
+    make = Maker()
+    sent: list[Sent] = [
+        ("/amcl_pose", START_NS, make("geometry_msgs/msg/PoseWithCovarianceStamped", START_NS)),
+        ("/goal_pose", START_NS, make("geometry_msgs/msg/PoseStamped", START_NS)),
+    ]
+    both = write_bag(tmp_path / "both", "mcap", sent, make.store)
+    assert set(imported(both)[0]) == {"/pose", "/goal_pose/pose"}
+    goal = write_bag(tmp_path / "goal", "mcap", sent[1:], make.store)
+    assert set(imported(goal)[0]) == {"/goal_pose/pose"}
+    named = imported(both, names={"/goal_pose": "/reference"})[0]
+    assert set(named) == {"/pose", "/reference/pose"}
+
+
+def test_poses_that_are_the_truth(tmp_path: Path) -> None:
+    """Of a topic that is named: positions, the heading and the orientation, by these names."""
+    make = Maker()
+    half = 0.25
+    turned = make(
+        "nav_msgs/msg/Odometry",
+        START_NS,
+        **{f"pose__pose__position__{name}": value for name, value in zip("xyz", (3, 4, 5), strict=True)},
+        pose__pose__orientation=[0.0, 0.0, np.sin(half), np.cos(half)],
+    )
+    sent: list[Sent] = [("/r1/mocap", START_NS, turned)]
+    path = write_bag(tmp_path / "bag", "mcap", sent, make.store)
+    streams = imported(path, truth="/r1/mocap")[0]
+    truth = streams["/r1/truth"]
+    assert "/r1/odometry_pose" not in streams
+    names = "x_m,y_m,z_m,heading_rad,orientation_w,orientation_x,orientation_y,orientation_z"
+    assert truth.metadata["components"] == names
+    assert_allclose(truth["state"], [[3, 4, 5, 0.5, np.cos(half), 0, 0, np.sin(half)]], atol=1e-12)
+    level: list[Sent] = [*sent, ("/level", START_NS, make("std_msgs/msg/Float64", data=0.75))]
+    other = write_bag(tmp_path / "other", "mcap", level, make.store)
+    for name, words in (("/level", "truth = /level: has no poses"), ("/mocap", "has no topic /mocap")):
+        with pytest.raises(BadInput, match=words):
+            imported(other, truth=name)
+
+
 def test_what_the_streams_say(tmp_path: Path) -> None:
     """Fields, units, covariances, frames and clocks of each kind, number by number."""
     make = Maker()
@@ -515,6 +555,13 @@ stamp = "at"
     assert wheels["value"].tolist() == expected
     assert wheels.components == ["left_mps", "right_mps", "a", "b", "c"]
     assert wheels.publish_time_ns.tolist() == [START_NS - 1000, START_NS - 999, START_NS - 998]
+    mapping.write_text(text.replace("factors = { value = 2.0 }", 'units = { value = "km/h" }'))
+    assert "the unit 'km/h' does not fit: a is a mere number" in refusal(path, mapping=str(mapping))
+    in_units = 'units = { value = ["km/h", "cm/s", "", "", ""] }\nwhere = { "left.speed" = 3.5 }'
+    mapping.write_text(text.replace("factors = { value = 2.0 }", in_units))
+    wheels = imported(path, mapping=str(mapping))[0]["/wheels"]
+    expected = [[3.5 / 3.6, m.right.speed / 100, *m.raw] for _, _, m in sent]
+    np.testing.assert_allclose(wheels["value"], expected)
     for old, new, sentence in [
         (
             '"left.speed"',

@@ -2,7 +2,7 @@
 
 A stream is named by the namespace of its topic and by what it is: /odom gives /odometry, /robot1/imu
 gives /robot1/inertial. Where two topics would give the same name, both are named by the topic:
-/odom/odometry, /wheels/odometry.
+/odom/odometry, /wheels/odometry. So are poses without a covariance, which may be goals: /goal_pose/pose.
 """
 
 from collections import Counter, defaultdict
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PositiveFloat
 
 from recorders.errors import BadInput, choices
+from recorders.importers.mapping import checked, not_finite
 from recorders.importers.ros.bags import Bag, open_bag
 from recorders.importers.ros.layouts import Messages, MessageType, Undecodable, by_size, definitions_of
 from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
@@ -28,12 +29,12 @@ from recorders.importers.ros.messages import (
     TYPES,
     Part,
     Taken,
+    as_truth,
     stamps_ns,
 )
 from recorders.importers.ros.raw import Batch, Connection
 from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
 from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.models.orientation import require_unit
 from recorders.parameters import Parameters
 from recorders.recording import Blocks, Importer
 
@@ -45,7 +46,6 @@ Distribution = Literal[
 # A block ends when it has so many messages, or bytes.
 _BLOCK_MESSAGES = 1 << 17
 _BLOCK_BYTES = 1 << 24
-_UNIT_TOLERANCE = 1e-3
 
 
 def _as_list(value: object) -> object:
@@ -61,8 +61,9 @@ class RosParameters(Parameters):
     `clock` says what the publish time is: the message's header, or the bag. Without `topics` all are
     taken that can be. `transforms` names pairs of frames, "map:base_link", whose poses are composed of
     what TF has; without any, every transform that is sent is taken as it is. `names` gives what stands
-    in place of the namespace in the streams of a topic: {"/amcl_pose" = "/robot1"}. `mapping` is a TOML
-    file for messages of one's own. `distribution` says whose definitions hold where the bag has none.
+    in place of the namespace in the streams of a topic: {"/amcl_pose" = "/robot1"}. The poses of the
+    topic `truth` are what estimates are compared with, as the stream `truth`. `mapping` is a TOML file
+    for messages of one's own. `distribution` says whose definitions hold where the bag has none.
     Headers that differ by more than `clock_tolerance_s` from one another's clock are of several clocks.
     """
 
@@ -70,6 +71,7 @@ class RosParameters(Parameters):
     topics: Names = []
     transforms: Names = []
     names: dict[str, str] = {}
+    truth: str | None = None
     mapping: str | None = None
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0
@@ -212,7 +214,8 @@ class _Import:
                 f"{mapping}: no topic of {self.path} is of type {name}; {choices(name, types)}"
             )
         asked, topics = self._parameters.topics, {each.topic for each in connections}
-        for topic in [*asked, *self._parameters.names]:
+        truth = [] if self._parameters.truth is None else [self._parameters.truth]
+        for topic in [*asked, *self._parameters.names, *truth]:
             if topic not in topics:
                 raise BadInput(f"{self.path}: has no topic {topic}; {choices(topic, topics)}")
         known: dict[tuple, _Reader | str] = {}
@@ -233,6 +236,10 @@ class _Import:
                     )
             else:
                 self._readers[each] = found
+        for topic in truth:
+            reader = next((each for of, each in self._readers.items() if of.topic == topic), None)
+            if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
+                raise BadInput(f"{self.path}: truth = {topic}: has no poses; name a topic that has some")
         if not self._readers:
             listed = (
                 ", ".join(f"{topic} ({why})" for topic, why in sorted(self._not_taken.items()))
@@ -265,16 +272,20 @@ class _Import:
 
     def _stream_names(self) -> dict[tuple[str, str], str]:
         """The name of a stream by topic and kind."""
-        given = self._parameters.names
+
+        def below(topic: str, taken: Taken) -> str:
+            own = topic if taken.is_doubtful else topic.rpartition("/")[0]
+            return self._parameters.names.get(topic, own).rstrip("/")
+
         wanted = {
-            (
-                each.topic,
-                kind,
-            ): f"{given.get(each.topic, each.topic.rpartition('/')[0]).rstrip('/')}/{kind}"
+            (each.topic, kind): f"{below(each.topic, reader.taken)}/{kind}"
             for each, reader in self._readers.items()
             if reader.taken is not None
             for kind in reader.taken.kinds
         }
+        if (truth := self._parameters.truth) is not None:
+            above = self._parameters.names.get(truth, truth.rpartition("/")[0]).rstrip("/")
+            wanted[truth, "truth"] = f"{above}/truth"
         counts = Counter(wanted.values())
         return {
             (topic, kind): name if counts[name] == 1 else f"{topic}/{kind}"
@@ -383,6 +394,8 @@ class _Import:
             for name, path in (("frame_id", reader.frame), ("child_frame_id", CHILD_FRAME))
         ]
         for part in reader.taken.parts(messages):
+            if topic == self._parameters.truth and part.schema is schemas.POSE:
+                part = as_truth(part)
             keep = self._kept(topic, part, stamp_ns)
             for frame, which in _by_frame(frames, len(messages)):
                 rows = np.flatnonzero(keep & (which if part.rows is None else which[part.rows]))
@@ -398,11 +411,7 @@ class _Import:
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
-        for entry in part.schema:
-            column = part.columns.get(entry.name)
-            if column is not None and column.dtype.kind == "f" and not entry.may_be_nan:
-                is_bad = ~np.isfinite(column).reshape(size, -1).all(axis=1)
-                dropped["NaN or infinite"] = dropped.get("NaN or infinite", False) | is_bad
+        dropped["NaN or infinite"] = not_finite(part.schema, part.columns)
         if stamp_ns is not None and self._parameters.clock == "header":
             own = stamp_ns if part.rows is None else stamp_ns[part.rows]
             dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0
@@ -436,7 +445,8 @@ class _Import:
         """Take up the rows (k,) of a part for a stream, with their stamps and places in the topic."""
         size = len(next(iter(part.columns.values())))
         which = slice(None) if len(rows) == size else rows
-        columns = {key: self._checked(topic, key, column[which]) for key, column in part.columns.items()}
+        where = f"{self.path}: topic {topic}"
+        columns = {key: checked(where, key, column[which]) for key, column in part.columns.items()}
         constants = {key: column[which] for key, column in part.constants.items()}
         widths = {key: column.shape[1] for key, column in columns.items() if column.ndim == 2}
         if name not in self._written:
@@ -457,20 +467,6 @@ class _Import:
         published = log_time_ns if self._parameters.clock == "bag" else sensed
         written.pieces.append(_Piece(places, published, log_time_ns, sensed, columns))
         self._came_of[topic][name] = None
-
-    def _checked(self, topic: str, field: str, column: NDArray) -> NDArray:
-        """A column's values, of which those that nothing can mean are refused."""
-        where = f"{self.path}: topic {topic}"
-        limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
-        if limit is not None and len(column) and np.abs(column).max() > limit:
-            worst = column[np.abs(column).argmax()]
-            raise BadInput(
-                f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}"
-            )
-        if field == "quaternion":
-            return require_unit(column, f"{where}: its quaternions", _UNIT_TOLERANCE)
-        is_infinite = np.isinf(column) if column.dtype.kind == "f" else np.zeros(0, bool)
-        return np.where(is_infinite, np.nan, column) if is_infinite.any() else column
 
     def _take_transforms(
         self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64], *, is_static: bool

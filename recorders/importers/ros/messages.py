@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recorders.importers.ros.layouts import Messages
 from recorders.log import Schema, schemas
+from recorders.models.orientation import heading
 
 Floats = NDArray[np.float64]
 STAMP, FRAME, CHILD_FRAME = "header.stamp", "header.frame_id", "child_frame_id"
@@ -46,10 +47,18 @@ class Part:
 
 
 class Taken(NamedTuple):
-    """How messages of a type are taken: the kinds of the streams that they give, and what reads them."""
+    """How messages of a type are taken.
+
+    Attributes:
+        kinds: of the streams that they give.
+        parts: what reads them.
+        is_doubtful: whether the type leaves open what they are, a measurement, a goal or the truth; then
+            their streams are named by the whole topic, and no model takes them unasked.
+    """
 
     kinds: tuple[str, ...]
     parts: Callable[[Messages], Iterator[Part]]
+    is_doubtful: bool = False
 
 
 def stamps_ns(messages: Messages, path: str = STAMP) -> NDArray[np.int64] | None:
@@ -183,13 +192,30 @@ def _pose(kind: str, messages: Messages, position: str, orientation: str, uncert
     )
 
 
+TRUTH: Mapping[str, str] = {
+    **dict.fromkeys(("x_m", "y_m", "z_m"), "linear"),
+    "heading_rad": "angle",
+    **{f"orientation_{name}": "quaternion" for name in "wxyz"},
+}
+
+
+def as_truth(part: Part) -> Part:
+    """Poses as the reference states that estimates are compared with, in the plane and in space."""
+    orientation = part.columns["quaternion"]
+    state = np.column_stack([part.columns["position_m"], heading(orientation), orientation])
+    metadata = {"components": ",".join(TRUTH), "kinds": ",".join(TRUTH.values())}
+    return Part("truth", schemas.TRUTH_STATE, {"state": state}, metadata)
+
+
 def _twists(path: str, uncertainty: str = "") -> Taken:
     return Taken(("twist",), lambda messages: iter([_twist("twist", messages, path, uncertainty)]))
 
 
 def _poses(position: str, orientation: str, uncertainty: str = "") -> Taken:
     return Taken(
-        ("pose",), lambda messages: iter([_pose("pose", messages, position, orientation, uncertainty)])
+        ("pose",),
+        lambda messages: iter([_pose("pose", messages, position, orientation, uncertainty)]),
+        is_doubtful=not uncertainty,
     )
 
 

@@ -44,6 +44,7 @@ def solved(start: str) -> Any:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 def test_the_sheets_row() -> None:
     """Section 2: states, traces, the cost of the start and of the end, six iterations."""
     found = solved("smoother")
@@ -65,6 +66,7 @@ def test_the_sheets_row() -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("start", "cost", "iterations"), [("prior", 7086.12968525, 12), ("motion", 10730.8608525, None)]
 )

@@ -1,0 +1,341 @@
+"""Where a filter begins in a log that does not say so, and where its plane lies.
+
+A log without a prior gets one at the first message that measures the state, see `model.Start`. It is so
+much wider than that message that the message itself, used like any other, is what counts. The origin of
+a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Topic, make_stream, schemas
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.blocks import Block, Ragged, merge_events, ragged_rows
+from replay.engine.estimator import Opened, Opening
+from replay.engine.failures import reason_stream
+from replay.engine.geodetic import origins_of
+from replay.engine.results import gaussian_stream, named
+from replay.engine.tangent import tangent_components, things
+from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
+from replay.inference.happenings import World, happenings_of, sensor_table
+from replay.inference.model import Sensor, Start
+from replay.inference.recursion import CONTROL, Happenings
+from replay.inference.steps import Stage
+
+WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
+FOREVER_NS = np.iinfo(np.int64).max
+CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a filter looks for in the first messages of a log.
+
+    Attributes:
+        name: what its output topics begin with, after `/estimates/`.
+        found: its topics.
+        stage: the model as the log states it, with the sensors at hand.
+        settings: (1 + sensors, fields) numbers of motion and sensors.
+        assumed: the parameters among them that the log does not state.
+    """
+
+    name: str
+    found: Found
+    stage: Stage
+    settings: Floats
+    assumed: Mapping[str, float]
+
+    @property
+    def opening(self) -> Opening | None:
+        """How it is found; None where the log states all."""
+        needs_origin = self.found.geodetic if self.found.origin is None else ()
+        wanted = [*needs_origin, *(() if self.found.has_prior else self._starting)]
+        topics = tuple(dict.fromkeys(topic.name for topic in wanted))
+        return Opening(topics, self.find) if topics else None
+
+    @cached_property
+    def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
+        """The sensors that measure components of the state by their names, with their numbers."""
+        state = self.stage.model.state
+        return [
+            (number, sensor, topic)
+            for number, (sensor, topic) in enumerate(self.found.sensors)
+            if sensor.covariance and sensor.measured.items() <= state.items()
+        ]
+
+    @property
+    def _starting(self) -> list[Topic]:
+        """The topics whose first message is where to begin."""
+        control = [] if self.found.control is None else [self.found.control]
+        drives = [*control, *(topic for _, topic in self.found.instead)]
+        if self._measuring:
+            return [*(drives if self._aligns else []), *(topic for _, _, topic in self._measuring)]
+        return [*drives, *(topic for _, topic in self.found.sensors)]
+
+    @property
+    def _aligns(self) -> bool:
+        """Whether fixes alone have to tell the whole state, and can."""
+        model = self.stage.model
+        is_whole = any(len(sensor.measured) == model.size for _, sensor, _ in self._measuring)
+        return bool(model.start and model.start.align and self._measuring) and not is_whole
+
+    def find(self, first: Mapping[str, Ragged], clock: Clock) -> Opened:
+        """What is found in the first messages; raises BadInput where none of them can be used."""
+        whole: dict[str, Ragged] = {}
+        told: list[Ragged] = []
+        facts: list[_Fact] = []
+        origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
+        for topic in self.found.geodetic if origins is None else ():
+            fixes = first[topic.name]
+            origins = origins_of(fixes)
+            whole[topic.name] = _first_rows(fixes)
+            told.append(self._told_origin(whole[topic.name]))
+            what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
+            time_ns, has_one, _ = _first_of(fixes, clock, None)
+            facts.append(_Fact(what, time_ns, has_one))
+        if not self.found.has_prior:
+            prior, found = self._prior(first, clock, origins)
+            whole[self.found.prior.name] = prior
+            facts += found
+        return Opened(whole, [*told, *self._told(facts)])
+
+    def _prior(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None
+    ) -> tuple[Ragged, list["_Fact"]]:
+        """The priors of all runs, and what is to be told of them."""
+        model, runs = self.stage.model, _runs(first)
+        mean, sigma = _anywhere(model.state, model.start)
+        covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
+        begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
+        facts = (
+            self._at_first(first, clock, origins, begun)
+            if self._measuring
+            else self._anywhere(first, clock, begun)
+        )
+        if self._aligns:
+            aligned = self._aligned(first, clock, origins, begun)
+            others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
+            facts = [aligned, *others]
+        has_begun = begun.time_ns < FOREVER_NS
+        facts += [
+            _Fact(
+                f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it",
+                begun.time_ns,
+                has_begun,
+            )
+            for name, number in self.assumed.items()
+        ]
+        stream = gaussian_stream(
+            self.found.prior.name,
+            begun.time_ns[has_begun],
+            begun.mean[has_begun],
+            begun.covariance[has_begun],
+            named(model.state),
+        )
+        return Ragged(stream, np.append(0, np.cumsum(has_begun))), facts
+
+    @property
+    def _without(self) -> str:
+        return f"the log has no prior ({self.found.prior.name}): it begins"
+
+    def _anywhere(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+        """Begin all runs at their first message, for nothing measures the state itself."""
+        for topic in self._starting:
+            found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
+            begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
+        where = "anywhere"
+        if not self.found.sensors:
+            begun.covariance[:] *= CERTAIN**2
+            where = "at zero, where its frame is"
+        return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+
+    def _at_first(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs at their first message that measures components of the state."""
+        chosen = np.full(len(begun.time_ns), -1)
+        for number, _, topic in self._measuring:
+            ragged = first[topic.name]
+            table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
+            found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
+            for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
+                begun.time_ns[run], chosen[run] = found_ns[run], number
+                begun.mean[run], sigma = self._about(number, table.data[rows[run]])
+                begun.covariance[run] = sigma**2 * np.eye(len(sigma))
+        if (chosen < 0).all():
+            raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
+        return [
+            _Fact(
+                f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
+            )
+            for number, _, topic in self._measuring
+        ]
+
+    def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
+        """The mean and the much wider sigmas of a state that one message tells of."""
+        model, sensor = self.stage.model, self.stage.sensors[number]
+        mean, sigma = _anywhere(model.state, model.start)
+        components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+        size = len(sensor.measured)
+        for place, (name, variance) in enumerate(
+            zip(sensor.measured, data[size + _diagonal(size)], strict=True)
+        ):
+            if not np.isnan(data[place]):
+                mean[list(model.state).index(name)] = data[place]
+                row = components.index(name)
+                sigma[row] = min(WIDER * np.sqrt(variance), sigma[row])
+        return mean, sigma
+
+    def _aligned(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> "_Fact":
+        """Begin runs just after the first fixes that, with the path between them, tell all."""
+        numbers = [number for number, _, _ in self._measuring]
+        sensors = tuple(self.found.sensors[number] for number in numbers)
+        found = self.found._replace(sensors=sensors)
+        stage = self.stage._replace(sensors=tuple(sensor for sensor, _ in sensors))
+        settings = self.settings[[0, *(1 + number for number in numbers)]]
+        names = [topic.name for topic in self._starting]
+        streams = {name: first[name] for name in names}
+        block = Block(streams, merge_events(streams, clock))
+        happenings, _ = happenings_of(stage, found, block, World({}, origins), settings)
+        is_aligned = np.zeros(len(begun.time_ns), bool)
+        for run in range(len(is_aligned)):
+            solved = self._align(happenings, run, stage, settings)
+            if solved is not None:
+                begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
+                is_aligned[run] = True
+        return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+
+    def _align(
+        self, happenings: Happenings, run: int, stage: Stage, settings: Floats
+    ) -> tuple[int, Floats, Floats] | None:
+        """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
+        model = stage.model
+        assert model.start is not None
+        assert model.start.align is not None
+        parameters = reading_settings(number_fields(model.parameters))(settings, 0)
+        state, control = (0.0,) * model.size, np.zeros(model.controls)
+        path: list[Any] = []
+        places: list[Floats] = []
+        spreads: list[Floats] = []
+        begin, end = happenings.offsets[run : run + 2]
+        before_ns = first_ns = 0
+        for event in range(begin, end):
+            time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
+            duration_s = (time_ns - before_ns) * 1e-9
+            if event > begin and duration_s > 0.0:
+                state = model.motion.move(state, tuple(control), duration_s, parameters)
+            before_ns, data = time_ns, happenings.data[event]
+            if source == CONTROL:
+                own = data[: len(control)]
+                control = np.where(np.isnan(own), control, own)
+            elif source >= 0:
+                size = len(stage.sensors[source].measured)
+                lower = np.zeros((size, size))
+                lower[np.tril_indices(size)] = data[size : size + size * (size + 1) // 2]
+                first_ns = first_ns or time_ns
+                path.append(state)
+                places.append(data[:size])
+                spreads.append(lower + np.tril(lower, -1).T)
+                solved = model.start.align(
+                    *map(np.array, (path, places, spreads)), (time_ns - first_ns) * 1e-9, parameters
+                )
+                if solved is not None:
+                    return time_ns + 1, *solved
+        return None
+
+    def _complaints(self) -> str:
+        complaints = [
+            complaint_of(self.stage.model, sensor, topic.name) for _, sensor, topic in self._measuring
+        ]
+        return "; ".join(complaints)
+
+    def _told_origin(self, fixes: Ragged) -> Ragged:
+        """The origins as fixes, on a topic of their own."""
+        stream = fixes.stream
+        columns: dict[str, Any] = {
+            name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
+        }
+        topic = f"/estimates/{self.name}/origin"
+        told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
+        return Ragged(told, fixes.offsets)
+
+    def _told(self, facts: list["_Fact"]) -> list[Ragged]:
+        """What was assumed, on the topic `started`: a message for each sentence and run."""
+        if not facts:
+            return []
+        texts, times, which = zip(*facts, strict=True)
+        is_said = np.stack(which, axis=1)
+        stream = reason_stream(
+            f"/estimates/{self.name}/started",
+            schemas.STARTED,
+            np.stack(times, axis=1)[is_said],
+            np.nonzero(is_said)[1],
+            texts,
+        )
+        return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
+
+
+class _Begun(NamedTuple):
+    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+
+
+class _Fact(NamedTuple):
+    """A sentence, when it is told (runs,), and in which runs (runs,)."""
+
+    text: str
+    time_ns: Integers
+    is_so: Booleans
+
+
+def _diagonal(size: int) -> Integers:
+    """Where the diagonal stands among the rows of a lower triangle."""
+    rows = np.arange(1, size + 1)
+    return np.cumsum(rows) - 1
+
+
+def _runs(first: Mapping[str, Ragged]) -> int:
+    return next(iter(first.values())).runs
+
+
+def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+    """The mean (n,) and standard deviations (t,) of a state of which nothing is known."""
+    assert start is not None
+    kinds = list(state.values())
+    mean = np.zeros(len(kinds))
+    for kind, columns in things(kinds):
+        if kind in ("axis", "quaternion"):
+            mean[columns.start] = 1.0
+    names = [name for name, _ in tangent_components(list(state), kinds)]
+    return mean, np.array([start.sigmas[name] for name in names])
+
+
+def _first_of(
+    ragged: Ragged, clock: Clock, usable: Booleans | None
+) -> tuple[Integers, Booleans, Integers]:
+    """The first usable message of every run (runs,): its stamp, whether there is one, its row."""
+    every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
+    place = np.searchsorted(every, ragged.offsets)
+    has_one = place[1:] > place[:-1]
+    rows = np.zeros(ragged.runs, np.int64)
+    rows[has_one] = every[place[:-1][has_one]]
+    time_ns = np.zeros(ragged.runs, np.int64)
+    time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
+    return time_ns, has_one, rows
+
+
+def _first_rows(ragged: Ragged) -> Ragged:
+    """The first message of every run that has one."""
+    is_first = np.zeros(len(ragged), bool)
+    is_first[ragged.offsets[:-1][np.diff(ragged.offsets) > 0]] = True
+    return Ragged(ragged.stream.take(is_first), ragged_rows(is_first, ragged.offsets))

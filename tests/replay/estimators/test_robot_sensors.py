@@ -1,0 +1,220 @@
+"""A robot with odometry and what else a bag may have: poses, fixes, headings, a gyro; no prior."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.log.run import RunMetadata
+from recorders.models.planar import drive, wrap_angle
+from recorders.recording import Recording
+from replay.engine.failures import sentences_of
+from replay.engine.sources import MemorySource, memory_source
+from replay.estimators.landmarks import RECKONING, ROBOT
+from replay.inference import estimators
+from tests.replay.inference.replays import bound, outputs
+
+Floats = NDArray[np.float64]
+STEPS, STEP_NS, EPOCH_NS = 60, 200_000_000, 5 * 10**9
+STAMPS = EPOCH_NS + STEP_NS * np.arange(STEPS)
+SLOW = STAMPS[7::10]
+SIGMA = np.array([0.3, 0.2, 0.05])
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Loops in plain Python, of which none is left to the next test."""
+    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    estimators._compiled.cache_clear()
+    yield
+    estimators._compiled.cache_clear()
+
+
+def poses() -> Floats:
+    """Where the robot is (STEPS, 3), on a circle."""
+    found = [(20.0, -5.0, 2.5)]
+    for _ in range(STEPS - 1):
+        found.append(drive(found[-1], (1.0, 0.3), 0.2))
+    return np.array(found)
+
+
+def odometry(topic: str = "/odometry", **metadata: str) -> Stream:
+    return make_stream(
+        topic,
+        schemas.ODOMETRY,
+        STAMPS,
+        metadata=metadata,
+        forward_mps=np.full(STEPS, 1.0),
+        turn_radps=np.full(STEPS, 0.3),
+    )
+
+
+def seen(*, topic: str = "/pose", known: bool = True) -> Stream:
+    """Poses with errors and covariances, among those of a body in space."""
+    true = poses()[7::10]
+    noisy = true + SIGMA * np.random.default_rng(4).normal(size=true.shape)
+    half, n = 0.5 * noisy[:, 2], len(true)
+    covariance = np.zeros((n, 6, 6))
+    covariance[:, [0, 1, 5], [0, 1, 5]] = SIGMA**2
+    return make_stream(
+        topic,
+        schemas.POSE,
+        SLOW,
+        metadata={"frame_id": "map"},
+        position_m=np.column_stack([noisy[:, :2], np.zeros(n)]),
+        quaternion=np.column_stack([np.cos(half), np.zeros((n, 2)), np.sin(half)]),
+        covariance=covariance.reshape(n, 36) if known else np.full((n, 36), np.nan),
+    )
+
+
+def fix(topic: str = "/fix") -> Stream:
+    n = len(SLOW)
+    return make_stream(
+        topic,
+        schemas.GEODETIC_FIX,
+        SLOW,
+        latitude_deg=np.full(n, 54.0),
+        longitude_deg=np.full(n, 12.0),
+        altitude_m=np.zeros(n),
+        covariance_m2=np.ones((n, 2)),
+    )
+
+
+def log(*streams: Stream) -> MemorySource:
+    return memory_source(Recording(list(streams)), RunMetadata("robot", epoch_ns=EPOCH_NS))
+
+
+def test_a_robot_begins_at_its_first_pose() -> None:
+    """There it is as uncertain as the pose says, and no more was assumed than is told."""
+    found = outputs(ROBOT, "ekf", [log(odometry(), seen())])
+    told = sentences_of(found["started"].stream)
+    assert told[0] == "the log has no prior (/prior): it begins at the first message of /pose"
+    assert [each.split(":")[0] for each in told[1:]] == [
+        "no channel states forward_noise_density",
+        "no channel states turn_noise_density",
+    ]
+    estimates = found["pose"].stream
+    assert estimates.publish_time_ns[0] == SLOW[0]
+    first = np.diag(estimates["covariance"][0].reshape(3, 3))
+    assert_allclose(first, SIGMA**2, rtol=2e-3)
+    error = estimates["mean"] - poses()[7:]
+    error[:, 2] = wrap_angle(error[:, 2])
+    assert (np.abs(error[-1]) < 3 * np.sqrt(np.diag(estimates["covariance"][-1].reshape(3, 3)))).all()
+    nis = found["innovation"]["normalised_innovation_squared"]
+    assert nis[0] < 1e-6
+    assert (nis[1:] < 20.0).all()
+    assert (nis[1:] > 1e-3).any()
+    assert_array_equal(found["innovation"]["accepted"], 1)
+
+
+def test_what_a_log_states_is_not_assumed() -> None:
+    stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
+    found = outputs(ROBOT, "ekf", [log(stated, seen())])
+    assert len(found["started"]) == 1
+    given = outputs(ROBOT, "ekf", [log(odometry(), seen())], forward_noise_density=0.01)
+    assert len(given["started"]) == 2
+
+
+def test_odometry_alone_begins_at_zero() -> None:
+    """Also the model of odometry alone, which takes no fixes. A sighting needs its map all the same."""
+    for model, others in ((ROBOT, ()), (RECKONING, (fix(), seen()))):
+        found = outputs(model, "ekf", [log(odometry(), *others)])
+        assert sentences_of(found["started"].stream)[0].endswith("it begins at zero, where its frame is")
+        end = found["pose"]["mean"][-1]
+        wanted = (0.0, 0.0, 0.0)
+        for _ in range(STEPS - 1):
+            wanted = drive(wanted, (1.0, 0.3), 0.2)
+        assert_allclose(end, [*wanted[:2], wrap_angle(wanted[2])], atol=1e-6)
+    sighting = make_stream("/bearing", schemas.BEARING, SLOW, target_id=[1] * 6, bearing_rad=[0.1] * 6)
+    assert bound(ROBOT, "ekf", [log(odometry(), sighting)]) == []
+
+
+def test_sightings_alone_begin_anywhere() -> None:
+    """That is said; a pose makes the beginning sure, and a prior is never overruled."""
+    landmark = make_stream(
+        "/landmarks", schemas.LANDMARK, STAMPS[:1], landmark_id=[1], position_m=[[0.0, 0.0]]
+    )
+    sighting = make_stream(
+        "/range",
+        schemas.RANGE,
+        SLOW,
+        metadata={"sigma_range_m": "0.5"},
+        target_id=[1] * 6,
+        range_m=[20.0] * 6,
+    )
+    found = outputs(ROBOT, "ekf", [log(odometry(), landmark, sighting)])
+    assert sentences_of(found["started"].stream)[0].endswith("(/prior): it begins anywhere")
+    first = found["pose"]["covariance"][0]
+    assert first[[0, 4]] == pytest.approx(1e6)
+    assert found["pose"].stream.publish_time_ns[0] == STAMPS[0]
+    prior = make_stream(
+        "/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS[:1],
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=poses()[:1],
+        covariance=[0.01 * np.eye(3).ravel()],
+    )
+    with pytest.raises(BadInput, match="does not state forward_noise_density"):
+        bound(ROBOT, "ekf", [log(odometry(), seen(), prior)])
+    stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
+    assert "started" not in outputs(ROBOT, "ekf", [log(stated, seen(), prior)])
+
+
+def test_poses_without_a_covariance() -> None:
+    source = log(odometry(), seen(known=False))
+    with pytest.raises(BadInput, match=r"begins nowhere: .*--set sigma_fix_m=...; give --set sigma_hea"):
+        outputs(ROBOT, "ekf", [source])
+    found = outputs(ROBOT, "ekf", [source], sigma_fix_m=0.3, sigma_heading_rad=0.05)
+    assert len(found["skipped"]) == 0
+    variances = np.diag(found["pose"]["covariance"][0].reshape(3, 3))
+    assert_allclose(variances, [0.09, 0.09, 0.0025], rtol=2e-3)
+
+
+def test_a_gyro_takes_the_place_of_the_wheels_where_it_is_asked_for() -> None:
+    """Its turn rate, that is, not their speed: these wheels do not turn, and the gyro knows better."""
+    straight = make_stream(
+        "/odometry", schemas.ODOMETRY, STAMPS, forward_mps=[1.0] * STEPS, turn_radps=[0.0] * STEPS
+    )
+    gyro = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        STAMPS,
+        specific_force_mps2=np.zeros((STEPS, 3)),
+        turn_rate_radps=np.tile([0.0, 0.0, 0.3], (STEPS, 1)),
+        magnetic_field_ut=np.full((STEPS, 3), np.nan),
+    )
+    alone = outputs(ROBOT, "ekf", [log(straight, gyro)])["pose"]["mean"]
+    assert_allclose(alone[-1], [0.2 * (STEPS - 1), 0.0, 0.0], atol=1e-6)
+    turned = outputs(ROBOT, "ekf", [log(straight, gyro)], topics={"turn_rate": "inertial"})["pose"][
+        "mean"
+    ]
+    assert_allclose(turned[-1, 2], wrap_angle(0.06 * (STEPS - 1)), atol=1e-6)
+
+
+def test_headings_are_a_sensor() -> None:
+    n = len(SLOW)
+    half = 0.5 * poses()[7::10, 2]
+    heading = make_stream(
+        "/heading",
+        schemas.ORIENTATION,
+        SLOW,
+        metadata={"covariance_rad2": "0.01,0,0,0,0.01,0,0,0,0.0004"},
+        quaternion=np.column_stack([np.cos(half), np.zeros((n, 2)), np.sin(half)]),
+    )
+    found = outputs(ROBOT, "ekf", [log(odometry(), seen(), heading)])["pose"]
+    variance = found["covariance"][found.stream.publish_time_ns == SLOW[0], 8]
+    assert_allclose(variance, 1 / (1 / 0.0025 + 1 / 0.0004), rtol=2e-3)
+
+
+def test_a_pose_and_a_fix_in_planes_that_have_nothing_to_do_with_each_other() -> None:
+    source = log(odometry(), seen(), fix())
+    with pytest.raises(BadInput, match=r"/fix is latitude and longitude, /pose a position in map"):
+        bound(ROBOT, "ekf", [source])
+    for left_out, streams in (("fix", ("/odometry", "/pose")), ("pose", ("/odometry", "/fix"))):
+        (only,) = bound(ROBOT, "ekf", [source], topics={left_out: ""})
+        assert only.streams == streams
