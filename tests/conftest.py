@@ -27,14 +27,14 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
     """
     from replay.engine import blocks, supervision
-    from replay.inference import estimators, imm, iterated, observability, rewinding, smoothers
+    from replay.inference import estimators, gauss_newton, imm, observability, rewinding, smoothers
 
     loops = (
         blocks._merge,
         supervision._over_runs,
         estimators._compiled,
         rewinding._compiled,
-        iterated._search,
+        gauss_newton.searching,
         smoothers._way_back,
         smoothers._sliding,
         imm._smoothing,

@@ -43,8 +43,10 @@ FAILURES = (
     "the estimate is no longer finite",
     "no particle explains what was measured",
     "the truth is not known here",
+    "what drives the motion is silent for too long",
 )
-NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH = 0, 1, 2, 3  # indices of FAILURES
+# indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 
@@ -329,7 +331,7 @@ class Reading(NamedTuple):
 
 def reading(sensor: Sensor) -> Reading:
     """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
-    m, about = len(sensor.measured), sensor.about.size if sensor.about else 0
+    m, about = len(sensor.measured), sensor.about_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
 

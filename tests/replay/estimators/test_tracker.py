@@ -56,8 +56,8 @@ def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]
     return [scan, made(f"/{name}/detection", schemas.DETECTION, **own, position_m=place)]
 
 
-def log(*streams: list[Stream]) -> MemorySource:
-    run = RunMetadata("scene", {}, None, 0, SIMULATION_EPOCH_NS, {})
+def log(*streams: list[Stream], scenario: str = "scene") -> MemorySource:
+    run = RunMetadata(scenario, {}, None, 0, SIMULATION_EPOCH_NS, {})
     return memory_source(Recording([each for of in streams for each in of]), run)
 
 
@@ -198,6 +198,14 @@ def test_a_miss_in_a_blind_sector_says_nothing(uncompiled: None):
         sensor("radar", RADAR, range(8), seen[:8]), sensor("lidar", stated, [8.5, 9.5], seen[8:])
     )
     assert replay(turned)["existence"]["existence"][-1] > 0.9
+
+
+def test_clusters_that_are_too_large_are_told(uncompiled: None):
+    """Thirteen tracks and detections in each other's gates; twelve are still summed."""
+    for count, told in ((12, []), (13, [13])):
+        row = [(1.0 * each, 0.0) for each in range(count)]
+        found = replay(log(sensor("radar", {**RADAR, "sigma_m": "9"}, [0, 1], [row, row])))
+        assert found["approximation"]["tracks"].tolist() == told
 
 
 def test_a_lag_is_of_the_measurement(uncompiled: None):
