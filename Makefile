@@ -3,7 +3,8 @@
 # experiments first, all or those that NAMES="..." lists.
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# --no-compile: Python compiles the modules that are imported, which are few of them
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: demo test test-fast fast-lane studies-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
 
@@ -17,9 +18,9 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-# the fast tests and the long reproductions of papers, side by side
-test: lint
-	$(MAKE) -j3 fast-lane studies-lane papers-lane
+# the fast tests, the long reproductions of papers and the linters, side by side
+test: .venv/with-test
+	$(MAKE) -j4 fast-lane studies-lane papers-lane lint
 
 test-fast: lint fast-lane
 
@@ -69,8 +70,10 @@ clean:
 	$(INSTALL) --editable .
 	@touch $@
 
-.venv/with-test: .venv/with-fuselog
+.venv/with-test: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
 	$(INSTALL) --editable '.[test]'
+	@touch .venv/with-fuselog
 	@touch $@
 
 .venv/with-bench: .venv/with-fuselog

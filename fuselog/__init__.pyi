@@ -17,6 +17,7 @@ from pipeline.door import open as open  # noqa: A004
 from pipeline.door import record as record
 from pipeline.door import run as run
 from pipeline.door import scenarios as scenarios
+from pipeline.door import sweep as sweep
 from pipeline.door import write as write
 from pipeline.experiment import Experiment as Experiment
 from pipeline.experiment import Setting as Setting
@@ -32,6 +33,8 @@ from pipeline.surgery import merge as merge
 from pipeline.surgery import relabel as relabel
 from pipeline.trajectories import Evaluation as Evaluation
 from pipeline.trajectories import evaluate as evaluate
+from pipeline.tuning.outcome import Tuning as Tuning
+from pipeline.tuning.tuning import tune as tune
 from recorders.errors import BadInput as BadInput
 from recorders.errors import UnknownName as UnknownName
 from recorders.log import Field as Field

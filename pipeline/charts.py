@@ -30,7 +30,7 @@ REFERENCE_COLOUR = "#808080"
 
 Numbers = list[float | None]
 Places = list[float | None] | list[str]
-Style = Literal["line", "dashed", "markers", "line+markers"]
+Style = Literal["line", "dashed", "markers", "dots", "line+markers"]
 
 
 class Axis(Parameters):
@@ -185,6 +185,7 @@ STYLES: dict[Style, dict[str, Any]] = {
     "line": {},
     "dashed": {"linestyle": "--"},
     "markers": {"linestyle": "", "marker": "o", "markersize": 4},
+    "dots": {"linestyle": "", "marker": "o", "markersize": 1, "alpha": 0.5},
     "line+markers": {"marker": "o", "markersize": 3},
 }
 

@@ -67,11 +67,26 @@ ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
+settings_option = click.option(
+    "--settings",
+    "settings_file",
+    type=ANY_PATH,
+    metavar="FILE",
+    help="Parameters of estimators from this TOML file, as fuselog tune writes; --set goes over it.",
+)
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
 )
 errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
+)
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), help="Share the runs among N processes, of one core each."
+)
+scheduler_option = click.option(
+    "--scheduler",
+    metavar="ADDRESS|local:N",
+    help="Share the runs among the workers of a Dask scheduler, or of one with N on this machine.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
@@ -102,6 +117,13 @@ late_option = click.option(
 )
 
 
+foxglove_option = click.option(
+    "--foxglove",
+    is_flag=True,
+    help="Write messages of Foxglove beside the streams, so that its viewers show them.",
+)
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
@@ -121,6 +143,7 @@ def fuselog() -> None:
     show_default=True,
     help="Of the log's chunks.",
 )
+@foxglove_option
 @set_option
 def record(
     scenario: str | None,
@@ -129,9 +152,11 @@ def record(
     run: int | None,
     again: Path | None,
     compression: str,
+    foxglove: bool,
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
+    from pipeline.commands import companions_if
     from pipeline.experiment import load_scenario
     from pipeline.outputs import RECORDED, check_files
     from recorders.log import open_log, write_log
@@ -153,34 +178,66 @@ def record(
     path = out or Path(f"{label}.mcap")
     check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
     recording, metadata = record_run(name, values, seed or 0, run or 0)
-    write_log(path, recording.streams, metadata, compression=compression)
+    beside = companions_if(foxglove)
+    write_log(path, recording.streams, metadata, compression=compression, companions=beside)
     _say_written(path, sum(map(len, recording.streams)))
 
 
 @fuselog.command(name="import", short_help="Import real data and write their log.")
 @click.argument("source")
-@click.argument("path", type=ANY_PATH)
+@click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
     help="For ROS: what says when a message was published, its header or the bag [default: header].",
 )
+@click.option("--mapping", help="What becomes of messages or columns: a TOML file, or one that ships.")
+@click.option(
+    "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
+)
 @set_option
 def import_(
-    source: str, path: Path, out: Path | None, clock: str | None, settings: tuple[str, ...]
+    source: str,
+    paths: tuple[Path, ...],
+    out: Path | None,
+    clock: str | None,
+    mapping: str | None,
+    guess: bool,
+    settings: tuple[str, ...],
 ) -> None:
-    """Import real data of kind SOURCE from PATH, as published, and write their log."""
-    from pipeline.outputs import check_files, imported
+    """Import real data of kind SOURCE from PATH, as published, and write their log.
+
+    Tables (SOURCE table) may be several files and folders, which become one log.
+    """
+    from pipeline.outputs import MAPPING, check_files, imported
+    from recorders.atomic import whole_file
     from recorders.parameters import parse_settings
     from recorders.recording import import_log
 
+    if guess:
+        from recorders.importers.tables.guessing import guess as guessed
+
+        if source != "table":
+            raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
+        target = out or Path("mapping.toml")
+        check_files([(target, MAPPING)], {"data": paths})
+        text = guessed(paths)
+        with whole_file(target) as file:
+            file.write_text(text, encoding="utf-8")
+        command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(target)])
+        click.echo(f"{target}: read it, then: {command}")
+        return
+    if len(paths) > 1 and source != "table":
+        raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
     target = out or Path(f"{source}.mcap")
-    check_files([(target, imported(source))], {"data": [path]})
-    chosen = {} if clock is None else {"clock": clock}
-    metadata, messages = import_log(source, path, parse_settings(settings) | chosen, target)
+    check_files([(target, imported(source))], {"data": paths})
+    more = [str(path) for path in paths[1:]]
+    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
-        click.echo(printable(f"{subject}: {fact}"))
+        click.echo(printable(f"{subject}: {fact}" if fact else subject))
     _say_written(target, messages)
 
 
@@ -227,10 +284,12 @@ def _say_written(path: Path, messages: int) -> None:
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
+@foxglove_option
 @recover_option
 @gap_option
 @parameters_option
 @json_option
+@settings_option
 @set_option
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
@@ -241,6 +300,64 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     from pipeline.commands import replay_logs
 
     replay_logs(list(logs), list(names), **options)
+
+
+@fuselog.command(short_help="Search the parameters of an estimator that explain logs best.")
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
+@click.option(
+    "--by",
+    type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
+    default="likelihood",
+    show_default=True,
+    help="What is best: the largest likelihood, NIS or NEES as they should be, the smallest RMSE.",
+)
+@click.option(
+    "--bound",
+    "bounds",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="Between what a parameter is searched (repeatable) [default: 1e-4 to 1e4 times its start].",
+)
+@click.option(
+    "--grid",
+    type=click.IntRange(min=1),
+    default=1,
+    help="Start from the best of so many values of each parameter between its bounds.",
+)
+@click.option(
+    "--validate",
+    "held_out",
+    multiple=True,
+    type=ANY_PATH,
+    help="A log that is held out, to judge the values by (repeatable).",
+)
+@click.option(
+    "--folds",
+    type=COUNT,
+    default=0,
+    help="Cut the logs into so many parts, and judge by each the others.",
+)
+@click.option(
+    "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def tune(logs: tuple[Path, ...], **options: Any) -> None:
+    """Search the parameters of an estimator that explain LOGS best, and say how well the logs tell them.
+
+    The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
+    but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
+    folder is for --settings of fuselog replay and run.
+    """
+    from pipeline.tuning.command import tune_logs
+
+    tune_logs(list(logs), **options)
 
 
 @fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
@@ -357,10 +474,13 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
-@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV or Parquet files.")
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV, Parquet or Foxglove files.")
 @click.argument("path", type=ANY_PATH)
 @click.option(
-    "--to", type=click.Choice(["tum", "kitti", "csv", "parquet"]), required=True, help="The format."
+    "--to",
+    type=click.Choice(["tum", "kitti", "csv", "parquet", "foxglove"]),
+    required=True,
+    help="The format.",
 )
 @click.option(
     "-o",
@@ -374,7 +494,7 @@ def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
     To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
-    parquet any stream, as a table.
+    parquet any stream, as a table; to foxglove one log of the messages that Foxglove and Rerun show.
     """
     from pipeline.exporting import export as export_log
 
@@ -486,6 +606,8 @@ def _say_changed(done: "Changed") -> None:
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
 @click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
+@click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
+@click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
 @click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option("--focus", help="What to show first, such as robot3.")
@@ -511,8 +633,11 @@ def view(path: Path, **options: Any) -> None:
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
 @click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@workers_option
+@scheduler_option
 @parameters_option
 @json_option
+@settings_option
 @set_option
 def run(
     experiment: tuple[str, ...],
@@ -535,6 +660,49 @@ def run(
     stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
     over = {key: value for key, value in stated.items() if value is not None}
     run_named(experiment, labels, over, **options)
+
+
+@fuselog.command(short_help="Run an experiment at many points of its parameters.")
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.option(
+    "--over",
+    "swept",
+    multiple=True,
+    required=True,
+    metavar="KEY=LOW:HIGH:N|logN or KEY=A,B,...",
+    help="A parameter and its values, evenly between two ends, or evenly in the logarithm (repeatable).",
+)
+@click.option(
+    "--samples", type=click.IntRange(min=1), help="So many points from the ranges in place of the grid."
+)
+@click.option("--sampling", type=click.Choice(["sobol", "random"]), default="sobol", show_default=True)
+@click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
+@click.option("--seed", type=int, help="Seed of the random numbers.")
+@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT-sweep].")
+@workers_option
+@scheduler_option
+@json_option
+@settings_option
+@set_option
+def sweep(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    **options: Any,
+) -> None:
+    """Run EXPERIMENT, or replay logs, at all points of a grid of parameters, or at samples of it.
+
+    fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --over robots=1,2
+
+    A table has every metric at every point, and within what nine in ten runs lie; figures show them as
+    curves, or as heat maps over two parameters. A key is as --set has it.
+    """
+    from pipeline.commands import sweep_named
+
+    over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    sweep_named(experiment, labels, over, **options)
 
 
 @fuselog.command(short_help="Render results as one self-contained HTML page.")

@@ -4,17 +4,27 @@ Rerun and matplotlib take long to import: only what draws imports them.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
-from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
+from pipeline.executors import crew_of
+from pipeline.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import ErrorTables, in_order, plain, result_folder, write_outcome
+from pipeline.results import (
+    ErrorTables,
+    in_order,
+    plain,
+    result_folder,
+    split_metric,
+    write_outcome,
+)
 from pipeline.starting import check_same_run, order_of, origins_of, span_of
 from pipeline.studies.localization import summarise, summary_table
+from pipeline.sweeps import DRAWN, Sampling, nested, parse_over, points_of, run_sweep
 from pipeline.terminal import (
     print_claims,
     print_json,
@@ -29,9 +39,9 @@ from pipeline.terminal import (
 from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import Log, NotMcap, open_log
-from recorders.parameters import parse_settings
-from recorders.parsing import parse_json
+from recorders.log import Companions, Log, NotMcap, open_log
+from recorders.parameters import merge, parse_settings
+from recorders.parsing import parse_json, read_toml
 from replay.engine.estimator import find_estimator
 from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
@@ -57,20 +67,27 @@ def replay_logs(
     sigmas: Sequence[str],
     save: Path | None,
     connect: str | None,
+    foxglove: bool,
     recover: bool,
     gap_limit_s: float,
     tells_parameters: bool,
     as_json: bool,
+    settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    inputs = {"log": logs, "start": [Path(origin) for origin in origins]}
+    inputs = {
+        "log": logs,
+        "start": [Path(origin) for origin in origins],
+        "settings": [settings_file] if settings_file else [],
+    }
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     stated = {"model": model, "every_s": every_s}
     chosen = {key: value for key, value in stated.items() if value is not None}
-    estimators = _settings_of_estimators(names, {**parse_settings(settings), **chosen})
+    tuned = read_settings(settings_file, names)
+    estimators = settings_of_estimators(names, {**parse_settings(settings), **chosen}, tuned)
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
@@ -84,13 +101,23 @@ def replay_logs(
         late=policy,
         save=save,
         connect=connect,
+        companions=companions_if(foxglove),
         progress=progress,
-    )
+    ).check()
     _state_losses(source.log for source in sources)
     if tells_parameters and not as_json:
         print_parameters(done.parameters)
     told = {"seconds": dict(done.seconds), "parameters": done.parameters}
     _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
+
+
+def companions_if(foxglove: bool) -> Companions | None:
+    """What makes the messages for Foxglove, where they are asked for; it takes long to import."""
+    if not foxglove:
+        return None
+    from pipeline.foxglove import companions
+
+    return companions
 
 
 def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
@@ -112,10 +139,27 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     return paths
 
 
-def _settings_of_estimators(
-    labels: Sequence[str], settings: Mapping[str, Any]
+def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label, from the tables of a TOML file; none without a file.
+
+    Raises BadInput where the file has settings of another estimator.
+    """
+    tables = {} if path is None else read_toml(path)
+    for label, table in tables.items():
+        if label not in labels or not isinstance(table, dict):
+            raise BadInput(
+                f"{path}: has settings of {label}, and a settings file has a table for each estimator "
+                f"that is replayed: {', '.join(labels)}"
+            )
+    return tables
+
+
+def settings_of_estimators(
+    labels: Sequence[str],
+    settings: Mapping[str, Any],
+    base: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label.
+    """Parameters by estimator label: those of `base`, and settings over them.
 
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
     BadInput where none has.
@@ -127,7 +171,8 @@ def _settings_of_estimators(
         if not isinstance(own, dict):
             raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
         chosen[label] = dict(own)
-        estimator, _ = find_estimator(str(own.get("kind", label)))
+        kind = {**base.get(label, {}), **own}.get("kind", label)
+        estimator, _ = find_estimator(str(kind))
         known[label] = set(estimator.parameters.model_fields)
     for key in [each for each in settings if each not in chosen]:
         takers = [label for label in chosen if key in known[label]]
@@ -138,7 +183,7 @@ def _settings_of_estimators(
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
         for label in takers:
             chosen[label].setdefault(key, settings[key])
-    return chosen
+    return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
@@ -340,6 +385,8 @@ def view_path(
     *,
     screenshot: Path | None,
     at_s: float | None,
+    start_s: float | None,
+    end_s: float | None,
     focus: str | None,
     save: Path | None,
     connect: str | None,
@@ -355,9 +402,12 @@ def view_path(
     with scratch_folder("fuselog-view") as folder:
         if rrd.suffix != ".rrd":
             rrd = save or folder / "timeline.rrd"
-            _draw_log(path, rrd, connect, focus, gap_limit_s, recover=recover)
-        elif save is not None or connect is not None or focus is not None:
-            raise BadInput(f"{rrd}: is drawn already; give --save, --connect and --focus with a log")
+            span = (start_s, end_s)
+            _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
+        elif any(given is not None for given in (start_s, end_s, focus, save, connect)):
+            raise BadInput(
+                f"{rrd}: is drawn already; give --start, --end, --focus, --save and --connect with a log"
+            )
         if screenshot is not None:
             for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
                 warn(complaint)
@@ -366,9 +416,16 @@ def view_path(
 
 
 def _draw_log(
-    path: Path, rrd: Path, connect: str | None, focus: str | None, gap_limit_s: float, *, recover: bool
+    path: Path,
+    rrd: Path,
+    connect: str | None,
+    focus: str | None,
+    span: tuple[float | None, float | None],
+    gap_limit_s: float,
+    *,
+    recover: bool,
 ) -> None:
-    """Draw a log, or an estimates log together with the log that it is of."""
+    """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
     from replay.timeline.show import Drawing
 
     log = open_log(path, recover=recover)
@@ -376,9 +433,12 @@ def _draw_log(
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
         source = LogSource(open_log(_source_path(log), recover=recover))
-    with Drawing(source, identity=str(path), focus=focus, save=rrd, connect=connect) as drawing:
+    shown = span_of(source, *span, "publish_time")
+    identity = f"{path} {span}"
+    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
+        judged = [replace(estimates, start_ns=shown.start_ns, end_ns=shown.end_ns)]
         judge = judge_logs(
-            [estimates] if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
+            judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
         )
     for sentence in judge.unjudged:
         warn(sentence)
@@ -394,27 +454,23 @@ def run_named(
     errors: bool,
     data: Path | None,
     out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
     tells_parameters: bool,
     as_json: bool,
+    settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims."""
-    values = parse_settings(settings)
-    files = [Path(each) for each in named if each.endswith(".mcap")]
-    if files:
-        if len(files) < len(named) or over.keys() & {"runs", "seed"} or data is not None:
-            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
-        experiment = experiment_of_logs(files, labels, {**values, **over})
-        label = experiment.title
-    else:
-        if len(named) > 1 or labels:
-            raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
-        label, experiment = load_experiment(named[0], values, over)
+    label, experiment = _experiment_of(named, labels, over, settings_file, parse_settings(settings))
+    if experiment.logs and data is not None and named[0].endswith(".mcap"):
+        raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
+    crew = crew_of(workers, scheduler, len(experiment.files) or experiment.runs)
     result = run_experiment(
-        label, experiment, folder, data=data, logs=logs, errors=errors, progress=progress
+        label, experiment, folder, data=data, logs=logs, errors=errors, crew=crew, progress=progress
     )
     if as_json:
         print_json(result.model_dump(mode="json"))
@@ -424,3 +480,67 @@ def run_named(
     print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
     say(f"{folder}: logs, estimates, tables, figures, result.json")
+
+
+def _experiment_of(
+    named: Sequence[str],
+    labels: Sequence[str],
+    over: Mapping[str, Any],
+    settings_file: Path | None,
+    values: Mapping[str, Any],
+) -> tuple[str, Experiment]:
+    """The experiment of a name or a TOML file, or that of logs, with settings; and what it is called."""
+    files = [Path(each) for each in named if each.endswith(".mcap")]
+    if files:
+        if len(files) < len(named) or over.keys() & {"runs", "seed"}:
+            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+        values = merge(read_settings(settings_file, labels), values)
+        experiment = experiment_of_logs(files, labels, {**values, **over})
+        return experiment.title, experiment
+    if len(named) > 1 or labels:
+        raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
+    estimators = load_experiment(named[0], {}, {})[1].estimators
+    return load_experiment(named[0], merge(read_settings(settings_file, estimators), values), over)
+
+
+def sweep_named(
+    named: Sequence[str],
+    labels: Sequence[str],
+    over: Mapping[str, Any],
+    *,
+    swept: Sequence[str],
+    samples: int | None,
+    sampling: Sampling,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
+    overs = [parse_over(text) for text in swept]
+    values = parse_settings(settings)
+
+    def at(point: Mapping[str, Any]) -> Experiment:
+        return _experiment_of(named, labels, over, settings_file, merge(values, nested(point)))[1]
+
+    label, experiment = _experiment_of(named, labels, over, settings_file, values)
+    points = points_of(overs, samples, sampling, experiment.seed)
+    folder = out or Path("out") / f"{label}-sweep"
+    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
+    check_folder(folder, {"input": inputs})
+    crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
+    result = run_sweep(label, overs, points, list(map(at, points)), folder, crew=crew, progress=progress)
+    if as_json:
+        print_json(result.model_dump(mode="json"))
+        return
+    drawn = {key: value for key, value in result.metrics.items() if split_metric(key)[1] in DRAWN}
+    lists = {key: value for key, value in drawn.items() if isinstance(value, list)}
+    shown = {key: value for key, value in lists.items() if len({*value}) > 1} or lists
+    rows = [
+        [*point.values(), *(value[number] for value in shown.values())]
+        for number, point in enumerate(points)
+    ]
+    print_table([*points[0], *shown], rows)
+    say(f"{folder}: the table of all metrics, figures, result.json")

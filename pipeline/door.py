@@ -6,19 +6,23 @@ it; `pipeline.replays` has the replay.
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline import catalog
 from pipeline.catalog import Entry
+from pipeline.executors import crew_of, of_executor
 from pipeline.experiment import load_experiment, load_scenario, run_experiment
 from pipeline.outputs import LOG, check_files, check_folder
 from pipeline.results import Result
 from pipeline.studies.localization import summary_table
+from pipeline.sweeps import nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, open_log, write_log
 from recorders.parameters import merge
@@ -123,6 +127,9 @@ def run(
     out: str | Path | None = None,
     logs: int = 20,
     errors: bool = False,
+    workers: int = 1,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
 ) -> ResultFolder:
     """Run an experiment into a result folder.
@@ -135,6 +142,10 @@ def run(
         out: the folder, by default out/ and the experiment's name.
         logs: of how many runs the logs are kept.
         errors: whether every single error is kept.
+        workers: processes that share the runs; a script that asks for more than one guards its own
+            work with `if __name__ == "__main__":`, as they import it.
+        scheduler: a Dask scheduler whose workers share them, or `local:N`.
+        executor: anything else that works on them, whose workers see this machine's files.
         set: entries of the experiment, parameters of its scenario, or of its estimators by label:
             `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
 
@@ -146,9 +157,51 @@ def run(
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []
     check_folder(folder, {"input": files if place is None else [*files, place]})
+    crew = crew_of(workers, scheduler, found.runs) if executor is None else of_executor(executor)
     return ResultFolder(
-        folder, run_experiment(name, found, folder, data=place, logs=logs, errors=errors)
+        folder, run_experiment(name, found, folder, data=place, logs=logs, errors=errors, crew=crew)
     )
+
+
+def sweep(
+    experiment: str | Path,
+    over: Mapping[str, Iterable[Any]],
+    /,
+    *,
+    runs: int | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+) -> ResultFolder:
+    """Run an experiment at all points of a grid into a result folder, whose table `sweep` has them.
+
+    Args:
+        experiment: a name (`experiments` has them), or a TOML file.
+        over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`.
+        runs: how many at each point, if not as many as the experiment says.
+        seed: another than the experiment's.
+        out: the folder, by default out/ and the experiment's name with -sweep.
+        workers: as for `run`.
+        scheduler: as for `run`.
+        executor: as for `run`.
+        set: as for `run`.
+
+    Raises BadInput where it cannot be run, or the folder holds something else than a result.
+    """
+    stated = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    overs = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
+    points = points_of(overs)
+    at = [load_experiment(str(experiment), merge(set or {}, nested(point)), stated) for point in points]
+    name = at[0][0]
+    folder = Path("out", f"{name}-sweep") if out is None else Path(out)
+    check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
+    found = [each for _, each in at]
+    runs_in_all = sum(each.runs for each in found)
+    crew = crew_of(workers, scheduler, runs_in_all) if executor is None else of_executor(executor)
+    return ResultFolder(folder, run_sweep(name, overs, points, found, folder, crew=crew))
 
 
 class Catalog(Mapping[str, Entry]):

@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -22,7 +21,7 @@ import psutil
 
 from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
-from recorders.log import Clock, LogWriter, RunMetadata
+from recorders.log import Clock, Companions, LogWriter, RunMetadata
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged
 from replay.engine.estimator import Bound, bind
@@ -31,7 +30,7 @@ from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
 from replay.judging.judge import TIME_BINS, Judge
-from replay.judging.metrics import Metric, Output, find_metrics, measure
+from replay.judging.metrics import Metric, Output, find_metrics, measure, plus
 from replay.judging.set_errors import SetErrors
 
 if TYPE_CHECKING:
@@ -97,11 +96,27 @@ class Pass:
         judge: of all runs.
         parameters: of every estimator, defaults included, by label.
         seconds: that each estimator took, by label.
+        refused: by estimator, why none of the runs can be replayed.
+        input_sha256: a hash of the data that went in, where it was asked for.
     """
 
     judge: Judge
     parameters: dict[str, dict[str, Any]]
-    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    seconds: dict[str, float] = field(default_factory=dict)
+    refused: dict[str, BadInput] = field(default_factory=dict)
+    input_sha256: str = ""
+
+    def merge(self, other: "Pass") -> None:
+        """Take in what a pass over later runs left."""
+        self.judge.merge(other.judge)
+        self.seconds = plus(self.seconds, other.seconds)
+        self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
+
+    def check(self) -> "Pass":
+        """Itself; raises BadInput where there is an estimator that could follow no run."""
+        for refusal in self.refused.values():
+            raise refusal
+        return self
 
 
 def replay_parts(
@@ -116,6 +131,7 @@ def replay_parts(
     connect: str | None = None,
     on_errors: Callable[[Errors], None] | None = None,
     block_messages: int = BLOCK_MESSAGES,
+    companions: Companions | None = None,
     progress: Progress = no_progress,
 ) -> Pass:
     """Replay an ensemble part by part: block by block to the estimates logs, the judge and the timeline.
@@ -133,16 +149,16 @@ def replay_parts(
         connect: the receiver that it goes to; see `Drawing`.
         on_errors: is handed the errors of every block.
         block_messages: about how many messages of a run are in memory at once.
+        companions: makes what is written beside the estimates for viewers.
         progress: is told of every block.
 
-    Raises BadInput as `replay` does, for what no run of any part can be replayed by.
+    An estimator that can follow no run of any part is told of, see `Pass.check`.
     """
     found = find_metrics(metrics)
-    reports: list[Report] = []
     passes: list[Pass] = []
 
     def replayed(part: Part) -> Iterator[None]:
-        reports.append(report := Report())
+        report = Report()
         bound = bind_from(part.sources, estimators, part.origins, order)
         judge = Judge(
             part.sources,
@@ -153,7 +169,13 @@ def replay_parts(
         )
         with ExitStack() as stack:
             writers = [
-                stack.enter_context(LogWriter(path, estimates_metadata(source, estimators, path, log)))
+                stack.enter_context(
+                    LogWriter(
+                        path,
+                        estimates_metadata(source, estimators, path, log),
+                        companions=companions,
+                    )
+                )
                 for (path, log), source in zip(part.estimates, part.sources, strict=False)
             ]
             drawing = None
@@ -161,7 +183,7 @@ def replay_parts(
                 from replay.timeline.show import Drawing  # which takes long to import
 
                 asked = json.dumps([str(part.sources[0].start_ns), estimators], default=str)
-                first = Drawing(part.sources[0], identity=asked, save=save, connect=connect)
+                first = Drawing(part.sources[0].whole(), identity=asked, save=save, connect=connect)
                 drawing = stack.enter_context(first)
             blocks = replay_blocks(
                 part.sources,
@@ -184,18 +206,15 @@ def replay_parts(
                 for run, writer in enumerate(writers):
                     writer.write([ragged.of_run(run) for ragged in block.values()])
                 yield
+        judge.close()
+        done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
         if passes:
-            passes[0].judge.merge(judge)
+            passes[0].merge(done)
         else:
-            passes.append(Pass(judge, parameters_of(bound)))
-        for label, time_s in report.seconds.items():
-            passes[0].seconds[label] += time_s
+            passes.append(done)
 
     for _ in progress(chain.from_iterable(map(replayed, parts)), "replaying", None):
         pass
-    for name, refusal in reports[0].refused.items():
-        if all(name in report.refused for report in reports):
-            raise refusal
     return passes[0]
 
 
@@ -405,13 +424,14 @@ def replay_in_memory(
     estimators: Settings,
     *,
     order: Clock = "publish_time",
+    late: Late | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Ragged]:
     """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
     outputs: dict[str, Ragged] = {}
     for label in progress(estimators, "replaying", len(estimators)):
         bound = bind(label, sources, estimators[label])
-        blocks = replay_blocks(sources, bound, Report(), order=order)
+        blocks = replay_blocks(sources, bound, Report(), order=order, late=late)
         outputs |= collect(list(block.values()) for block in blocks)
     return outputs
 

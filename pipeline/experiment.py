@@ -11,6 +11,8 @@ from typing import Annotated, Any, Self
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
 from pipeline.ensemble import Progress, no_progress
+from pipeline.executors import Crew
+from pipeline.kept import Kept, kept_cells
 from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge
@@ -101,18 +103,24 @@ class Setting:
         place: where the folder will be when it is whole.
         data: what is imported.
         logs: of how many runs the logs are kept.
+        draws: whether the first run's timeline is drawn.
         errors: whether every single error is kept too.
         options: of the study's own type.
         progress: is told how it goes.
+        crew: who works off the cells of a campaign; by default this process.
+        kept: where finished cells are kept until all are.
     """
 
     folder: Path
     place: Path
     data: Path | None = None
     logs: int = 20
+    draws: bool = True
     errors: bool = False
     options: Any = None
     progress: Progress = no_progress
+    crew: Crew | None = None
+    kept: Kept | None = None
 
 
 @dataclass(frozen=True)
@@ -256,6 +264,7 @@ def run_experiment(
     data: Path | None = None,
     logs: int = 20,
     errors: bool = False,
+    crew: Crew | None = None,
     progress: Progress = no_progress,
 ) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
@@ -276,13 +285,25 @@ def run_experiment(
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
+        kept_cells(folder) as kept,
         result_folder(folder) as part,
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
     ):
         # of runs that all failed there is no mean: a null in the results, not a warning
         warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
-        outcome = study.run(experiment, Setting(part, folder, data, logs, errors, options, progress))
+        setting = Setting(
+            folder=part,
+            place=folder,
+            data=data,
+            logs=logs,
+            errors=errors,
+            options=options,
+            progress=progress,
+            crew=crew,
+            kept=kept,
+        )
+        outcome = study.run(experiment, setting)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

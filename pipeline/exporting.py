@@ -12,12 +12,18 @@ from urllib.parse import quote
 from pipeline.outputs import Kind, check_files, check_folder
 from recorders.atomic import whole_file, whole_folder
 from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Log, Stream, open_log, read_blocks, read_empty, schemas
+from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
 from recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from replay.judging.trajectories import trajectory_of
 
-To = Literal["tum", "kitti", "csv", "parquet"]
-SUFFIXES: dict[To, str] = {"tum": ".txt", "kitti": ".txt", "csv": ".csv", "parquet": ".parquet"}
+To = Literal["tum", "kitti", "csv", "parquet", "foxglove"]
+SUFFIXES: dict[To, str] = {
+    "tum": ".txt",
+    "kitti": ".txt",
+    "csv": ".csv",
+    "parquet": ".parquet",
+    "foxglove": ".mcap",
+}
 TRAJECTORIES: dict[str, tuple[str, Callable[[Trajectory], list[str]]]] = {
     "tum": ("# timestamp tx ty tz qx qy qz qw\n", tum_lines),
     "kitti": ("", kitti_lines),
@@ -41,12 +47,14 @@ def export(
     topics: Sequence[str] = (),
     recover: bool = False,
 ) -> Exported:
-    """Export topics of a log: "tum" and "kitti" trajectories, or "csv" and "parquet" tables.
+    """Export topics of a log: "tum" and "kitti" trajectories, "csv" and "parquet" tables, or "foxglove".
 
     Args:
         path: the log, or estimates log.
-        to: the format; trajectories are of estimates and truths that state a position.
-        out: the folder of the files, by default named after the log; of one topic the file.
+        to: the format; trajectories are of estimates and truths that state a position; "foxglove" is
+            one log of what its viewers can show, see `pipeline.foxglove`.
+        out: the folder of the files, by default named after the log; of one topic, or to "foxglove", the
+            file.
         topics: which; none stands for all that fit.
         recover: read what is whole of a log that was cut off or damaged.
 
@@ -57,6 +65,8 @@ def export(
     log = open_log(path, recover=recover)
     notes = [log.loss_statement] if log.loss_statement else []
     chosen = _chosen(log, to, topics, notes)
+    if to == "foxglove":
+        return _export_companions(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
     names = {topic: _file_name(topic, to) for topic in chosen}
     for topic, name in names.items():
         if list(names.values()).count(name) > 1:
@@ -64,8 +74,7 @@ def export(
     if len(topics) == 1:
         (topic,) = chosen
         place = Path(out or f"{log.path.stem}-{names[topic]}")
-        new = Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
-        check_files([(place, new)], {"log": [log.path]})
+        check_files([(place, _new(to))], {"log": [log.path]})
         with whole_file(place) as part:
             _write(log, to, {topic: part}, notes)
         return Exported({topic: place}, notes)
@@ -101,6 +110,29 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
         what = "estimates or truth with a position" if to in TRAJECTORIES else "streams of columns"
         raise BadInput(f"{log.path}: holds no {what} to export to {to}")
     return chosen
+
+
+def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """One log of the companions of all topics that have some."""
+    from pipeline.foxglove import companions  # which takes long to import
+
+    check_files([(place, _new("foxglove"))], {"log": [log.path]})
+    written = dict.fromkeys(topics, 0)
+    with LogWriter(place) as writer:
+        for block in read_blocks(log, topics):
+            for topic, stream in block.items():
+                written[topic] += writer.write_companions(companions(stream))
+        if not any(written.values()):
+            raise BadInput(f"{log.path}: holds nothing that Foxglove can show; export it as csv")
+    without = [topic for topic, messages in written.items() if messages == 0]
+    if without:
+        notes.append(f"Foxglove has no message for, left out: {', '.join(without)}")
+    return Exported({topic: place for topic, messages in written.items() if messages}, notes)
+
+
+def _new(to: To) -> Kind:
+    """A file that is not there yet."""
+    return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
 
 
 def _is_state(log: Log, topic: str) -> bool:

@@ -45,6 +45,9 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
         for topic in log.topics.values()
     ]
     print_table(["topic", "schema", "messages", "per second"], rows)
+    if log.companions:
+        count = sum(topic.messages for topic in log.companions.values())
+        say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
     elif log.topics:

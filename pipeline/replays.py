@@ -86,7 +86,7 @@ def replay(
             raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
     from_ = [start_from] if isinstance(start_from, str | Path) else start_from
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
-    settings = _settings(estimators)
+    settings = settings_of(estimators)
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
     sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
@@ -102,9 +102,9 @@ def replay(
             metrics=wanted,
             order=order,
             late=policy,
-        )
+        ).check()
         estimates = [LogSource(open_log(path)) for path, _ in places]
-        made = Replay(sources, estimates, settings, done, gap_limit_s)
+        made = Replay(sources, estimates, settings, done, gap_limit_s, arrival_order, late)
         weakref.finalize(made, stack.pop_all().close)
     return made
 
@@ -119,6 +119,7 @@ class Replay:
         settings: the estimators by label, as they were given.
         done: the pass: its judge, all parameters, and how long each estimator worked.
         gap_limit_s: the truth is not interpolated over longer gaps.
+        arrival_order, late: as they were given.
     """
 
     logs: Sequence[LogSource | MemorySource]
@@ -126,6 +127,8 @@ class Replay:
     settings: Settings
     done: Pass
     gap_limit_s: float
+    arrival_order: bool = False
+    late: str | None = None
 
     @property
     def judge(self) -> Judge:
@@ -218,7 +221,7 @@ class Replay:
         if not 0 <= run < len(self.logs):
             raise BadInput(f"no run {run} to show; the runs are 0 to {len(self.logs) - 1}")
         if save is not None:
-            check_files([(Path(save), TIMELINE)], {"log": self._paths})
+            check_files([(Path(save), TIMELINE)], {"log": self.paths})
             self._draw(run, focus, Path(save))
             return
         with scratch_folder("fuselog-view") as folder:
@@ -232,7 +235,7 @@ class Replay:
 
         log = self.logs[run]
         identity = json.dumps([str(log.start_ns), self.settings], default=str)
-        with Drawing(log, identity=identity, focus=focus, save=rrd) as drawing:
+        with Drawing(log.whole(), identity=identity, focus=focus, save=rrd) as drawing:
             judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
@@ -241,7 +244,7 @@ class Replay:
         Raises BadInput where something else than a result of ours is in the place.
         """
         place = Path(folder)
-        check_folder(place, {"input": self._paths})
+        check_folder(place, {"input": self.paths})
         settings = {
             "title": f"replay of {self.logs[0].name}",
             "logs": [log.name for log in self.logs],
@@ -249,16 +252,20 @@ class Replay:
             "parameters": self.done.parameters,
             "gap_limit_s": self.gap_limit_s,
         }
+        stated = {"arrival_order": self.arrival_order or None, "late": self.late}
+        settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
             outcome = summarise(self.judge)
-            outcome.input_sha256 = self._hash()
+            outcome.input_sha256 = self.input_sha256
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 
     @property
-    def _paths(self) -> list[Path]:
+    def paths(self) -> list[Path]:
+        """The files that were replayed."""
         return [log.log.path for log in self.logs if isinstance(log, LogSource)]
 
-    def _hash(self) -> str:
+    @property
+    def input_sha256(self) -> str:
         """SHA-256 of what was replayed: of logs their files, of recordings their columns."""
         digest = hashlib.sha256()
         for log in self.logs:
@@ -288,7 +295,7 @@ def _source(log: Log) -> LogSource | MemorySource:
     raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
 
 
-def _settings(
+def settings_of(
     estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
 ) -> dict[str, dict[str, Any]]:
     """The settings of each estimator by its label; raises BadInput where they are none."""

@@ -7,7 +7,7 @@ it, so that nothing else is ever replaced with it.
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -33,6 +33,8 @@ RESULT_FILE = "result.json"
 CSV_ROWS = 20_000
 # Raised when result.json changes in a way that its readers must know; one without it is of the first.
 FORMAT = 1
+# Where every single error is, in a result's folder.
+ERRORS = Path("tables", "errors")
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -191,7 +193,7 @@ class ErrorTables:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder / "tables" / "errors"
+        self._folder = folder / ERRORS
         self._stack = ExitStack()
         self._writers: dict[tuple[str, str], Any] = {}
 
@@ -218,6 +220,17 @@ class ErrorTables:
             self._writers[what] = self._stack.enter_context(writer)
         if len(table):
             self._writers[what].write_table(table)
+
+
+def join_tables(parts: Sequence[Path], place: Path) -> None:
+    """One Parquet file of the rows of several, in their order."""
+    import pyarrow.parquet
+
+    files = [pyarrow.parquet.ParquetFile(part) for part in parts]
+    with pyarrow.parquet.ParquetWriter(place, files[0].schema_arrow) as writer:
+        for file in files:
+            for group in range(file.num_row_groups):
+                writer.write_table(file.read_row_group(group))
 
 
 def write_outcome(

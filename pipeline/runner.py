@@ -3,7 +3,6 @@
 A study keeps what is its own: cases, claims, tables, figures.
 """
 
-import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -16,10 +15,9 @@ from pipeline.ensemble import (
     Pass,
     Replayed,
     Settings,
-    add_to_hash,
     estimates_metadata,
     hash_files,
-    parts_of,
+    hash_streams,
     record_ensemble,
     replay_ensemble,
     replay_parts,
@@ -142,49 +140,41 @@ class Runner:
             self.keep(replayed.sources, replayed.outputs, name, drawn=name if number else "")
             yield name, replayed
 
-    def judge(self) -> tuple[Pass, str]:
-        """All of it in one streamed pass: what it leaves, and a hash of the data that went in.
-
-        Memory holds a part of the runs at a time.
-        """
+    def judge(self, now: slice) -> Pass:
+        """Some of the runs in one streamed pass; the first ones' logs and timeline go to the folder."""
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
-        digest = hashlib.sha256()
-
-        def parts() -> Iterator[Part]:
-            for now in parts_of(experiment.runs):
-                places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
-                sources: Sequence[Source]
-                if experiment.logs:
-                    files = experiment.files[now]
-                    sources = [LogSource(open_log(file)) for file in files]
-                    digest.update(hash_files(files).encode())
-                    estimates = [
-                        (path, self._as_seen_from(path, file))
-                        for (_, path), file in zip(places, files, strict=False)
-                    ]
-                else:
-                    recorded = self.obtain(first_run=now.start, runs=now.stop - now.start)
-                    for source, (log, _) in zip(recorded, places, strict=False):
-                        _write_log(source, log)
-                    for source in recorded:
-                        add_to_hash(digest, source)
-                    sources, estimates = recorded, [(path, log) for log, path in places]
-                yield Part(sources, now.start, len(sources) == experiment.runs, estimates)
-
+        places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
+        sources: Sequence[Source]
+        if experiment.logs:
+            files = experiment.files[now]
+            sources = [LogSource(open_log(file)) for file in files]
+            input_sha256 = hash_files(files)
+            estimates = [
+                (path, self._as_seen_from(path, file))
+                for (_, path), file in zip(places, files, strict=False)
+            ]
+        else:
+            recorded = self.obtain(first_run=now.start, runs=now.stop - now.start)
+            for source, (log, _) in zip(recorded, places, strict=False):
+                _write_log(source, log)
+            sources, estimates = recorded, [(path, log) for log, path in places]
+            input_sha256 = hash_streams(recorded)
+        part = Part(sources, now.start, len(sources) == experiment.runs, estimates)
         with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
             done = replay_parts(
-                parts(),
+                [part],
                 experiment.estimators,
                 gap_limit_s=experiment.gap_limit_s,
                 metrics=experiment.metrics,
                 order=order,
                 late=late,
-                save=setting.folder / "timeline.rrd",
+                save=setting.folder / "timeline.rrd" if setting.draws else None,
                 on_errors=errors.add if errors else None,
                 progress=setting.progress,
             )
-        return done, digest.hexdigest()
+        done.input_sha256 = input_sha256
+        return done
 
     def _as_seen_from(self, path: Path, log: Path) -> Path:
         """Where a log seems to be from a file of the folder, so that it is there when that has moved."""

@@ -262,6 +262,11 @@ def _losses(log: Log) -> list[str]:
     """What is missing from a log, or is in it beside its topics and is not carried over."""
     foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
     losses = [log.loss_statement] if log.loss_statement else []
+    if log.companions:
+        losses.append(
+            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
+            "fuselog export LOG --to foxglove"
+        )
     if foreign:
         losses.append(
             f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"

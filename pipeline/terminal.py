@@ -7,7 +7,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -36,6 +37,18 @@ def progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[An
     """Pass items through with a progress bar on standard error; none where nobody watches."""
     with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
         yield from bar.track(items, total=total, description=title)
+
+
+@contextmanager
+def status() -> Iterator[Callable[[str], None]]:
+    """What shows how work goes, in one line on standard error; nothing where nobody watches."""
+    with err.status("", spinner="line") if err.is_terminal else nullcontext() as line:
+
+        def show(text: str) -> None:
+            if line is not None:
+                line.update(printable(text))
+
+        yield show
 
 
 def say(text: str) -> None:

@@ -1,5 +1,6 @@
 """Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from textwrap import shorten
@@ -111,6 +112,47 @@ def _accepts(schema: Mapping[str, Any]) -> str:
     signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
     bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
     return " ".join([schema.get("type", "anything").replace("null", "none"), *bounds])
+
+
+def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
+    """The least and the greatest value of a number by its full name; infinite where there is none.
+
+    Raises BadInput where a type has no number of this name.
+    """
+    schema = kind.model_json_schema()
+    tables, known = [schema], set[str]()
+    for part in name.split("."):
+        known = {each for table in tables for each in table.get("properties", {})}
+        entries = [
+            table["properties"][part] if part in table.get("properties", {}) else table[_OTHERS]
+            for table in tables
+            if part in table.get("properties", {}) or isinstance(table.get(_OTHERS), dict)
+        ]
+        tables = [
+            schema["$defs"][option["$ref"].rpartition("/")[2]] if "$ref" in option else option
+            for entry in entries
+            for option in entry.get("anyOf", [entry])
+        ]
+    numbers = [each for each in tables if each.get("type") == "number"]
+    if not tables:
+        raise BadInput(f"no parameter '{name}'; {choices(name.rpartition('.')[2], sorted(known))}")
+    if not numbers:
+        raise BadInput(f"parameter '{name}' is no number that can be searched for")
+    low = max(each.get("exclusiveMinimum", each.get("minimum", -math.inf)) for each in numbers)
+    return low, min(each.get("exclusiveMaximum", each.get("maximum", math.inf)) for each in numbers)
+
+
+_OTHERS = "additionalProperties"  # of a table whose names are the user's
+
+
+def nested(name: str, value: Any) -> dict[str, Any]:
+    """The tables in which a value of this full name stands.
+
+    >>> nested("range.rate_hz", 5.0)
+    {'range': {'rate_hz': 5.0}}
+    """
+    first, _, rest = name.partition(".")
+    return {first: nested(rest, value) if rest else value}
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import os
 import sys
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,41 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip on Windows what it has no such thing for."""
     if sys.platform == "win32" and item.get_closest_marker("unix"):
         pytest.skip("signals, limits, links and owners of files as Unix has them")
+
+
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Loops in plain Python, of which none is left to the next test.
+
+    A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
+    """
+    from replay.engine import blocks, supervision
+    from replay.inference import (
+        estimators,
+        gauss_newton,
+        imm,
+        observability,
+        rewinding,
+        smoothers,
+    )
+
+    loops = (
+        blocks._merge,
+        supervision._over_runs,
+        estimators._compiled,
+        rewinding._compiled,
+        gauss_newton.searching,
+        smoothers._way_back,
+        smoothers._sliding,
+        imm._smoothing,
+        observability._summing,
+    )
+    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    for each in loops:
+        each.cache_clear()
+    yield
+    for each in loops:
+        each.cache_clear()
 
 
 @pytest.fixture(scope="session")
@@ -36,12 +72,27 @@ def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the Autoferry scenarios, unpacked once."""
+    return _unpacked(real_data / "autoferry.tar.xz", tmp_path_factory) / "autoferry"
+
+
+@pytest.fixture(scope="session")
 def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of TUM and KITTI trajectories and of evo's results, unpacked once."""
     archive = real_data / "trajectories.tar.xz"
     if not archive.exists():
         pytest.skip(f"no {archive}")
     return _unpacked(archive, tmp_path_factory) / "trajectories"
+
+
+@pytest.fixture(scope="session")
+def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of GNSS, inertial and UWB recordings, unpacked once."""
+    archive = real_data / "navigation.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    return _unpacked(archive, tmp_path_factory) / "navigation"
 
 
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -74,9 +74,9 @@ function axesOf(index) {
 function lineTrace(series, colour, index) {
   return {
     ...axesOf(index), x: series.x, y: series.y, name: escaped(series.label), legendgroup: series.label,
-    mode: { "line+markers": "lines+markers", markers: "markers" }[series.style] ?? "lines",
+    mode: { "line+markers": "lines+markers", markers: "markers", dots: "markers" }[series.style] ?? "lines",
     line: { color: colour, width: 1.5, dash: series.style === "dashed" ? "dash" : "solid" },
-    marker: { color: colour, size: 5 },
+    marker: series.style === "dots" ? { color: colour, size: 2, opacity: 0.5 } : { color: colour, size: 5 },
   };
 }
 

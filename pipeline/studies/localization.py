@@ -4,23 +4,24 @@ It is what most experiments need: record or import, replay, judge, draw. Familie
 add their own tables, figures and claims.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import pandas as pd
 
+from pipeline.campaigns import judge
 from pipeline.charts import Axis, Chart, Panel, Style, band, curve, thinned
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome, split_metric
-from pipeline.runner import Runner
 from replay.judging.evaluation import Errors
 from replay.judging.judge import Judge
+from replay.judging.means import INSERTED
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
-    done, input_sha256 = Runner(experiment, setting).judge()
+    done = judge(experiment, setting)
     outcome = summarise(done.judge)
-    outcome.input_sha256, outcome.parameters = input_sha256, done.parameters
+    outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters
     return outcome
 
 
@@ -35,10 +36,17 @@ def summarise(judge: Judge) -> Outcome:
         outcome.tables["steps"] = pd.concat(steps)
         outcome.tables["runs"] = judge.runs_table
         outcome.tables["times"] = judge.times
-    modes = judge.modes
-    if len(modes):
-        outcome.tables["modes"] = modes
-    for what, charts in {"errors": error_charts(judge), "modes": mode_charts(modes)}.items():
+    over_time = {"modes": judge.modes, "effective": judge.effective, "late-times": judge.late}
+    outcome.tables |= {name: table for name, table in over_time.items() if len(table)}
+    if len(judge.late):
+        outcome.tables["late"] = late_counts(judge.late)
+    drawn = {
+        "errors": error_charts(judge),
+        "modes": by_case(judge.modes, mode_chart),
+        "effective": by_case(judge.effective, effective_chart),
+        "late": by_case(judge.late, late_chart),
+    }
+    for what, charts in drawn.items():
         for case, chart in charts.items():
             outcome.figures[f"{what}-{case}" if case else what] = chart
     return outcome
@@ -84,11 +92,11 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
     return Chart(title=f"{what}; bands: the RMSE's 95 % if consistent", panels=[rmse, nees])
 
 
-def mode_charts(modes: pd.DataFrame) -> dict[str, Chart]:
-    """How probable modes are over time, by case, where there are any; see `Judge.modes`."""
-    if modes.empty:
+def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:
+    """A chart of the rows of each case."""
+    if table.empty:
         return {}
-    return {str(case): mode_chart(each, str(case)) for case, each in modes.groupby("case", sort=False)}
+    return {str(case): draw(rows, str(case)) for case, rows in table.groupby("case", sort=False)}
 
 
 def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
@@ -102,6 +110,48 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
     dashed = "; dashed: given all data of a run" if modes["smoothed"].any() else ""
     title = f"{case or 'modes'}, probability of each mode{dashed}"
     return Chart(title=title, panels=list(panels.values()))
+
+
+def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
+    """The mean share of the particles that is effective over time, all runs together."""
+    x, y = Axis(label="time (s)"), Axis(label="effective share", limits=(0.0, 1.0))
+    series = [
+        curve(str(name), rows["elapsed_s"], rows["effective_share"])
+        for name, rows in effective.groupby("estimator", sort=False)
+    ]
+    title = f"{case or 'particles'}, share of the particles that is effective"
+    return Chart(title=title, panels=[Panel(x=x, y=y, series=series)])
+
+
+def late_counts(late: pd.DataFrame) -> pd.DataFrame:
+    """How many messages came late: a row per estimator, case and what became of them; see `Judge.late`.
+
+    With their mean delay in seconds, and how many messages were used again for them.
+    """
+    rows = late.assign(late_s=late["late_s"] * late["messages"])
+    if "repeated" in late:
+        rows["repeated"] = late["repeated"].fillna(0.0) * late["messages"]
+    counts = rows.drop(columns="elapsed_s").groupby(["estimator", "case", "became"], sort=False).sum()
+    counts["late_s"] /= counts["messages"]
+    return counts.reset_index()
+
+
+def late_chart(late: pd.DataFrame, case: str) -> Chart:
+    """How late messages came over time and what became of them, a panel for each estimator."""
+    counts, panels = late_counts(late), []
+    for name, rows in late.groupby("estimator", sort=False):
+        series = [
+            curve(str(became), each["elapsed_s"], each["late_s"], "markers")
+            for became, each in rows.groupby("became", sort=False)
+        ]
+        told = [
+            f"{each.messages} {each.became}"
+            + (f", {each.repeated:.0f} used again for them" if each.became == INSERTED else "")
+            for each in counts[counts["estimator"] == name].itertuples()
+        ]
+        x, y = Axis(label="time (s)"), Axis(label="mean delay (s)")
+        panels.append(Panel(x=x, y=y, series=series, title=f"{name}: {'; '.join(told)}"))
+    return Chart(title=f"{case or 'messages'}, messages that came late", panels=panels)
 
 
 LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)

@@ -1,15 +1,18 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
+from recorders.log.companions import Companion
 from recorders.log.container import NotMcap
 from recorders.log.opening import Log, Topic, open_log
 from recorders.log.reader import read_blocks, read_empty, read_span, read_streams
 from recorders.log.run import RunMetadata
 from recorders.log.schemas import Field, Schema
 from recorders.log.streams import Clock, Stream, make_stream
-from recorders.log.writer import LogWriter, write_log
+from recorders.log.writer import Companions, LogWriter, write_log
 
 __all__ = [
     "Clock",
+    "Companion",
+    "Companions",
     "Field",
     "Log",
     "LogWriter",

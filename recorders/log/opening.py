@@ -8,6 +8,7 @@ from pathlib import Path
 from mcap import records
 
 from recorders.errors import BadInput
+from recorders.log.companions import COMPANION_OF
 from recorders.log.container import Container, open_container
 from recorders.log.run import RECORD_NAME, RunMetadata
 
@@ -39,7 +40,16 @@ class Log:
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """The topics by name, sorted."""
+        """The topics by name, sorted; companions are none of them."""
+        return {name: topic for name, topic in self._all.items() if COMPANION_OF not in topic.metadata}
+
+    @cached_property
+    def companions(self) -> dict[str, Topic]:
+        """What is in the log for viewers alone, by name, sorted."""
+        return {name: topic for name, topic in self._all.items() if COMPANION_OF in topic.metadata}
+
+    @cached_property
+    def _all(self) -> dict[str, Topic]:
         grouped: dict[str, list[records.Channel]] = {}
         for channel in self.container.channels.values():
             grouped.setdefault(channel.topic, []).append(channel)
@@ -80,9 +90,9 @@ class Log:
         """How many are left out of the messages that a whole summary states; empty where none are."""
         stated = {
             topic.name: sum(self.container.stated_counts[key] for key in topic.channel_ids)
-            for topic in self.topics.values()
+            for topic in self._all.values()
         }
-        lost = {name: count - self.topics[name].messages for name, count in stated.items()}
+        lost = {name: count - self._all[name].messages for name, count in stated.items()}
         parts = [f"{lost[name]} of {stated[name]} of {name}" for name in lost if lost[name] > 0]
         return f"messages are left out, {_listed(parts, 'topics')}" if parts else ""
 

@@ -242,6 +242,12 @@ DETECTION = _declare(
     _identifier("scan_id"),
     _vector("position_m"),
 )
+SCAN_BEARING = _declare(
+    "ScanBearing",
+    "One bearing of an unordered scan, in the sensor's frame, anticlockwise from its x axis.",
+    _identifier("scan_id"),
+    _real("bearing_rad"),
+)
 SCAN = _declare(
     "Scan",
     "One sweep of a sensor and how many detections it has; none is information too.",
@@ -384,6 +390,11 @@ REWOUND = _declare(
     "A late measurement was used after all; so many messages after it were used again.",
     _identifier("repeated"),
 )
+WAITED = _declare(
+    "Waited",
+    "A late measurement was used in its order, since newer ones waited for it: by so much newer.",
+    _real("behind_s"),
+)
 COVERAGE = _declare(
     "Coverage",
     "For how much of a run, from this stamp to the end, there are estimates.",
@@ -434,6 +445,26 @@ TRACK_ESTIMATE = _declare(
     _identifier("track_id"),
     _vector("mean"),
     _vector("covariance"),
+)
+
+EXISTENCE = _declare(
+    "Existence",
+    "How probable it is that the track of the same row of another topic is that of a thing.",
+    _real("existence"),
+)
+ASSOCIATION = _declare(
+    "Association",
+    "How probable it is that a detection is a track's; the metadata lists the sensors by number.",
+    _identifier("track_id"),
+    _identifier("sensor_id"),
+    _identifier("scan_id"),
+    _identifier("detection"),
+    _real("probability"),
+)
+APPROXIMATION = _declare(
+    "Approximation",
+    "So many tracks shared so many detections of a scan that how probable each is was approximated.",
+    _identifier("tracks"),
 )
 
 SCHEMAS: dict[str, Schema] = {

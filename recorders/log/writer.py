@@ -1,6 +1,6 @@
 """Writing streams as a log: whole chunks at a time, and never half a file."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -8,12 +8,21 @@ from typing import Any, Self
 import numpy as np
 
 from recorders.errors import BadInput
+from recorders.log.companions import (
+    COMPANION_OF,
+    Companion,
+    Numbered,
+    chunks_of_companions,
+    descriptor_set,
+)
 from recorders.log.container_writer import ContainerWriter
 from recorders.log.layout import layout_of
 from recorders.log.packing import chunks_of
 from recorders.log.run import RECORD_NAME, RunMetadata
 from recorders.log.schemas import Schema
 from recorders.log.streams import Stream, check_stream
+
+Companions = Callable[[Stream], Iterable[Companion]]
 
 
 @dataclass
@@ -27,6 +36,14 @@ class _Topic:
     messages: int = 0
 
 
+@dataclass
+class _Channel:
+    """The channel of a companion, and how many messages it has so far."""
+
+    channel_id: int
+    messages: int = 0
+
+
 class LogWriter:
     """Writes one log; use it as a context manager, and the log appears whole or not at all.
 
@@ -35,6 +52,7 @@ class LogWriter:
         run: what the run was; where that is known at the end alone, see `describe`.
         compression: "zstd", "lz4" or "none".
         chunk_bytes: about how large an uncompressed chunk gets.
+        companions: makes the messages for viewers that are written beside each stream.
 
     Raises BadInput where the file cannot be written.
     """
@@ -46,12 +64,15 @@ class LogWriter:
         *,
         compression: str = "zstd",
         chunk_bytes: int = 1 << 20,
+        companions: Companions | None = None,
     ) -> None:
         self.path = Path(path)
         self._container = ContainerWriter(self.path, compression)
         self._run = None if run is None else run.to_record()
         self._chunk_bytes = chunk_bytes
         self._topics: dict[str, _Topic] = {}
+        self._companions = companions
+        self._channels: dict[str, _Channel] = {}
 
     def __enter__(self) -> Self:
         self._container.__enter__()
@@ -93,6 +114,26 @@ class LogWriter:
                 topic.messages += len(stream)
         if parts:
             self._container.add_chunks(list(chunks_of(parts, self._chunk_bytes)))
+        if self._companions is not None:
+            self.write_companions(each for stream in block for each in self._companions(stream))
+
+    def write_companions(self, companions: Iterable[Companion]) -> int:
+        """Write messages that are no streams, in log-time order; says how many they were."""
+        numbered = []
+        for companion in companions:
+            channel = self._channels.get(companion.topic)
+            if channel is None:
+                description = descriptor_set(companion.message)
+                schema_id = self._container.add_schema(
+                    companion.message.DESCRIPTOR.full_name, description
+                )
+                stated = {COMPANION_OF: companion.of}
+                channel = _Channel(self._container.add_channel(companion.topic, schema_id, stated))
+                self._channels[companion.topic] = channel
+            numbered.append(Numbered(channel.channel_id, channel.messages, companion))
+            channel.messages += 1
+        self._container.add_chunks(list(chunks_of_companions(numbered, self._chunk_bytes)))
+        return len(numbered)
 
     def _declare(self, stream: Stream) -> None:
         """Register the stream's topic, or compare it with what it was."""
@@ -130,6 +171,7 @@ def write_log(
     run: RunMetadata | None = None,
     *,
     compression: str = "zstd",
+    companions: Companions | None = None,
 ) -> None:
     """Write one log from streams that are all at hand; see `LogWriter`.
 
@@ -139,7 +181,7 @@ def write_log(
     >>> read_streams(open_log("run.mcap"), ["/range"])["/range"]["range_m"].tolist()
     [5.0, 3.0]
     """
-    with LogWriter(path, run, compression=compression) as log:
+    with LogWriter(path, run, compression=compression, companions=companions) as log:
         log.write(streams)
 
 

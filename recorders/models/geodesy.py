@@ -14,7 +14,7 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 def earth_centred(
     latitude_deg: Component, longitude_deg: Component, altitude_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """The point at a height above the ellipsoid in the frame that turns with the earth, in m."""
+    """A point at a height above the ellipsoid in the frame that turns with the earth, in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (
@@ -72,9 +72,9 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """East, north and up (m) of a point, seen from the origin.
+    """East, north and up (m) of a place as it is seen from the origin.
 
-    Both are latitude and longitude in deg and, unless they lie on the ellipsoid, their heights in m.
+    Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
     """
     latitude, longitude = np.radians(origin_deg[0]), np.radians(origin_deg[1])
     x, y, z = (

@@ -7,15 +7,20 @@ file, and then the content.
 import logging
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
 
 _OTHERS_MAY_WRITE = 0o022
+# Nothing that is kept takes longer to make, on a slow and busy machine.
+_TURN_S = 120.0
 
 
 def cache_folder() -> Path:
@@ -91,6 +96,33 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
         raise BadInput(f"{path}: cannot be written ({error.strerror})") from error
     with whole_file(path, parents=False) as new:
         new.write_bytes(_digest(content) + f" {made_by}\n".encode() + content)
+
+
+@contextmanager
+def in_turn(path: Path) -> Iterator[bool]:
+    """Wait until no other process makes this file; whether there was one, so that it may be there now.
+
+    The lock goes with the process that holds it, however that ends. One that keeps it for very long, and
+    a disk that cannot lock, keep nobody from the work: it is done twice then, which harms nothing.
+    """
+    lock = FileLock(path.with_suffix(".lock"), timeout=0)
+    waited = False
+    try:
+        _make_private(path.parent)
+        try:
+            lock.acquire()
+        except Timeout:
+            waited = True
+            lock.acquire(timeout=_TURN_S)
+    except (OSError, NotImplementedError):  # Timeout too
+        pass
+    try:
+        yield waited
+    finally:
+        if lock.is_locked:
+            with suppress(OSError):  # the file is there: nobody needs the lock any more
+                Path(lock.lock_file).unlink()
+            lock.release()
 
 
 def _make_private(folder: Path) -> None:

@@ -8,6 +8,7 @@ which also run uncompiled.
 """
 
 import ast
+import gc
 import inspect
 import logging
 import os
@@ -17,6 +18,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager
 from functools import cache, lru_cache, partial, wraps
 from hashlib import sha256
 from importlib.metadata import version
@@ -32,6 +34,7 @@ from numba._dynfunc import make_function
 from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.errors import NumbaError
 from numba.core.registry import cpu_target
@@ -39,13 +42,14 @@ from numba.core.serialize import dumps
 from numba.core.typed_passes import NativeLowering
 
 from recorders.errors import BadInput
-from replay.engine.cache import cache_folder, is_private, read_checked, say_once, write_checked
+from replay.engine.cache import cache_folder, in_turn, is_private, read_checked, say_once, write_checked
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 # What a version names, which is part of every key; of any other module the sources are needed.
 _VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}
+_LOG = logging.getLogger("fuselog")
 # What compiles in less time is not told of.
 _PATIENCE_S = 1.0
 
@@ -235,7 +239,6 @@ def _over_runs(
         for helper in begun:
             helper.result()
     except NumbaError as error:
-        loop._cache.ended()  # type: ignore[attr-defined]
         said = str(error)
         reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
         reason = re.sub(r",? ?(defined )?at kernel_\w+ \(\d+\)", "", reason)
@@ -426,7 +429,8 @@ def _load(text: str, title: str) -> Callable[..., Any]:
     module = ModuleType(name)
     sys.modules[name] = module  # compiled code that was kept looks for it there
     exec(compile(text, name, "exec"), module.__dict__)
-    module.kernel._cache = _CompiledCode(name, title)
+    module.kernel._cache = code = _CompiledCode(name, title)
+    module.kernel.compile = partial(code.compile, module.kernel.compile)
     return module.kernel
 
 
@@ -442,40 +446,33 @@ class _CompiledCode:
     def __init__(self, name: str, title: str) -> None:
         self._name = name
         self._title = title
-        self._patience: Timer | None = None
+        # what holds while it is compiled
+        self._meanwhile = ExitStack()
+
+    def compile(self, by_numba: Callable[[Any], Any], signature: Any) -> Any:
+        """Load or compile the kernel for these types of arguments; numba asks the methods below."""
+        with global_compiler_lock, self._meanwhile:
+            return by_numba(signature)
 
     def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
-        """The code, or None: it is compiled then, which is said where it takes long."""
-        found = self._loaded(signature, target)
-        log = logging.getLogger("fuselog")
-        if found is None and log.isEnabledFor(logging.INFO):
-            self._patience = Timer(_PATIENCE_S, log.info, (f"compiling {self._title}, once",))
-            self._patience.daemon = True
-            self._patience.start()
-        return found
+        """The code, or None: it is compiled then, which is said where it takes long.
 
-    def ended(self) -> None:
-        """It is compiled now, or cannot be."""
-        if self._patience:
-            self._patience.cancel()
-
-    def _loaded(self, signature: Any, target: Any) -> CompileResult | None:
+        Of several processes that want it one compiles, and the others load what that one has kept.
+        """
         target.refresh()  # numba's own cache says: "to ensure it is initialized"
         path = self._path(signature, target)
         if path is None or not is_private(path.parent):
+            self._meanwhile.enter_context(_compiling(self._title))
             return None
-        content = read_checked(path)
-        if content is None:
-            return None
-        try:
-            name, parts = pickle.loads(content)
-            return CompileResult._rebuild(target, *parts) if name == path.name else None
-        except Exception:  # whatever a file of other versions, or of a class that has moved, leads to
-            return None
+        found = _loaded(path, target)
+        if found is None:
+            self._meanwhile.enter_context(_compiling(self._title))
+            if self._meanwhile.enter_context(in_turn(path)):
+                found = _loaded(path, target)
+        return found
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the code."""
-        self.ended()
         path = self._path(signature, result.target_context)
         # an address in the code is worth nothing in another process
         if path is None or result.library.has_dynamic_globals or not is_private(path.parent):
@@ -494,6 +491,36 @@ class _CompiledCode:
         except RuntimeError:  # a user without a home
             return None
         return folder / "kernels" / f"{self._name}-{sha256(key.encode()).hexdigest()[:24]}.bin"
+
+
+def _loaded(path: Path, target: Any) -> CompileResult | None:
+    content = read_checked(path)
+    if content is None:
+        return None
+    try:
+        name, parts = pickle.loads(content)
+        return CompileResult._rebuild(target, *parts) if name == path.name else None
+    except Exception:  # whatever a file of other versions, or of a class that has moved, leads to
+        return None
+
+
+@contextmanager
+def _compiling(title: str) -> Iterator[None]:
+    """Say that a kernel is compiled, where that takes long, and collect no garbage meanwhile.
+
+    A compiler makes very many objects and little garbage; looking for that takes a seventh of its time.
+    """
+    patience = Timer(_PATIENCE_S, _LOG.info, (f"compiling {title}, once",))
+    patience.daemon = True
+    collecting = gc.isenabled()
+    gc.disable()
+    patience.start()
+    try:
+        yield
+    finally:
+        patience.cancel()
+        if collecting:
+            gc.enable()
 
 
 def _described(kind: Any) -> str:

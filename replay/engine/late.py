@@ -8,7 +8,8 @@ arrive and does one of three things about it:
     wait:SECONDS    a message is held back until so long after its stamp; then as drop
     rewind:SECONDS  the estimator goes back, if not further than that; what is older still is left out
 
-What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`.
+What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
+was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself.
 """
 
 from collections.abc import Mapping
@@ -19,13 +20,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput, choices
-from recorders.log import schemas
+from recorders.log import make_stream, schemas
 from replay.engine.arrays import Booleans, Integers
 from replay.engine.blocks import Block, Events, Ragged, join, last_of_equals
 from replay.engine.estimator import Bound, Recursive
 from replay.engine.failures import reason_stream
 
 POLICIES = ("drop", "wait", "rewind")
+OLDER = "older than what was used before"  # of every message that is left out for being late
 LONGEST_S = 1e9
 
 
@@ -100,16 +102,18 @@ class _State(NamedTuple):
     Attributes:
         inner: the estimator's own.
         waiting: messages that are held back.
-        newest_ns: (runs,) of the stamps that were taken, None before the first block.
+        newest_ns, arrived_ns: (runs,) the newest stamps that were taken, and that have arrived; None
+            before the first block.
     """
 
     inner: Any
     waiting: Mapping[str, Ragged]
-    newest_ns: Integers | None
+    newest_ns: Integers | None = None
+    arrived_ns: Integers | None = None
 
 
 def _start(bound: Recursive, whole: dict[str, Ragged]) -> _State:
-    return _State(bound.start(whole), {}, None)
+    return _State(bound.start(whole), {})
 
 
 def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_State, list[Ragged]]:
@@ -135,12 +139,16 @@ def _take(
     ready = np.ones(len(arrivals.run), bool)
     if late.policy == "wait" and not is_over:
         ready = arrivals.moment_ns < _reached(streams)[arrivals.run]
-    before_ns = np.zeros(arrivals.runs, np.int64) if state.newest_ns is None else state.newest_ns
-    newest_ns, is_late = _find_late(arrivals, ready, before_ns, late)
-    skipped = _skipped(bound.name, arrivals, is_late, late)
+    newest_ns, behind_ns = _find_behind(arrivals, ready, state.newest_ns)
+    is_late = behind_ns > late.back_ns
+    told = [_skipped(bound.name, arrivals, is_late, late)]
+    arrived_ns = state.arrived_ns
+    if late.policy == "wait":
+        arrived_ns, waited = _waited(bound.name, streams, arrived_ns, late)
+        told.append(waited)
     inner, made = bound.run(state.inner, _block(arrivals, ready & ~is_late))
     waiting = {} if ready.all() else _block(arrivals, ~ready).streams
-    return _State(inner, waiting, newest_ns), [skipped, *made]
+    return _State(inner, waiting, newest_ns, arrived_ns), [*told, *made]
 
 
 class _Arrivals(NamedTuple):
@@ -200,19 +208,22 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
     return np.max(reached, axis=0)
 
 
-def _find_late(
-    arrivals: _Arrivals, ready: Booleans, newest_ns: Integers, late: Late
-) -> tuple[Integers, Booleans]:
-    """The newest stamps (runs,) that were then taken, and which messages (n,) come too late for that."""
-    newest_ns, is_late = newest_ns.copy(), np.zeros(len(ready), bool)
-    rows = np.flatnonzero(ready)
+def _find_behind(
+    arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
+) -> tuple[Integers, Integers]:
+    """The newest stamps (runs,) after those that are taken, and by how much (n,) each was behind them.
+
+    Zero for a message that is not behind what was taken before it, and for one that is not ready.
+    """
+    newest_ns = np.zeros(arrivals.runs, np.int64) if before_ns is None else before_ns.copy()
+    behind_ns, rows = np.zeros(len(ready), np.int64), np.flatnonzero(ready)
     ends = np.searchsorted(arrivals.run[rows], np.arange(len(newest_ns) + 1))
     for run in np.flatnonzero(np.diff(ends)):
         own = rows[ends[run] : ends[run + 1]]
         newest = np.maximum.accumulate(np.append(newest_ns[run], arrivals.stamp_ns[own]))
-        is_late[own] = arrivals.stamp_ns[own] < newest[:-1] - late.back_ns
+        behind_ns[own] = np.maximum(newest[:-1] - arrivals.stamp_ns[own], 0)
         newest_ns[run] = newest[-1]
-    return newest_ns, is_late
+    return newest_ns, behind_ns
 
 
 def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
@@ -238,7 +249,7 @@ def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
 def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> Ragged:
     """The messages that were left out."""
     by = f"more than {late.back_ns * 1e-9:g} s " if late.back_ns else ""
-    reasons = [f"topic {topic}: it is {by}older than what was used before" for topic in arrivals.streams]
+    reasons = [f"topic {topic}: it is {by}{OLDER}" for topic in arrivals.streams]
     stream = reason_stream(
         f"/estimates/{name}/skipped",
         schemas.SKIPPED,
@@ -248,3 +259,22 @@ def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> R
     )
     offsets = np.searchsorted(arrivals.run[is_late], np.arange(arrivals.runs + 1))
     return Ragged(replace(stream, log_time_ns=arrivals.moment_ns[is_late]), offsets)
+
+
+def _waited(
+    name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
+) -> tuple[Integers, Ragged]:
+    """The newest stamps (runs,) that have arrived, and the late messages that newer ones wait for."""
+    arrivals = _arrivals(Late("drop", 0), streams, {})
+    everything = np.ones(len(arrivals.run), bool)
+    arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)
+    in_time = (behind_ns > 0) & (arrivals.moment_ns <= arrivals.stamp_ns + late.window_ns)
+    stream = make_stream(
+        f"/estimates/{name}/waited",
+        schemas.WAITED,
+        arrivals.stamp_ns[in_time],
+        log_time_ns=arrivals.moment_ns[in_time],
+        behind_s=behind_ns[in_time] * 1e-9,
+    )
+    offsets = np.searchsorted(arrivals.run[in_time], np.arange(arrivals.runs + 1))
+    return arrived_ns, Ragged(stream, offsets)

@@ -9,7 +9,7 @@ could.
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import cache, partial
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -90,6 +90,17 @@ class Settings(NamedTuple):
     variance: Floats
     anchor: Booleans
     gate: Floats
+
+
+class Fusion(NamedTuple):
+    """How a sighting of another robot is used: in one state of all, by an intersection, or naively.
+
+    The weight of an intersection is that of the least trace or else of the least determinant.
+    """
+
+    joint: bool
+    intersect: bool
+    by_trace: bool
 
 
 class Events(NamedTuple):
@@ -232,84 +243,84 @@ def scale(covariance: Floats, first: int, factor: float) -> None:
             covariance[first + row, first + column] *= factor
 
 
-def cooperation(joint: bool, intersect: bool, by_trace: bool) -> Function:
-    """The loop over the events of one run."""
+def meet(
+    mean: Floats,
+    covariance: Floats,
+    robots: Integers,
+    difference: Floats,
+    variance: Floats,
+    gate: float,
+    fusion: Fusion,
+    work: Work,
+) -> bool:
+    """Use a sighting; False where a covariance is not positive definite."""
+    own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
+    first, both = 3 * robots, robots[1] >= 0
+    for row in range(2):
+        own[row, row] = variance[row]
+    for side in range(1 + both):
+        traces[side] = see_through(covariance, first[side], side, work)
+    for side in range(1 + (both and not fusion.joint)):
+        weight, share = 1.0, 0.0
+        if both and not fusion.joint:
+            share = 1.0
+            if fusion.intersect:
+                stake = Stake(3, traces[side], work.spread[side], work.square[side])
+                weight = sighting_weight(fusion.by_trace, stake, work.spread[1 - side], own)
+                share = 1.0 / (1.0 - weight)
+        blend(1.0, own, share, work.spread[1 - side], noise)
+        scale(covariance, first[side], 1.0 / weight)
+        work.whole[:] = 0.0
+        for other in range(side, side + 1 + (both and fusion.joint)):
+            for row in range(2):
+                for k in range(3):
+                    work.whole[row, first[other] + k] = work.both[other, row, k]
+        squared = update(mean, covariance, difference, work.whole, noise, work.update, gate)
+        if np.isnan(squared):
+            return False
+        if not squared <= gate:
+            scale(covariance, first[side], weight)
+    return True
 
-    def meet(
-        mean: Floats,
-        covariance: Floats,
-        robots: Integers,
-        difference: Floats,
-        variance: Floats,
-        gate: float,
-        work: Work,
-    ) -> bool:
-        """Use a sighting; False where a covariance is not positive definite."""
-        own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
-        first, both = 3 * robots, robots[1] >= 0
-        for row in range(2):
-            own[row, row] = variance[row]
-        for side in range(1 + both):
-            traces[side] = see_through(covariance, first[side], side, work)
-        for side in range(1 + (both and not joint)):
-            weight, share = 1.0, 0.0
-            if both and not joint:
-                share = 1.0
-                if intersect:
-                    stake = Stake(3, traces[side], work.spread[side], work.square[side])
-                    weight = sighting_weight(by_trace, stake, work.spread[1 - side], own)
-                    share = 1.0 / (1.0 - weight)
-            blend(1.0, own, share, work.spread[1 - side], noise)
-            scale(covariance, first[side], 1.0 / weight)
-            work.whole[:] = 0.0
-            for other in range(side, side + 1 + (both and joint)):
-                for row in range(2):
-                    for k in range(3):
-                        work.whole[row, first[other] + k] = work.both[other, row, k]
-            squared = update(mean, covariance, difference, work.whole, noise, work.update, gate)
-            if np.isnan(squared):
-                return False
-            if not squared <= gate:
-                scale(covariance, first[side], weight)
-        return True
 
-    def cooperate(
-        run: int, events: Events, settings: Settings, carried: Carried, results: Results
-    ) -> None:
-        mean, covariance = carried.mean[run], carried.covariance[run]
-        work, difference = memory(len(mean)), np.empty(2)
-        for event in range(events.offsets[run], events.offsets[run + 1]):
-            robots, now = events.robots[event], events.time_ns[event]
-            robot, seen = robots[0], robots[1]
-            if carried.failure[run] != ALL_WELL or now < carried.time_ns[run, robot]:
+def cooperate(
+    run: int, events: Events, settings: Settings, fusion: Fusion, carried: Carried, results: Results
+) -> None:
+    """Move the robots of one run through its events, until these end or an update fails."""
+    mean, covariance = carried.mean[run], carried.covariance[run]
+    work, difference = memory(len(mean)), np.empty(2)
+    for event in range(events.offsets[run], events.offsets[run + 1]):
+        robots, now = events.robots[event], events.time_ns[event]
+        robot, seen = robots[0], robots[1]
+        if carried.failure[run] != ALL_WELL or now < carried.time_ns[run, robot]:
+            continue
+        for side in range(2):
+            if robots[side] >= 0:
+                density = settings.density[robots[side]]
+                advance(carried, run, robots[side], now, density, work)
+        if events.is_sighting[event]:
+            place = (events.place[event, 0], events.place[event, 1])
+            if seen >= 0:
+                place = (mean[3 * seen], mean[3 * seen + 1])
+            look(mean, robot, place, events.value[event], difference, work)
+            measured, variance = 0, settings.variance[robot]
+            for k in range(2):
+                measured += not np.isnan(difference[k])
+            gate = settings.gate[measured]
+            if measured > 0 and not meet(
+                mean, covariance, robots, difference, variance, gate, fusion, work
+            ):
+                carried.failure[run] = NOT_POSITIVE_DEFINITE
                 continue
-            for side in range(2):
-                if robots[side] >= 0:
-                    density = settings.density[robots[side]]
-                    advance(carried, run, robots[side], now, density, work)
-            if events.is_sighting[event]:
-                place = (events.place[event, 0], events.place[event, 1])
-                if seen >= 0:
-                    place = (mean[3 * seen], mean[3 * seen + 1])
-                look(mean, robot, place, events.value[event], difference, work)
-                measured, variance = 0, settings.variance[robot]
-                for k in range(2):
-                    measured += not np.isnan(difference[k])
-                gate = settings.gate[measured]
-                if measured > 0 and not meet(mean, covariance, robots, difference, variance, gate, work):
-                    carried.failure[run] = NOT_POSITIVE_DEFINITE
-                    continue
-            else:
-                for k in range(2):
-                    carried.velocity[run, robot, k] = events.value[event, k]
-            if not np.isfinite(mean.sum()):
-                carried.failure[run] = NOT_FINITE
-            elif events.is_due[event]:
-                own = slice(3 * robot, 3 * robot + 3)
-                found = results.mean[event], results.covariance[event]
-                copy_gaussian(mean[own], covariance[own, own], found[0], found[1])
-
-    return cooperate
+        else:
+            for k in range(2):
+                carried.velocity[run, robot, k] = events.value[event, k]
+        if not np.isfinite(mean.sum()):
+            carried.failure[run] = NOT_FINITE
+        elif events.is_due[event]:
+            own = slice(3 * robot, 3 * robot + 3)
+            found = results.mean[event], results.covariance[event]
+            copy_gaussian(mean[own], covariance[own, own], found[0], found[1])
 
 
 def memory(states: int) -> Work:
@@ -330,9 +341,9 @@ def memory(states: int) -> Work:
     )
 
 
-@lru_cache(maxsize=8)
-def _compiled(mode: Mode, criterion: Criterion) -> Function:
-    return compile_over_runs(cooperation(mode == "joint", mode == "ci", criterion == "trace"))
+@cache
+def _compiled() -> Function:
+    return compile_over_runs(cooperate)
 
 
 def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
@@ -381,7 +392,8 @@ def run(
     events = _events(block, state, prefixes, mode, settings)
     count, topic = len(events.time_ns), f"/estimates/{name}"
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
-    _compiled(mode, criterion)(len(carried.mean), events, settings, carried, results)
+    fusion = Fusion(mode == "joint", mode == "ci", criterion == "trace")
+    _compiled()(len(carried.mean), events, settings, fusion, carried, results)
     said = np.isfinite(results.mean[:, 0])
     made = [
         states_in(

@@ -7,8 +7,7 @@ fuses K estimates of one state: scalar loops, so that networks compile it, calle
 weights, mean, covariance) -> gap`, the last three filled, infinity where a covariance is singular.
 """
 
-from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +22,9 @@ Criterion = Literal["trace", "determinant"]
 # what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
 SINGULAR = 1e-13
 ITERATIONS = 10_000
+# by their numbers, which are known only when a kernel runs: one kernel has them all
+RULES = ("ci-trace", "ci-determinant", "niehsen", "franken", "naive", "inverse-ci", "split-ci")
+CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(len(RULES))
 GOLDEN = 0.6180339887498949
 SIGHTING_STEPS = 40
 
@@ -155,41 +157,48 @@ def determinant_slope(covariance: Floats, slope: Floats) -> None:
             slope[row, column] = covariance[row, column] / size
 
 
-def optimised(fill_slope: Function, power: float, tolerance: float, iterations: int) -> Function:
-    """Weights by w_i <- w_i g_i^power, normalised, until none can gain more than the tolerance.
+def weigh_optimally(
+    by_trace: bool,
+    count: int,
+    covariances: Floats,
+    information: Floats,
+    weights: Floats,
+    tolerance: float,
+) -> float:
+    """Weights by w_i <- w_i g_i^p, normalised, until none can gain more than the tolerance.
 
-    At the least criterion no gain g_i = tr(I_i slope) exceeds 1, and those of weights above 0 are 1.
+    For the trace p is 1/2, for the determinant 1. At the least criterion no gain g_i = tr(I_i slope)
+    exceeds 1, and those of weights above 0 are 1.
     """
-
-    def weigh(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
-        gap = np.inf
-        size = covariances.shape[1]
-        covariance, slope, better = np.empty((size, size)), np.empty((size, size)), np.empty(count)
+    gap = np.inf
+    size = covariances.shape[1]
+    covariance, slope, better = np.empty((size, size)), np.empty((size, size)), np.empty(count)
+    for i in range(count):
+        weights[i] = 1.0 / count
+    for _ in range(ITERATIONS):
+        if not summed(count, weights, information, covariance):
+            return np.inf
+        if by_trace:
+            trace_slope(covariance, slope)
+        else:
+            determinant_slope(covariance, slope)
+        total, gap = 0.0, -np.inf
         for i in range(count):
-            weights[i] = 1.0 / count
-        for _ in range(iterations):
-            if not summed(count, weights, information, covariance):
-                return np.inf
-            fill_slope(covariance, slope)
-            total, gap = 0.0, -np.inf
-            for i in range(count):
-                gain = 0.0
-                for row in range(size):
-                    for k in range(size):
-                        gain += information[i, row, k] * slope[row, k]
-                gap = max(gap, gain - 1.0)
-                better[i] = weights[i] * gain**power
-                total += better[i]
-            if gap <= tolerance:
-                break
-            for i in range(count):
-                weights[i] = better[i] / total
-        return gap
-
-    return weigh
+            gain = 0.0
+            for row in range(size):
+                for k in range(size):
+                    gain += information[i, row, k] * slope[row, k]
+            gap = max(gap, gain - 1.0)
+            better[i] = weights[i] * (np.sqrt(gain) if by_trace else gain)
+            total += better[i]
+        if gap <= tolerance:
+            break
+        for i in range(count):
+            weights[i] = better[i] / total
+    return gap
 
 
-def weigh_by_traces(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
+def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
     """Niehsen: weights in proportion to 1 / tr P_i."""
     total = 0.0
     for i in range(count):
@@ -200,7 +209,6 @@ def weigh_by_traces(count: int, covariances: Floats, information: Floats, weight
         total += weights[i]
     for i in range(count):
         weights[i] /= total
-    return 0.0
 
 
 def determinant(matrix: Floats) -> float:
@@ -215,9 +223,9 @@ def determinant(matrix: Floats) -> float:
     return product
 
 
-def weigh_by_shares(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
+def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
     """Franken and Huepper: weights by what is lost from |sum of I| without I_i, plus |I_i|."""
-    size = covariances.shape[1]
+    size = information.shape[1]
     whole = np.zeros((size, size))
     rest = np.empty((size, size))
     for i in range(count):
@@ -230,30 +238,53 @@ def weigh_by_shares(count: int, covariances: Floats, information: Floats, weight
         total += weights[i]
     for i in range(count):
         weights[i] /= total
-    return 0.0
 
 
-def weigh_fully(count: int, covariances: Floats, information: Floats, weights: Floats) -> float:
+def weigh_fully(count: int, weights: Floats) -> None:
     """Naive Kalman fusion, as if all errors were independent: every weight is 1."""
     for i in range(count):
         weights[i] = 1.0
+
+
+def weigh(
+    rule: int,
+    count: int,
+    covariances: Floats,
+    information: Floats,
+    weights: Floats,
+    tolerance: float,
+) -> float:
+    """Fill the weights of a rule that adds up weighted informations; returns their certificate."""
+    if rule in (CI_TRACE, CI_DETERMINANT):
+        by_trace = rule == CI_TRACE
+        return weigh_optimally(by_trace, count, covariances, information, weights, tolerance)
+    if rule == NIEHSEN:
+        weigh_by_traces(count, covariances, weights)
+    elif rule == FRANKEN:
+        weigh_by_shares(count, information, weights)
+    else:
+        weigh_fully(count, weights)
     return 0.0
 
 
-def weighted(weigh: Function) -> Function:
-    """The rule that adds up weighted informations."""
-
-    def fuse(count: int, parts: Estimate, weights: Floats, mean: Floats, covariance: Floats) -> float:
-        information = np.empty_like(parts.covariance)
-        for i in range(count):
-            if not inverted(parts.covariance[i], information[i]):
-                return np.inf
-        gap = weigh(count, parts.covariance, information, weights)
-        if not gap < np.inf or not combined(count, weights, information, parts.mean, mean, covariance):
+def fuse_together(
+    rule: int,
+    count: int,
+    parts: Estimate,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+    tolerance: float,
+) -> float:
+    """Add up weighted informations."""
+    information = np.empty_like(parts.covariance)
+    for i in range(count):
+        if not inverted(parts.covariance[i], information[i]):
             return np.inf
-        return gap
-
-    return fuse
+    gap = weigh(rule, count, parts.covariance, information, weights, tolerance)
+    if not gap < np.inf or not combined(count, weights, information, parts.mean, mean, covariance):
+        return np.inf
+    return gap
 
 
 def put(given: Estimate, place: Estimate) -> None:
@@ -356,74 +387,89 @@ def golden(step: int, steps: int, value: float, section: Floats) -> float:
     return section[int(section[6])]
 
 
-def pairwise(mix: Function, steps: int) -> Function:
-    """The rule that fuses one estimate after another, each at the weight of the least trace."""
+def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> float:
+    """Fuse two estimates at a weight; returns the trace, infinite where they cannot be fused."""
+    is_fused = mix_split(weight, pair, fused) if is_split else mix_inverse(weight, pair, fused)
+    if not is_fused:
+        return np.inf
+    trace = 0.0
+    for row in range(len(fused.mean)):
+        trace += fused.covariance[row, row]
+    return trace
 
-    def trace_at(weight: float, pair: Estimate, fused: Estimate) -> float:
-        if not mix(weight, pair, fused):
+
+def fuse_in_turn(
+    is_split: bool,
+    count: int,
+    parts: Estimate,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+    tolerance: float,
+) -> float:
+    """Fuse one estimate after another, each at the weight of the least trace."""
+    size, steps = len(mean), steps_for(tolerance)
+    pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
+    fused = Estimate(mean, covariance, np.empty((size, size)))
+    weights[0] = 1.0
+    put(one_of(parts, 0), fused)
+    for i in range(1, count):
+        put(fused, one_of(pair, 0))
+        put(one_of(parts, i), one_of(pair, 1))
+        section = np.empty(7)
+        trace = np.inf
+        for step in range(steps):
+            weights[i] = golden(step, steps, trace, section)
+            trace = trace_at(is_split, weights[i], pair, fused)
+        if trace == np.inf:
             return np.inf
-        trace = 0.0
-        for row in range(len(fused.mean)):
-            trace += fused.covariance[row, row]
-        return trace
-
-    def fuse(count: int, parts: Estimate, weights: Floats, mean: Floats, covariance: Floats) -> float:
-        size = len(mean)
-        pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
-        fused = Estimate(mean, covariance, np.empty((size, size)))
-        weights[0] = 1.0
-        put(one_of(parts, 0), fused)
-        for i in range(1, count):
-            put(fused, one_of(pair, 0))
-            put(one_of(parts, i), one_of(pair, 1))
-            section = np.empty(7)
-            trace = np.inf
-            for step in range(steps):
-                weights[i] = golden(step, steps, trace, section)
-                trace = trace_at(weights[i], pair, fused)
-            if trace == np.inf:
-                return np.inf
-        return 0.0
-
-    return fuse
+    return 0.0
 
 
-RULES: dict[str, Callable[[float], Function]] = {
-    "ci-trace": lambda tolerance: weighted(optimised(trace_slope, 0.5, tolerance, ITERATIONS)),
-    "ci-determinant": lambda tolerance: weighted(
-        optimised(determinant_slope, 1.0, tolerance, ITERATIONS)
-    ),
-    "niehsen": lambda _: weighted(weigh_by_traces),
-    "franken": lambda _: weighted(weigh_by_shares),
-    "naive": lambda _: weighted(weigh_fully),
-    "inverse-ci": lambda tolerance: pairwise(mix_inverse, steps_for(tolerance)),
-    "split-ci": lambda tolerance: pairwise(mix_split, steps_for(tolerance)),
-}
+def rule_number(name: str) -> int:
+    """The number of a rule of RULES; raises BadInput for another name."""
+    if name not in RULES:
+        raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
+    return RULES.index(name)
 
 
-def rule(name: str, tolerance: float) -> Function:
-    """The rule of a name of RULES.
+def fuse_by(
+    rule: int,
+    count: int,
+    parts: Estimate,
+    weights: Floats,
+    mean: Floats,
+    covariance: Floats,
+    tolerance: float,
+) -> float:
+    """Fuse the first `count` estimates by the rule of a number; returns the certificate.
 
     `tolerance` bounds the gap where weights are optimised together, and the square of ten times a
     single weight's error.
-    Raises BadInput for another name.
     """
-    if name not in RULES:
-        raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
-    return RULES[name](tolerance)
+    if rule in (INVERSE_CI, SPLIT_CI):
+        is_split = rule == SPLIT_CI
+        return fuse_in_turn(is_split, count, parts, weights, mean, covariance, tolerance)
+    return fuse_together(rule, count, parts, weights, mean, covariance, tolerance)
 
 
-@lru_cache(maxsize=16)
-def _over_runs(name: str, tolerance: float) -> Function:
-    fuse_one = rule(name, tolerance)
+def fuse_run(
+    run: int,
+    rule: int,
+    tolerance: float,
+    means: Floats,
+    covariances: Floats,
+    independents: Floats,
+    fused: Fused,
+) -> None:
+    """Fuse the estimates of one run."""
+    parts = Estimate(means[run], covariances[run], independents[run])
+    mean, covariance, weights = fused.mean[run], fused.covariance[run], fused.weights[run]
+    fused.gap[run] = fuse_by(rule, means.shape[1], parts, weights, mean, covariance, tolerance)
 
-    def fuse_run(
-        run: int, means: Floats, covariances: Floats, independents: Floats, fused: Fused
-    ) -> None:
-        parts = Estimate(means[run], covariances[run], independents[run])
-        count, weights = means.shape[1], fused.weights[run]
-        fused.gap[run] = fuse_one(count, parts, weights, fused.mean[run], fused.covariance[run])
 
+@cache
+def _fuse_runs() -> Function:
     return compile_over_runs(fuse_run)
 
 
@@ -470,8 +516,10 @@ def fuse(
     fused = Fused(
         np.empty((runs, size)), np.empty((runs, size, size)), np.empty((runs, count)), np.empty(runs)
     )
-    _over_runs(name, tolerance)(
+    _fuse_runs()(
         runs,
+        rule_number(name),
+        tolerance,
         mean.reshape(runs, count, size),
         covariance.reshape(runs, count, size, size),
         known.reshape(runs, count, size, size),

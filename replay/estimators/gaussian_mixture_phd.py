@@ -29,6 +29,7 @@ from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.measurements import PLANE, read_vectors
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, state_stream
+from replay.estimators.scans import by_scan
 from replay.inference.gaussian import (
     Innovation,
     cholesky,
@@ -469,31 +470,11 @@ def run(
 def scans_of(scan: Ragged, detection: Ragged) -> Scans:
     """Put detections to their scans.
 
-    Raises BadInput where a scan has another number of detections than it says, or positions are not in
-    the plane.
+    Raises BadInput as `by_scan` does, and where positions are not in the plane.
     """
-    topic = detection.stream.topic
-    place = detection["position_m"]
-    if len(detection) and place.shape[1] < 2:
-        raise BadInput(f"topic {topic}: positions in the plane need two coordinates")
-    keys, known = (
-        (np.repeat(np.arange(each.runs), np.diff(each.offsets)) << 32) + each["scan_id"].astype(np.int64)
-        for each in (detection, scan)
-    )
-    order = np.argsort(keys, kind="stable")
-    first = np.searchsorted(keys[order], known)
-    end = np.searchsorted(keys[order], known, side="right")
-    stated = scan["detections"].astype(np.int64)
-    wrong = np.flatnonzero(end - first != stated)
-    if len(wrong) or len(keys) != stated.sum():
-        row = wrong[0] if len(wrong) else 0
-        said = (
-            f"scan {scan['scan_id'][row]} says {stated[row]} detections, there are {(end - first)[row]}"
-        )
-        raise BadInput(
-            f"topic {topic}: {said if len(wrong) else 'detections of scans that are not there'}; "
-            "record every scan with its count"
-        )
+    if len(detection) and detection["position_m"].shape[1] < 2:
+        raise BadInput(f"topic {detection.stream.topic}: positions in the plane need two coordinates")
+    order, (first, end) = by_scan(scan, detection)
     ordered = read_vectors(detection.stream, "position_m", PLANE)[order]
     return Scans(scan.offsets, scan.stream.publish_time_ns, first, end, ordered)
 

@@ -7,7 +7,7 @@ replay's output, so that one run is replayed with any rule. The state is (positi
 """
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from replay.engine.components import components_of
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, states_in
-from replay.estimators.covariance_intersection import Estimate, rule
+from replay.estimators.covariance_intersection import Estimate, fuse_by, rule_number
 from replay.inference.gaussian import coast, copy_gaussian
 
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
@@ -83,6 +83,17 @@ class Sensing(NamedTuple):
     density: Floats
 
 
+class Fusion(NamedTuple):
+    """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
+
+    With `own_first` a node fuses its own x*, not its prediction.
+    """
+
+    rule: int
+    tolerance: float
+    own_first: bool
+
+
 class Results(NamedTuple):
     """What the kernel fills, a row per activity: estimates, and x* as it is sent."""
 
@@ -131,96 +142,104 @@ def observe(
                 covariance[column, row] = covariance[row, column]
 
 
-def network(fuse: Function) -> Function:
-    """The loop over the activities of one run; `own_first` fuses the own x*, not the prediction."""
+def follow(
+    run: int,
+    activities: Activities,
+    sensing: Sensing,
+    prior_mean: Floats,
+    prior_covariance: Floats,
+    prior_ns: Integers,
+    fusion: Fusion,
+    results: Results,
+    failed_ns: Integers,
+) -> None:
+    """Move the nodes of one run through their activities, until these end or a fusion fails."""
+    nodes, size = len(sensing.density), prior_mean.shape[1]
+    mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
+    time_ns = np.empty(nodes, np.int64)
+    for node in range(nodes):
+        copy_gaussian(prior_mean[run], prior_covariance[run], mean[node], covariance[node])
+        time_ns[node] = prior_ns[run]
+    begin, last = activities.offsets[run], activities.offsets[run + 1]
+    most = 1
+    for activity in range(begin, last):
+        most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
+    weights, square = np.empty(most), (most, size, size)
+    parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
+    while begin < last:
+        now = activities.time_ns[begin]
+        end = begin
+        while end < last and activities.time_ns[end] == now:
+            node = activities.node[end]
+            if now > time_ns[node]:
+                span_s = (now - time_ns[node]) * 1e-9
+                move(mean[node], covariance[node], sensing.density[node], span_s)
+                time_ns[node] = now
+            sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
+            copy_gaussian(mean[node], covariance[node], sent_mean, sent_covariance)
+            for k in range(activities.measured[end], activities.measured[end + 1]):
+                observe(
+                    sent_mean,
+                    sent_covariance,
+                    results.sent_independent[end],
+                    sensing.value[k],
+                    sensing.variance[sensing.sensor[k]],
+                )
+            end += 1
+        for activity in range(begin, end):
+            node = activities.node[activity]
+            first = activities.received[activity]
+            count = 1 + activities.received[activity + 1] - first
+            if count > 1:
+                for i in range(count):
+                    source = activities.message[first + i - 1] if i > 0 else activity
+                    its_mean, its_covariance = mean[node], covariance[node]
+                    if i > 0 or fusion.own_first:
+                        its_mean = results.sent_mean[source]
+                        its_covariance = results.sent_covariance[source]
+                    copy_gaussian(its_mean, its_covariance, parts.mean[i], parts.covariance[i])
+                    late_s = (now - activities.time_ns[source]) * 1e-9
+                    # what was new in a late one others may have passed on
+                    new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
+                    for row in range(size):
+                        for column in range(size):
+                            own = results.sent_independent[source, row, column]
+                            parts.independent[i, row, column] = new * own
+                    if late_s > 0.0:
+                        move(parts.mean[i], parts.covariance[i], sensing.density[node], late_s)
+                gap = fuse_by(
+                    fusion.rule,
+                    count,
+                    parts,
+                    weights,
+                    mean[node],
+                    covariance[node],
+                    fusion.tolerance,
+                )
+                if not gap < np.inf:
+                    failed_ns[run] = now
+                    return
+            for k in range(activities.measured[activity], activities.measured[activity + 1]):
+                observe(
+                    mean[node],
+                    covariance[node],
+                    parts.independent[0],  # of no use any more
+                    sensing.value[k],
+                    sensing.variance[sensing.sensor[k]],
+                )
+            found_mean, found_covariance = results.mean[activity], results.covariance[activity]
+            copy_gaussian(mean[node], covariance[node], found_mean, found_covariance)
+        begin = end
 
-    def follow(
-        run: int,
-        activities: Activities,
-        sensing: Sensing,
-        prior_mean: Floats,
-        prior_covariance: Floats,
-        prior_ns: Integers,
-        own_first: bool,
-        results: Results,
-        failed_ns: Integers,
-    ) -> None:
-        nodes, size = len(sensing.density), prior_mean.shape[1]
-        mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
-        time_ns = np.empty(nodes, np.int64)
-        for node in range(nodes):
-            copy_gaussian(prior_mean[run], prior_covariance[run], mean[node], covariance[node])
-            time_ns[node] = prior_ns[run]
-        begin, last = activities.offsets[run], activities.offsets[run + 1]
-        most = 1
-        for activity in range(begin, last):
-            most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
-        weights, square = np.empty(most), (most, size, size)
-        parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
-        while begin < last:
-            now = activities.time_ns[begin]
-            end = begin
-            while end < last and activities.time_ns[end] == now:
-                node = activities.node[end]
-                if now > time_ns[node]:
-                    span_s = (now - time_ns[node]) * 1e-9
-                    move(mean[node], covariance[node], sensing.density[node], span_s)
-                    time_ns[node] = now
-                sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
-                copy_gaussian(mean[node], covariance[node], sent_mean, sent_covariance)
-                for k in range(activities.measured[end], activities.measured[end + 1]):
-                    observe(
-                        sent_mean,
-                        sent_covariance,
-                        results.sent_independent[end],
-                        sensing.value[k],
-                        sensing.variance[sensing.sensor[k]],
-                    )
-                end += 1
-            for activity in range(begin, end):
-                node = activities.node[activity]
-                first = activities.received[activity]
-                count = 1 + activities.received[activity + 1] - first
-                if count > 1:
-                    for i in range(count):
-                        source = activities.message[first + i - 1] if i > 0 else activity
-                        its_mean, its_covariance = mean[node], covariance[node]
-                        if i > 0 or own_first:
-                            its_mean = results.sent_mean[source]
-                            its_covariance = results.sent_covariance[source]
-                        copy_gaussian(its_mean, its_covariance, parts.mean[i], parts.covariance[i])
-                        late_s = (now - activities.time_ns[source]) * 1e-9
-                        # what was new in a late one others may have passed on
-                        new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
-                        for row in range(size):
-                            for column in range(size):
-                                own = results.sent_independent[source, row, column]
-                                parts.independent[i, row, column] = new * own
-                        if late_s > 0.0:
-                            move(parts.mean[i], parts.covariance[i], sensing.density[node], late_s)
-                    gap = fuse(count, parts, weights, mean[node], covariance[node])
-                    if not gap < np.inf:
-                        failed_ns[run] = now
-                        return
-                for k in range(activities.measured[activity], activities.measured[activity + 1]):
-                    observe(
-                        mean[node],
-                        covariance[node],
-                        parts.independent[0],  # of no use any more
-                        sensing.value[k],
-                        sensing.variance[sensing.sensor[k]],
-                    )
-                found_mean, found_covariance = results.mean[activity], results.covariance[activity]
-                copy_gaussian(mean[node], covariance[node], found_mean, found_covariance)
-            begin = end
 
-    return follow
+@cache
+def _compiled() -> Function:
+    return compile_over_runs(follow)
 
 
-@lru_cache(maxsize=16)
-def _compiled(name: str, tolerance: float) -> Function:
-    fused_by = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
-    return compile_over_runs(network(rule(fused_by, tolerance)))
+def _fusion(name: str, tolerance: float) -> Fusion:
+    rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
+    return Fusion(rule_number(rule), tolerance, name == TRAP)
 
 
 def message_bytes(name: str, states: int) -> int:
@@ -250,14 +269,14 @@ def solve(
     square = np.full((count, size, size), np.nan)
     results = Results(blank, square, blank.copy(), square.copy(), np.zeros_like(square))
     failed_ns = np.full(runs, -1)
-    _compiled(parameters.rule, parameters.tolerance)(
+    _compiled()(
         runs,
         activities,
         sensing,
         prior_mean,
         prior_covariance,
         prior_ns,
-        parameters.rule == TRAP,
+        _fusion(parameters.rule, parameters.tolerance),
         results,
         failed_ns,
     )

@@ -10,6 +10,7 @@ Tichavsky, Muravchik and Nehorai, IEEE Trans. Signal Processing 46(5), 1998.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Ragged
+from replay.engine.compile import compile_over_runs
 from replay.engine.components import match_components
 from replay.engine.results import named
 from replay.engine.tangent import truth_at
@@ -34,6 +36,7 @@ from replay.inference.gaussian import (
 from replay.inference.generate import tuple_of
 from replay.inference.methods import FILTERS, Method, MethodParameters
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations
+from replay.inference.smoothers import solve_semidefinite
 from replay.inference.steps import (
     NO_TRUTH,
     NOT_POSITIVE_DEFINITE,
@@ -219,16 +222,58 @@ def add_information(information: Floats, rows: Floats, noise: Floats, size: int)
                 information[row, column] += rows[i, row] * rows[i, column]
 
 
-def smoothed_covariances(covariance: Floats, transition: Floats, noise: Floats) -> Floats:
-    """The covariances (nodes, t, t) of a smoother along one trajectory, from those of its filter."""
-    found = covariance.copy()
-    for node in range(len(found) - 2, -1, -1):
-        step, here = transition[node + 1], covariance[node]
-        predicted = step @ here @ step.T + noise[node + 1]
-        gain = np.linalg.lstsq(predicted, step @ here, rcond=None)[0].T
-        found[node] = here + gain @ (found[node + 1] - predicted) @ gain.T
-        found[node] = 0.5 * (found[node] + found[node].T)
-    return found
+class BackMemory(NamedTuple):
+    """What the way back of one core works in: four matrices (t, t)."""
+
+    predicted: Floats
+    turned: Floats
+    factor: Floats
+    product: Floats
+
+
+def back_memory(t: int) -> BackMemory:
+    """Memory for the way back of states with t components in the tangent space."""
+    return BackMemory(*(np.empty((t, t)) for _ in BackMemory._fields))
+
+
+@lru_cache(maxsize=1)
+def _smoothing() -> Function:
+    return compile_over_runs(smooth, allocates=False)
+
+
+def smooth(
+    run: int,
+    offsets: Integers,
+    transition: Floats,
+    noise: Floats,
+    covariance: Floats,
+    memory: BackMemory,
+) -> None:
+    """Make covariances (nodes, t, t) of a filter those of its smoother along one trajectory, in place.
+
+    With the gain G = P F' P-^-1, each is P + G (Ps - P-) G', Ps being that of the node after it.
+    """
+    predicted, turned, factor, product = memory
+    for node in range(offsets[run + 1] - 2, offsets[run] - 1, -1):
+        here, later, step = covariance[node], covariance[node + 1], transition[node + 1]
+        for row in range(len(here)):
+            for column in range(len(here)):
+                predicted[row, column] = here[row, column]
+        moved_covariance(predicted, step, turned)  # which becomes F P
+        for row in range(len(here)):
+            for column in range(len(here)):
+                predicted[row, column] += noise[node + 1, row, column]
+        if not solve_semidefinite(predicted, turned, factor):
+            covariance[node, 0, 0] = np.nan
+            continue
+        for row in range(len(here)):
+            for column in range(len(here)):
+                factor[row, column] = turned[column, row]
+                predicted[row, column] = later[row, column] - predicted[row, column]
+        moved_covariance(predicted, factor, product)
+        for row in range(len(here)):
+            for column in range(len(here)):
+                here[row, column] += predicted[row, column]
 
 
 class Kept(NamedTuple):
@@ -320,14 +365,16 @@ class BoundFilter(Filter):
 
     def smoothed(self, pieces: Sequence[tuple[Nodes, Integers]]) -> Ragged:
         """The estimates at all nodes, run by run."""
-        parts = []
-        for run in range(len(pieces[0][1]) - 1):
-            own = [[each[rows[run] : rows[run + 1]] for each in nodes[1:]] for nodes, rows in pieces]
-            times, mean, *steps = (np.concatenate(column) for column in zip(*own, strict=True))
-            parts.append((times, mean, smoothed_covariances(*steps[:3])))
-        offsets = np.append(0, np.cumsum([len(times) for times, _, _ in parts]))
-        columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return self.states(Estimates(offsets[1:], *columns), offsets)
+        runs, t = len(pieces[0][1]) - 1, self.stage.model.tangent
+        parts = [
+            [column[rows[run] : rows[run + 1]] for column in nodes[1:6]]
+            for run in range(runs)
+            for nodes, rows in pieces
+        ]
+        times, mean, covariance, transition, noise = map(np.concatenate, zip(*parts, strict=True))
+        offsets = np.sum([rows for _, rows in pieces], axis=0)
+        _smoothing()(runs, offsets, transition, noise, covariance, scratch=partial(back_memory, t))
+        return self.states(Estimates(offsets[1:], times, mean, covariance), offsets)
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
         """The stream of true states, each with what is known of it there."""

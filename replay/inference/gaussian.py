@@ -146,6 +146,19 @@ def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
             covariance[row, column] = covariance[column, row] = entry
 
 
+def scalar_update(
+    mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
+) -> None:
+    """The Kalman update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
+    share = difference / variance
+    for row in range(len(cross)):
+        mean[row] += cross[row] * share
+        part = cross[row] / variance
+        for column in range(row + 1):
+            covariance[row, column] -= part * cross[column]
+            covariance[column, row] = covariance[row, column]
+
+
 def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
     """P becomes F P F', by way of `product`."""
     size = len(covariance)

@@ -25,9 +25,10 @@ from replay.engine.estimator import Estimator
 from replay.engine.tangent import tangent_components
 from replay.inference.binding import number_fields, reading_settings
 from replay.inference.estimators import State, modelled_by, of_any_model
+from replay.inference.gauss_newton import carrying
 from replay.inference.gaussian import kalman_step, keep_measured, whiten
 from replay.inference.generate import differencing, is_flat, tuple_of
-from replay.inference.iterated import ITERATED, IteratedSmoother, Way, carrying
+from replay.inference.iterated import ITERATED, IteratedSmoother, Way
 from replay.inference.methods import Method, MethodParameters
 from replay.inference.model import Model
 from replay.inference.recursion import Estimates, filled, no_results, recursion

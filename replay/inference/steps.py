@@ -426,6 +426,34 @@ def linear_innovation(sensor: Sensor, number: int) -> Function:
     return compare
 
 
+def weighing(sensor: Sensor, number: int) -> Function:
+    """`weigh(data, parameters, work)`: a linearised measurement's residual in units of its noise.
+
+    From the workspace's `predicted` and `rows`, with R = L L': the innovation's difference becomes
+    L^-1 (y - h), its cross-covariance H' L^-T. Returns how many components were measured, and the square
+    of the residual, NaN where R is not positive definite.
+    """
+    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
+    add_noise = sensor_noise(sensor)
+
+    def weigh(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
+        innovation = work.innovations[number]
+        difference, noise, turned = innovation
+        for i in range(m):
+            difference[i] = wrap(data[i] - work.predicted[i], angular[i])
+            for k in range(len(turned)):
+                turned[k, i] = work.rows[i, k]
+            for j in range(m):
+                noise[i, j] = 0.0
+        add_noise(noise, data, parameters, work)
+        size = keep_measured(innovation)
+        squared, _ = whiten(innovation, size)
+        kalman_step(innovation, size, work.step)
+        return size, squared
+
+    return weigh
+
+
 def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:
     """All components that these sensors measure, by name with their kinds: those of the innovations."""
     slots: dict[str, str] = {}

@@ -30,6 +30,7 @@ from replay.judging.evaluation import (
     split_topic,
     unjudged,
 )
+from replay.judging.means import MeansOfAll
 from replay.judging.metrics import (
     Measurement,
     Metric,
@@ -42,13 +43,12 @@ from replay.judging.metrics import (
     plus,
     step_bounds,
 )
-from replay.judging.modes import Modes
 from replay.judging.set_errors import SetErrors, set_errors
 from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
-BOUND_STEP, MODES = schemas.BOUND_STEP.full_name, schemas.MODE_PROBABILITIES.full_name
+BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
 STARTED = schemas.STARTED.full_name
 COVERAGE = schemas.COVERAGE.full_name
@@ -60,6 +60,8 @@ LEAST_SHARE = 0.995
 STEPS = 1 << 17
 # The sums over time of one run: at most so many bins, of a millisecond times a power of two.
 TIME_BINS = 64
+# Of very many runs they are fewer each: so many bins in all.
+TIME_CELLS = 1 << 18
 TIME_BIN_NS = 1_000_000
 
 
@@ -146,7 +148,7 @@ class Judge:
         self._unjudged: dict[str, str] = {}
         self._degrees: Counter[str] = Counter()
         self._bounds: dict[tuple[str, str], Bounds] = {}
-        self._modes: dict[str, Modes] = {}
+        self._means = MeansOfAll()
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
@@ -165,8 +167,7 @@ class Judge:
             output = Output(*named, rows, self._sources, self._first_run)
             if schema == BOUND_STEP:
                 self._bounds.setdefault(split_topic(topic), Bounds()).add(output)
-            elif schema == MODES:
-                self._modes.setdefault(topic, Modes.of(output)).add(output)
+            self._means.add(output)
             self._measured.add(topic, output)
         found = set_errors(
             outputs, self._truths, gap_limit_s=self._gap_limit_s, first_run=self._first_run
@@ -193,7 +194,7 @@ class Judge:
         columns = _columns_of(errors)
         if topic not in self._quantities:
             width = columns.shape[1]
-            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS)
+            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS, cells=TIME_CELLS)
             self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
@@ -221,6 +222,13 @@ class Judge:
         elif schema == COVERAGE:
             told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
 
+    def close(self) -> None:
+        """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
+        self._sources, self._truths, self._on_errors = (), [], None
+        self._steps.clear()
+        for each in self._quantities.values():
+            each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
+
     def merge(self, other: "Judge") -> None:
         """Take in what was judged of other runs."""
         self.runs += other.runs
@@ -233,11 +241,7 @@ class Judge:
                 self._quantities[topic].merge(quantities)
             else:
                 self._quantities[topic] = quantities
-        for topic, modes in other._modes.items():
-            if topic in self._modes:
-                self._modes[topic].merge(modes)
-            else:
-                self._modes[topic] = modes
+        self._means.merge(other._means)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
         for topic, theirs in other._told.items():
@@ -337,8 +341,18 @@ class Judge:
 
     @property
     def modes(self) -> pd.DataFrame:
-        """How probable modes are: a row per estimator, case, span of time and mode; see `Modes`."""
-        return joined(each.table for each in self._modes.values())
+        """How probable modes are: a row per estimator, case, span of time and mode; see `MeansOfAll`."""
+        return joined(self._means.modes())
+
+    @property
+    def effective(self) -> pd.DataFrame:
+        """What share of the particles is effective: a row per estimator, case and span of time."""
+        return joined(self._means.effective())
+
+    @property
+    def late(self) -> pd.DataFrame:
+        """Messages that came late: a row per estimator, case, what became of them, and span of time."""
+        return joined(self._means.late())
 
     @property
     def judged(self) -> dict[str, Errors]:

@@ -140,6 +140,13 @@ class Measurement:
                     state = states[name] if name in states else metric.start()
                     states[name] = metric.add(state, judged)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """As it is pickled: metrics are found again by their names."""
+        return {**vars(self), "_metrics": list(self._metrics)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _metrics=find_metrics(state["_metrics"]))
+
     def merge(self, other: "Measurement") -> None:
         """Take in what was made of other runs by the same metrics."""
         self._named |= other._named

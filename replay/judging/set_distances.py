@@ -15,6 +15,7 @@ from scipy.spatial.distance import cdist
 from recorders.errors import BadInput
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
 
 class Gospa(NamedTuple):
@@ -66,12 +67,26 @@ def gospa(
     return Gospa((localisation + missed + false) ** (1.0 / order), localisation, missed, false)
 
 
+def gospa_pairs(
+    estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0
+) -> tuple[Integers, Integers]:
+    """The pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
+
+    Raises BadInput as `gospa` does.
+    """
+    costs = _assigned_costs(estimates, truths, cutoff, order)
+    near = costs.pairs < cutoff**order
+    return costs.estimate[near], costs.truth[near]
+
+
 class _Costs(NamedTuple):
-    """Sizes of the sets, and the cut-off distances to the power of the order of the best pairs."""
+    """Sizes of the sets, and the best pairs: cut-off distances to the power of the order, and who."""
 
     estimates: int
     truths: int
     pairs: Floats
+    estimate: Integers
+    truth: Integers
 
 
 def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
@@ -80,11 +95,13 @@ def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, orde
         raise BadInput(f"cutoff {cutoff:g}, order {order:g}: a positive cutoff and an order from 1 on")
     first, second = _points(estimates, "estimates"), _points(truths, "truths")
     if len(first) == 0 or len(second) == 0:
-        return _Costs(len(first), len(second), np.empty(0))
+        nobody = np.empty(0, np.int64)
+        return _Costs(len(first), len(second), np.empty(0), nobody, nobody)
     if first.shape[1] != second.shape[1]:
         raise BadInput(f"estimates have {first.shape[1]} components, truths {second.shape[1]}")
     costs = np.minimum(cdist(first, second), cutoff) ** order
-    return _Costs(len(first), len(second), costs[linear_sum_assignment(costs)])
+    estimate, truth = linear_sum_assignment(costs)
+    return _Costs(len(first), len(second), costs[estimate, truth], estimate, truth)
 
 
 def _points(points: ArrayLike, what: str) -> Floats:

@@ -11,12 +11,16 @@ class BinnedSums:
     """Sums of rows of numbers (n, columns) by group and by bin of a position, a whole number from 0 on.
 
     Bin b holds the positions from b width to (b + 1) width. Where there is a limit, the width doubles
-    as often as needed, so that the sums never take more than `limit` bins a group.
+    as often as needed, so that the sums never take more than `limit` bins a group; where there are very
+    many groups, those of several sums merged take no more than about `cells` bins in all.
     """
 
-    def __init__(self, columns: int, *, width: int = 1, limit: int | None = None) -> None:
+    def __init__(
+        self, columns: int, *, width: int = 1, limit: int | None = None, cells: int | None = None
+    ) -> None:
         self.width = width
         self._limit = limit
+        self._cells = cells
         # first column: how many rows there were
         self._sums: Floats = np.zeros((1, 0, 1 + columns))
         self._bins = 0
@@ -50,6 +54,8 @@ class BinnedSums:
         self._reserve(len(theirs), theirs.shape[1])
         self._sums[: len(theirs), : theirs.shape[1]] += theirs
         while self._limit is not None and self._bins > self._limit:
+            self._double()
+        while self._cells is not None and self._bins > 1 and self._groups * self._bins > self._cells:
             self._double()
 
     def filled(self) -> tuple[Integers, Floats, Floats]:

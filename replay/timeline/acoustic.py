@@ -12,7 +12,7 @@ from replay.engine.channels import numbered
 from replay.estimators.acoustic_streams import gather_detections
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, beside
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -56,11 +56,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         _draw_shot(canvas, "truth", Stroke(TRUTH, 2.0), then, then["state"], cone)
     for estimator, stream in scene.outputs_of(CASE, schemas.GAUSSIAN_ESTIMATE):
         _draw_estimates(canvas, estimator, Stroke(scene.colour(estimator), 1.5), stream, cone)
-    board = rrb.Vertical(
-        plane_view(canvas, ROOT, [], [], shown),
-        draw_events(canvas, scene, CASE),
-        row_shares=[3, 1],
-    )
+    board = above_events(plane_view(canvas, ROOT, [], [], shown), draw_events(canvas, scene, CASE))
     return beside(board, draw_quality_in_tabs(canvas, scene, CASE), CASE)
 
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.engine.blocks import gather
-from replay.judging.evaluation import Floats
 from replay.judging.metrics import Output
 from replay.judging.tracks import live_counts, reports_of, track_tables
-from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, escaped, thin
-from replay.timeline.plane import ROOT, plane_view, trail_of, turn_up
+from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, thin
+from replay.timeline.geodetic import are_near, degrees_of, map_view, usual
+from replay.timeline.plane import ROOT, plane_view, turn_up
 from replay.timeline.plots import LINE, plot_view
 
 REPORTS, GEODETIC, IDENTITY = "/reports", "/geodetic", "/identity"
@@ -27,11 +27,6 @@ LISTED_VESSELS = 200
 DRAWN_REPORTS = 50_000
 # Hues this far apart, in turns, never meet again soon.
 GOLDEN = 0.618034
-SHOWN_SHARE = 0.9
-# So many times the shown extent beyond it is far off.
-FAR = 10.0
-# How wide the map is drawn, about, and its tiles.
-MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
@@ -60,21 +55,15 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
     plane_entity, map_entity = f"{ROOT}/{name}/reports", f"geodetic/{name}/reports"
     canvas.send(plane_entity, times, points)
     canvas.fix(plane_entity, rr.Points2D.from_fields(radii=radii))
-    degrees = np.stack([geodetic["latitude_deg"], geodetic["longitude_deg"]], axis=1)[rows]
-    near = _is_near(degrees)
+    degrees = degrees_of(geodetic)[rows]
+    near = are_near(degrees)
     on_map = rr.GeoPoints.columns(positions=degrees[near], colors=colours[near])
     canvas.send(map_entity, times[near], on_map)
     canvas.fix(map_entity, rr.GeoPoints.from_fields(radii=radii))
-    trail = trail_of(canvas, TRAIL_S)
-    map_view = rrb.MapView(
-        origin=escaped(f"geodetic/{name}"),
-        name="OpenStreetMap" if near.all() else f"OpenStreetMap, {(~near).sum()} far off left out",
-        zoom=_zoom(degrees[near]),
-        overrides={escaped(map_entity): [trail]},
-    )
-    shown = _usual(place)
+    on_earth = map_view(canvas, f"geodetic/{name}", degrees, [map_entity], TRAIL_S)
+    shown = usual(place)
     plane = plane_view(canvas, f"{ROOT}/{name}", [], [plane_entity], shown, TRAIL_S)
-    return rrb.Horizontal(plane, map_view, name=name)
+    return rrb.Horizontal(plane, on_earth, name=name)
 
 
 def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -83,27 +72,6 @@ def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
     value = np.where(numbers % 2 == 0, 1.0, 0.75)
     colours = hsv_to_rgb(np.stack([hue, np.full(len(hue), 0.7), value], axis=1))
     return np.rint(255 * colours).astype(np.uint8)
-
-
-def _usual(places: Floats) -> Floats:
-    """The corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
-    tail = 0.5 * (1.0 - SHOWN_SHARE)
-    return np.quantile(places, [tail, 1.0 - tail], axis=0)
-
-
-def _is_near(places: Floats) -> NDArray[np.bool_]:
-    """Which places are not far off: the map's view centres on all that it has."""
-    low, high = _usual(places)
-    margin = FAR * (high - low).max()
-    return ((places >= low - margin) & (places <= high + margin)).all(axis=1)
-
-
-def _zoom(degrees: Floats) -> float:
-    """The zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
-    low, high = degrees.min(axis=0), degrees.max(axis=0)
-    latitude = np.radians(0.5 * (low[0] + high[0]))
-    width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)
-    return float(np.clip(np.log2(360.0 / width * MAP_PIXELS / TILE_PIXELS), 1.0, 19.0))
 
 
 def _draw_live(canvas: Canvas, scene: Scene, tracks: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:

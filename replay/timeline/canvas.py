@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
 from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, split_topic
+from replay.judging.evaluation import Errors, Floats, split_topic
 
 Times = NDArray[np.int64]
 Colour = tuple[int, int, int]
@@ -94,8 +94,9 @@ class Scene:
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """The truth streams of a case."""
-        return [self.read(topic) for topic in self._truths if _prefix(topic) == case]
+        """The non-empty truth streams of a case."""
+        truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
+        return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
         """The run's sensor topics below a case, and those that are below none; see `unread`."""
@@ -244,9 +245,35 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
     """The rows to draw: all, or the last of each of `rows` equal spans of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
-    span_ns = max((time_ns[-1] - time_ns[0]) / rows, 1.0)
-    of_span = np.minimum((time_ns - time_ns[0]) / span_ns, rows - 1).astype(np.int64)
+    of_span = _spans(time_ns, rows)
     return np.flatnonzero(np.append(of_span[1:] != of_span[:-1], True))
+
+
+def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
+    """The rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    if len(time_ns) <= rows:
+        return np.arange(len(time_ns))
+    return extremes(_spans(time_ns, rows // 2), values)
+
+
+def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
+    """The rows of the least and of the greatest value of every span, the first where several are.
+
+    `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
+    """
+    first = np.flatnonzero(np.diff(of_span, prepend=-1))
+    sizes = np.diff(first, append=len(of_span))
+    found = []
+    for extreme in (np.fmin, np.fmax):
+        rows = np.flatnonzero(values == np.repeat(extreme.reduceat(values, first), sizes))
+        found.append(rows[np.diff(of_span[rows], prepend=-1) > 0])
+    return np.unique(np.concatenate(found))
+
+
+def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
+    """In which of so many equal spans of time each stamp is, from zero on."""
+    span_ns = max((time_ns[-1] - time_ns[0]) / spans, 1.0)
+    return np.minimum((time_ns - time_ns[0]) / span_ns, spans - 1).astype(np.int64)
 
 
 def gap_limit_ns(time_ns: Times) -> int:

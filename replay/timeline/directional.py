@@ -3,7 +3,7 @@
 To the right of each are the errors in degrees with their bands, as everywhere.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ from replay.timeline.canvas import (
     escaped,
     thin,
 )
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plots import draw_quality
 
 # Pictures and outlines are large: fewer of them than of numbers.
@@ -55,7 +55,7 @@ class Track(NamedTuple):
 def _tracks(scene: Scene, case: str, width: int, rows: int) -> Iterator[Track]:
     """The truth, then every estimate of this width, thinned to what is drawn."""
     for stream in scene.truths_of(case):
-        if len(stream) and stream["state"].shape[1] == width:
+        if stream["state"].shape[1] == width:
             yield _track("truth", TRUTH, stream, "state", rows)
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if stream["mean"].shape[1] == width:
@@ -78,9 +78,7 @@ def _draw_with(
     """A board above the events of each case, its errors beside it."""
 
     def draw_case(case: str) -> rrb.Container:
-        left = rrb.Vertical(
-            board(canvas, scene, case), draw_events(canvas, scene, case), row_shares=[3, 1]
-        )
+        left = above_events(board(canvas, scene, case), draw_events(canvas, scene, case))
         return beside(left, draw_quality(canvas, scene, case), case)
 
     return draw_cases(scene, draw_case)
@@ -90,23 +88,38 @@ def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
     """Triads: the truth's in red, green and blue, an estimate's longer and in its own colour."""
     root = entity_path("space", case)
     for number, track in enumerate(_tracks(scene, case, 4, 5000)):
-        entity = f"{root}/{track.name}"
-        turned = rr.Transform3D.columns(quaternion=np.roll(track.states, -1, axis=1))
-        canvas.send(entity, track.time_ns, turned)
         is_truth = track.name == "truth"
         colours = AXES if is_truth else [track.colour] * 3
-        labels = [f"{track.name} {axis}" for axis in "xyz"]
-        arrows = rr.Arrows3D(
-            vectors=(1.0 + 0.1 * number) * np.eye(3),
-            colors=colours,
-            radii=0.025 if is_truth else 0.012,
-            labels=labels,
-            show_labels=False,
-        )
-        canvas.fix(f"{entity}/axes", arrows)
+        radius = 0.025 if is_truth else 0.012
+        turned = (track.time_ns, track.states)
+        draw_triads(canvas, f"{root}/{track.name}", *turned, colours, 1.0 + 0.1 * number, radius)
+    return space_view(root, "Orientation: truth in red, green, blue")
+
+
+def draw_triads(
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    quaternions: Floats,
+    colours: Sequence[Colour],
+    length: float,
+    radius: float,
+) -> None:
+    """The axes x, y and z turned by each of quaternions (n, 4), w first."""
+    turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
+    canvas.send(entity, time_ns, turned)
+    labels = [f"{entity.rpartition('/')[2]} {axis}" for axis in "xyz"]
+    arrows = rr.Arrows3D(
+        vectors=length * np.eye(3), colors=colours, radii=radius, labels=labels, show_labels=False
+    )
+    canvas.fix(f"{entity}/axes", arrows)
+
+
+def space_view(root: str, name: str) -> rrb.Spatial3DView:
+    """A view of triads about one origin, x towards the eye."""
     return rrb.Spatial3DView(
         origin=escaped(root),
-        name="Orientation: truth in red, green, blue",
+        name=name,
         eye_controls=rrb.EyeControls3D(
             position=(2.4, 1.4, 1.2), look_target=(0, 0, 0), eye_up=(0, 0, 1)
         ),

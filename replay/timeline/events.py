@@ -1,6 +1,6 @@
 """What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,15 +32,24 @@ class Happened(NamedTuple):
     texts: list[str]
 
 
-def draw_events(canvas: Canvas, scene: Scene, case: str) -> rrb.TextLogView:
-    """The events of a case: one entity per estimator and sensor."""
+def above_events(
+    board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
+) -> rrb.Container:
+    """A board so many times as high as the events below it, if there are any."""
+    return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
+
+
+def draw_events(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TextLogView]:
+    """The events of a case, one entity per estimator and sensor: no view where nothing happened."""
     root = entity_path("events", case)
     unread = Happened("log", "INFO", np.full(len(scene.unread), canvas.epoch_ns), _not_drawn(scene))
-    for who, level, time_ns, texts in (unread, *_of_estimators(scene, case), *_of_sensors(scene, case)):
+    happened = [unread, *_of_estimators(scene, case), *_of_sensors(scene, case)]
+    happened = [each for each in happened if each.texts]
+    for who, level, time_ns, texts in happened:
         lines = [f"{who}: {text}" for text in texts]
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
-    return events_view(root)
+    return [events_view(root)] if happened else []
 
 
 def _not_drawn(scene: Scene) -> list[str]:
@@ -78,6 +87,12 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         texts = [
             f"came {delay:.3f} s late: went back and used {repeated} after it again"
             for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.WAITED):
+        texts = [
+            f"came late, {behind:.3f} s behind newer ones, which waited for it"
+            for behind in stream["behind_s"].tolist()
         ]
         yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.FAILURE):

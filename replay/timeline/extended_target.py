@@ -6,7 +6,7 @@ import rerun.blueprint as rrb
 from recorders.log import Stream, schemas
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, WRONG, Canvas, Scene, Timeline, beside
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plane import ROOT, Stroke, draw_dots, draw_outlines, plane_view, turn_up
 from replay.timeline.plots import draw_components, draw_quality
 
@@ -27,11 +27,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     for estimator, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE):
         if _is_target(stream):
             _draw_target(canvas, estimator, stream, stream["mean"], Stroke(scene.colour(estimator)))
-    board = rrb.Vertical(
-        plane_view(canvas, ROOT, [], [points], np.concatenate(shown)),
-        draw_events(canvas, scene, ""),
-        row_shares=[3, 1],
-    )
+    plane = plane_view(canvas, ROOT, [], [points], np.concatenate(shown))
+    board = above_events(plane, draw_events(canvas, scene, ""))
     plots = [*draw_components(canvas, scene, "")[:2], *draw_quality(canvas, scene, "")]
     return beside(board, plots, "")
 

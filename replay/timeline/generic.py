@@ -1,22 +1,24 @@
 """The timeline of a log that no family draws: all that it holds, by schema.
 
-Places are on a plane: truths, estimates, fixes, landmarks. What sensors measure is a plot for each
-number, and beside it are errors, NEES and NIS, where there are estimates.
+Places are on a plane, one for each frame of the log, and on a map of the earth: truths, estimates,
+fixes, poses, landmarks with what is seen of them. What a sensor sees is drawn about it, what it measures
+is a plot for each quantity. Beside it are errors, NEES and NIS, where there are estimates.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import count
+from itertools import cycle
 
 import numpy as np
 import rerun.blueprint as rrb
+from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
-from recorders.log import Stream, schemas
+from recorders.log import Field, Stream, schemas
 from replay.judging.evaluation import Floats
+from replay.timeline.about import draw_about
 from replay.timeline.canvas import (
     PALETTE,
-    TRUTH,
     Canvas,
     Scene,
     Timeline,
@@ -25,7 +27,16 @@ from replay.timeline.canvas import (
     entity_path,
     thin,
 )
-from replay.timeline.events import NOT_SENSED, draw_events
+from replay.timeline.directional import draw_triads, space_view
+from replay.timeline.events import NOT_SENSED, above_events, draw_events
+from replay.timeline.geodetic import degrees_of, draw_fixes, map_view
+from replay.timeline.landmarks import (
+    ARROW_SHARE,
+    draw_sights,
+    draw_track,
+    landmarks_of,
+    tracks_of,
+)
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -47,13 +58,17 @@ from replay.timeline.plots import (
     plot_view,
     shown_unit,
 )
+from replay.timeline.thinning import KEPT_ROWS, curves_of
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
-LANDMARK = schemas.LANDMARK.full_name
+LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name
+GEODETIC, ORIENTATION = schemas.GEODETIC_FIX.full_name, schemas.ORIENTATION.full_name
+ANGLES = ("roll", "pitch", "yaw")
+Board = rrb.Container | rrb.View
 
 
-def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A plane, plots and events for each case.
+def draw(canvas: Canvas, scene: Scene) -> Board:
+    """Planes, maps, plots and events for each case.
 
     Raises BadInput where there is nothing to draw.
     """
@@ -68,100 +83,139 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     return draw_cases(scene, partial(_draw_case, canvas, scene))
 
 
-def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
+def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     sensed = [scene.read(topic) for topic in scene.topics_near(case)]
     sensed = [stream for stream in sensed if len(stream)]
-    boards: list[rrb.Container | rrb.View] = [
-        *_draw_plane(canvas, scene, case, sensed),
-        *(_titled(name, views) for name, views in _draw_sensors(canvas, case, sensed)),
+    boards: list[Board] = [
+        *_draw_planes(canvas, scene, case, sensed),
+        *_draw_earth(canvas, case, [each for each in sensed if each.schema.full_name == GEODETIC]),
+        *_draw_space(canvas, case, [each for each in sensed if each.schema.full_name == ORIENTATION]),
+        *_draw_sensors(canvas, case, sensed),
     ]
     components = draw_components(canvas, scene, case)
     if components:
-        boards.append(_titled("state", components))
+        boards.append(rrb.Vertical(*components, name="state"))
     modes = draw_modes(canvas, scene, case)
     if modes:
-        boards.append(_titled("modes", modes))
-    events = draw_events(canvas, scene, case)
-    board = rrb.Vertical(rrb.Tabs(*boards), events, row_shares=[4, 1])
-    return beside(board if boards else rrb.Vertical(events), draw_quality(canvas, scene, case), case)
+        boards.append(rrb.Vertical(*modes, name="modes"))
+    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, case), 4.0)
+    return beside(board, draw_quality(canvas, scene, case), case)
 
 
-def _titled(name: str, views: list[rrb.TimeSeriesView]) -> rrb.Container:
-    return rrb.Vertical(*views, name=name)
+def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:
+    """Everything that has a place, side by side for each frame: no board where nothing has."""
+    by_frame: dict[str, list[Stream]] = {"": []}
+    for stream in sensed:
+        if stream.schema.full_name in {*FIXES, LANDMARK} and stream["position_m"].shape[1] >= 2:
+            by_frame[""].append(stream)
+        elif stream.schema.full_name == POSE and np.ptp(stream["position_m"][:, :2], axis=0).any():
+            by_frame.setdefault(stream.metadata.get("frame_id", ""), []).append(stream)
+    views = [
+        view
+        for frame, streams in by_frame.items()
+        for view in _draw_plane(canvas, scene, case, frame, streams)
+    ]
+    return [rrb.Horizontal(*views, name="map")] if views else []
 
 
 def _draw_plane(
-    canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]
+    canvas: Canvas, scene: Scene, case: str, frame: str, sensed: list[Stream]
 ) -> list[rrb.Spatial2DView]:
-    """Everything that has a place: no view where nothing has."""
-    root = entity_path(ROOT, case)
-    tracks = [("truth", Stroke(TRUTH, 2.0), stream, "state") for stream in scene.truths_of(case)]
-    for name, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
-        tracks.append((name, Stroke(scene.colour(name)), stream, "mean"))
-    draw_clouds(canvas, scene, case, root)
-    shown: list[Floats] = []
-    paths: list[str] = []
-    for name, stroke, stream, field in tracks:
-        poses = _poses(stream, stream[field])
+    """The places of one frame; truths and estimates are in the log's own, which has no name."""
+    root, shown, paths = entity_path(ROOT, case), [], []
+    if frame:
+        root = entity_path("frames", frame, case)
+        turn_up(canvas, root)
+    else:
+        tracks = tracks_of(scene, case)
+        for track in tracks:
+            shown.append(track.poses[:, :2])
+            paths.append(draw_track(canvas, root, track, extent_of(shown[-1])))
+        draw_clouds(canvas, scene, case, root)
+        draw_sights(canvas, scene, case, tracks, landmarks_of(scene))
+    for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
+        entity, stroke = f"{root}/{_name(stream, case)}", Stroke(colour)
         rows = thin(stream.publish_time_ns)
-        rows = rows[np.isfinite(poses[rows, :2]).all(axis=1)]
-        if len(rows) == 0:
-            continue
-        entity, time_ns = f"{root}/{name}", stream.publish_time_ns[rows]
-        draw_path(canvas, f"{entity}/path", time_ns, poses[rows, :2], stroke)
-        if np.isfinite(poses[rows]).all():
-            length_m = 0.04 * extent_of(poses[rows, :2])
-            draw_poses(canvas, f"{entity}/pose", time_ns, poses[rows], stroke, length_m)
-        paths.append(f"{entity}/path")
-        shown.append(poses[rows, :2])
-    for number, stream in enumerate(sensed):
-        if stream.schema.full_name not in {*FIXES, LANDMARK} or stream["position_m"].shape[1] < 2:
-            continue
-        places, entity = stream["position_m"][:, :2], f"{root}/{_name(stream, case)}"
+        time_ns, places = stream.publish_time_ns[rows], stream["position_m"][rows, :2]
         if stream.schema.full_name == LANDMARK:
+            places = stream["position_m"][:, :2]
             draw_points(canvas, entity, stream["landmark_id"], places)
+        elif stream.schema.full_name == POSE:
+            yaw = _euler_deg(stream["quaternion"][rows])[:, 2:]
+            poses = np.concatenate([places, np.radians(yaw)], axis=1)
+            known = np.isfinite(poses).all(axis=1)
+            length_m = ARROW_SHARE * extent_of(places)
+            draw_path(canvas, f"{entity}/path", time_ns, places, stroke)
+            draw_poses(canvas, f"{entity}/pose", time_ns[known], poses[known], stroke, length_m)
+            paths.append(f"{entity}/path")
         else:
-            rows = thin(stream.publish_time_ns)
-            stroke = Stroke(PALETTE[number % len(PALETTE)])
-            draw_dots(canvas, entity, stream.publish_time_ns[rows], places[rows], stroke)
+            draw_dots(canvas, entity, time_ns, places, stroke)
+            paths.append(entity)
         shown.append(places)
-    return [plane_view(canvas, root, [], paths, np.concatenate(shown))] if shown else []
+    name = f"Frame {frame}" if frame else "Map"
+    return [plane_view(canvas, root, [], paths, np.concatenate(shown), name=name)] if shown else []
 
 
-def _poses(stream: Stream, states: Floats) -> Floats:
-    """Position and heading (n, 3), NaN where the stream has no such component."""
-    poses = np.full((len(stream), 3), np.nan)
-    for column, name in enumerate(("x_m", "y_m", "heading_rad")):
-        if name in stream.components:
-            poses[:, column] = states[:, stream.components.index(name)]
-    return poses
+def _draw_earth(canvas: Canvas, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
+    """Geodetic fixes on a map of the earth."""
+    root = entity_path("geodetic", case)
+    for stream, colour in zip(fixes, cycle(PALETTE), strict=False):
+        draw_fixes(canvas, f"{root}/{_name(stream, case)}", stream, colour)
+    degrees = [degrees_of(stream) for stream in fixes]
+    return [map_view(canvas, root, np.concatenate(degrees))] if fixes else []
 
 
-def _draw_sensors(
-    canvas: Canvas, case: str, sensed: list[Stream]
-) -> Iterator[tuple[str, list[rrb.TimeSeriesView]]]:
-    """A plot for each real field and each vector of a sensor, unless wide or a covariance."""
+def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb.Spatial3DView]:
+    """Orientations as triads about one origin."""
+    root = entity_path("space", case)
+    for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
+        rows = thin(stream.publish_time_ns)
+        rows = rows[np.isfinite(stream["quaternion"][rows]).all(axis=1)]
+        turned = (stream.publish_time_ns[rows], stream["quaternion"][rows])
+        draw_triads(canvas, f"{root}/{_name(stream, case)}", *turned, [colour] * 3, 1.0, 0.02)
+    return [space_view(root, "Orientation")] if sensed else []
+
+
+def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[rrb.Container]:
+    """What a sensor sees about it, and a plot for each number that it measures, unless covariances."""
     for stream in sensed:
+        if stream.schema.full_name in NOT_SENSED:
+            continue
         name = _name(stream, case)
-        views = []
-        for field in stream.schema:
-            is_plotted = field.kind == "real" or (
-                field.kind == "vector"
-                and not field.name.startswith("covariance")
-                and stream[field.name].shape[1] <= len(PALETTE)
-            )
-            if stream.schema.full_name in NOT_SENSED or not is_plotted:
-                continue
-            quantity, unit, scale = shown_unit(field.name)
-            plot = entity_path("plots", case, name, field.name)
-            columns = scale * stream[field.name].reshape(len(stream), -1).T
-            named = stream.components if len(stream.components) == len(columns) else count()
-            for element, values, colour in zip(named, columns, PALETTE, strict=False):
-                curve = str(element) if field.kind == "vector" else field.name
-                draw_curve(canvas, plot, curve, colour, stream.publish_time_ns, values, POINTS)
-            views.append(plot_view(plot, f"{quantity.capitalize()} ({unit})", legend=len(columns) > 1))
-        if views:
-            yield name, views
+        plots = [_draw_field(canvas, case, stream, *curves) for curves in curves_of(stream)]
+        about = draw_about(canvas, entity_path("about", case, name), stream)
+        if about:
+            turn_up(canvas, entity_path("about", case, name))
+        columns: list[Board] = [*about, *([rrb.Vertical(*plots)] if plots else [])]
+        if columns:
+            yield rrb.Horizontal(*columns, name=name)
+
+
+def _draw_field(
+    canvas: Canvas, case: str, stream: Stream, field: Field, curves: Floats
+) -> rrb.TimeSeriesView:
+    """The plot of a field's curves (curves, n); rotations are shown as angles."""
+    quantity, unit, scale = shown_unit(field.name)
+    plot = entity_path("plots", case, _name(stream, case), field.name)
+    named: Sequence[str] = [str(element) for element in range(len(curves))]
+    if field.kind == "real":
+        named = [field.name]
+    elif field.name == "quaternion":
+        quantity, unit, named, curves = "orientation", "deg", ANGLES, _euler_deg(curves.T).T
+    elif len(stream.components) == len(curves):
+        named = stream.components
+    for curve, values, colour in zip(named, scale * curves, cycle(PALETTE), strict=False):
+        draw_curve(canvas, plot, curve, colour, stream.publish_time_ns, values, POINTS, most=KEPT_ROWS)
+    return plot_view(plot, f"{quantity.capitalize()} ({unit})", legend=len(curves) > 1)
+
+
+def _euler_deg(quaternions: Floats) -> Floats:
+    """Roll, pitch and yaw (n, 3), turned about z, y, x in this order; NaN where there is no rotation."""
+    angles = np.full((len(quaternions), 3), np.nan)
+    known = np.linalg.norm(quaternions, axis=1) > 0.0
+    turned = Rotation.from_quat(quaternions[known], scalar_first=True)
+    angles[known] = turned.as_euler("ZYX", degrees=True)[:, ::-1]
+    return angles
 
 
 def _name(stream: Stream, case: str) -> str:

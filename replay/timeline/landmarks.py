@@ -1,6 +1,5 @@
 """The robots' timeline: each robot on its map of landmarks, its errors, NEES, NIS and events."""
 
-from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import pandas as pd
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
+from replay.engine.measurements import PLANE
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
@@ -22,7 +22,7 @@ from replay.timeline.canvas import (
     entity_path,
     thin,
 )
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -39,7 +39,9 @@ from replay.timeline.plane import (
 from replay.timeline.plots import draw_quality
 from replay.timeline.sets import draw_sets
 
-POSE = ("x_m", "y_m", "heading_rad")
+HEADING = "heading_rad"
+# An arrow is so long, as a share of the scene.
+ARROW_SHARE = 0.04
 SIGHTINGS = tuple(each.full_name for each in (schemas.RANGE_BEARING, schemas.RANGE, schemas.BEARING))
 SEEN = (170, 170, 90, 140)
 GATED = (*WRONG, 255)
@@ -48,7 +50,10 @@ FRESH_NS = 500_000_000
 
 
 class Track(NamedTuple):
-    """Poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them."""
+    """Poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
+
+    A heading that is not stated is NaN.
+    """
 
     name: str
     stroke: Stroke
@@ -59,13 +64,13 @@ class Track(NamedTuple):
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     """A map and plots for each robot."""
-    landmarks = _landmarks(scene)
+    landmarks = landmarks_of(scene)
     turn_up(canvas)
     draw_points(canvas, f"{ROOT}/landmarks", landmarks.index.to_numpy(), landmarks.to_numpy())
     return draw_cases(scene, partial(_draw_robot, canvas, scene, landmarks))
 
 
-def _landmarks(scene: Scene) -> pd.DataFrame:
+def landmarks_of(scene: Scene) -> pd.DataFrame:
     """Places (n, 2) by number; none where the log has no map, as that of estimates."""
     if "/landmarks" not in scene.source.topics:
         return pd.DataFrame(np.empty((0, 2)), index=np.empty(0, np.int64))
@@ -79,54 +84,56 @@ def _draw_robot(
     canvas: Canvas, scene: Scene, landmarks: pd.DataFrame, robot: str
 ) -> rrb.Container | rrb.View:
     root = entity_path(ROOT, robot)
-    tracks = list(_tracks(scene, robot))
+    tracks = tracks_of(scene, robot)
     shown = np.concatenate([landmarks.to_numpy(), *(each.poses[:, :2] for each in tracks[:1])])
-    arrow_m = 0.04 * extent_of(shown)
-    for track in tracks:
-        entity = f"{root}/{track.name}"
-        draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
-        draw_poses(canvas, f"{entity}/pose", track.time_ns, track.poses, track.stroke, arrow_m)
-        if track.covariances is not None:
-            outline = (track.time_ns, track.poses[:, :2], track.covariances, track.stroke)
-            draw_ellipses(canvas, f"{entity}/ellipse", *outline)
+    paths = [draw_track(canvas, root, track, extent_of(shown)) for track in tracks]
     draw_clouds(canvas, scene, robot, root)
-    _draw_sights(canvas, scene, robot, tracks, landmarks)
+    draw_sights(canvas, scene, robot, tracks, landmarks)
     _, areas = draw_sets(canvas, scene, robot, root)
-    paths = [f"{root}/{track.name}/path" for track in tracks]
-    board = rrb.Vertical(
-        plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown),
-        draw_events(canvas, scene, robot),
-        row_shares=[3, 1],
-    )
+    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
+    board = above_events(plane, draw_events(canvas, scene, robot))
     return beside(board, [*draw_quality(canvas, scene, robot), *areas], robot)
 
 
-def _tracks(scene: Scene, robot: str) -> Iterator[Track]:
-    """The truth and every estimate, thinned to what is drawn."""
-    for stream in filter(_has_pose, scene.truths_of(robot)):
-        yield _track("truth", Stroke(TRUTH, 2.0), stream, stream["state"])
+def tracks_of(scene: Scene, robot: str) -> list[Track]:
+    """The truth and every estimate that says where the robot is, thinned to what is drawn."""
+    found = [("truth", Stroke(TRUTH, 2.0), each, each["state"]) for each in scene.truths_of(robot)]
     for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
-        if _has_pose(stream):
-            yield _track(estimator, Stroke(scene.colour(estimator)), stream, stream["mean"])
-
-
-def _has_pose(stream: Stream) -> bool:
-    return set(POSE) <= set(stream.components) and len(stream) > 0
+        found.append((estimator, Stroke(scene.colour(estimator)), stream, stream["mean"]))
+    tracks = [_track(*each) for each in found if set(PLANE) <= set(each[2].components)]
+    return [track for track in tracks if len(track.time_ns)]
 
 
 def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
     rows = thin(stream.publish_time_ns)
-    columns = [stream.components.index(component) for component in POSE]
+    columns = [stream.components.index(component) for component in PLANE]
     rows = rows[np.isfinite(states[rows][:, columns]).all(axis=1)]
+    poses = np.full((len(rows), 3), np.nan)
+    poses[:, :2] = states[rows][:, columns]
+    if HEADING in stream.components:
+        poses[:, 2] = states[rows, stream.components.index(HEADING)]
     covariances = None
     if "covariance" in stream.columns:
         size = len(stream.components)
         covariances = stream["covariance"][rows].reshape(-1, size, size)
-        covariances = covariances[:, columns[:2]][:, :, columns[:2]]
-    return Track(name, stroke, stream.publish_time_ns[rows], states[rows][:, columns], covariances)
+        covariances = covariances[:, columns][:, :, columns]
+    return Track(name, stroke, stream.publish_time_ns[rows], poses, covariances)
 
 
-def _draw_sights(
+def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
+    """Path, arrows and ellipses of a robot in a scene so wide; the entity of the path."""
+    entity = f"{root}/{track.name}"
+    draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
+    if np.isfinite(track.poses).all():
+        length_m = ARROW_SHARE * extent_m
+        draw_poses(canvas, f"{entity}/pose", track.time_ns, track.poses, track.stroke, length_m)
+    if track.covariances is not None:
+        outline = (track.time_ns, track.poses[:, :2], track.covariances, track.stroke)
+        draw_ellipses(canvas, f"{entity}/ellipse", *outline)
+    return f"{entity}/path"
+
+
+def draw_sights(
     canvas: Canvas, scene: Scene, robot: str, tracks: list[Track], landmarks: pd.DataFrame
 ) -> None:
     """Lines from the robot to the landmarks it sees; one that an estimator's gate kept out is red."""

@@ -23,7 +23,7 @@ from replay.timeline.canvas import (
     entity_path,
     escaped,
 )
-from replay.timeline.events import draw_events, events_view
+from replay.timeline.events import above_events, draw_events, events_view
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -55,11 +55,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     turn_up(canvas)
     links = scene.read("/links")
     nodes = _nodes(scene, links)
-    board = rrb.Vertical(
-        rrb.Horizontal(_draw_graph(canvas, links, nodes), _draw_maps(canvas, scene)),
-        _draw_events(canvas, scene, links),
-        row_shares=[3, 1],
-    )
+    maps = rrb.Horizontal(_draw_graph(canvas, links, nodes), _draw_maps(canvas, scene))
+    board = above_events(maps, _draw_events(canvas, scene, links))
     cases = [case for case in scene.cases if scene.errors_of(case)][:PLOTTED_NODES]
     if not cases:
         return board
@@ -167,15 +164,14 @@ def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> floa
     return float(np.quantile(reach, SHOWN_SHARE))
 
 
-def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> rrb.TextLogView:
+def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLogView]:
     """What happened to estimators, sensors and messages, in one list."""
-    for case in scene.cases[: PLOTTED_NODES + 1]:
-        draw_events(canvas, scene, case)
+    happened = [draw_events(canvas, scene, case) for case in scene.cases[: PLOTTED_NODES + 1]]
     times, first = np.unique(links.publish_time_ns, return_index=True)
     texts = [_told(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
     levels = ["WARN" if "lost" in text else "INFO" for text in texts]
     canvas.send("events/links", times, rr.TextLog.columns(text=texts, level=levels))
-    return events_view("events")
+    return [events_view("events")] if texts or any(happened) else []
 
 
 def _told(sent: Stream) -> str:

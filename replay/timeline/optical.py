@@ -19,7 +19,7 @@ from recorders.log import Stream, schemas
 from recorders.models.optical import bias_components, direction
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, WRONG, Canvas, Colour, Scene, Timeline, Times, beside, nice
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plots import draw_quality_in_tabs
 
 ROOT = "space"
@@ -54,11 +54,8 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         for name, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE)
     ]
     name = f"Scene; 95 % ellipsoids {' '.join(f'x{each:g}' for each in dict.fromkeys(shown))}"
-    board = rrb.Vertical(
-        rrb.Spatial3DView(origin=ROOT, name=name if shown else "Scene"),
-        draw_events(canvas, scene, ""),
-        row_shares=[3, 1],
-    )
+    space = rrb.Spatial3DView(origin=ROOT, name=name if shown else "Scene")
+    board = above_events(space, draw_events(canvas, scene, ""))
     return beside(board, draw_quality_in_tabs(canvas, scene, ""), "")
 
 

@@ -40,6 +40,8 @@ SHOWN_INTERVALS = 1.5
 # Of clouds of particles so many are drawn, those of whole stamps; the area of each is its weight.
 CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
+# What is left free beside the places, as a share of their side, or of so much of the longer one.
+MARGIN, LEAST_SIDE = 0.07, 0.3
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -56,9 +58,9 @@ class Stroke(NamedTuple):
         return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - self.radius_px}
 
 
-def turn_up(canvas: Canvas) -> None:
-    """Let y point up below `map`."""
-    canvas.fix(ROOT, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+def turn_up(canvas: Canvas, root: str = ROOT) -> None:
+    """Let y point up below an entity."""
+    canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
 
 
 def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
@@ -92,6 +94,17 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
     """A point (n, 2) at each time, such as a measurement."""
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
+def draw_scans(
+    canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
+) -> None:
+    """All points (n, 2) of a stamp together, until those of the next."""
+    times, sizes = np.unique(time_ns, return_counts=True)
+    columns = rr.Points2D.columns(positions=places)
+    canvas.send(entity, times, columns.partition(sizes))
+    radii = rr.Radius.ui_points(radius_px)
+    canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii))
 
 
 class Cloud(NamedTuple):
@@ -214,7 +227,7 @@ def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> F
 def draw_lines(
     canvas: Canvas, entity: str, time_ns: Times, lines: Floats, colours: NDArray[np.uint8]
 ) -> None:
-    """Lines (n, 2, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
+    """Lines (n, points, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
 
     They make way for the next look, and vanish where that comes later than usual.
     """
@@ -257,7 +270,8 @@ def plane_view(
     extent = extent_of(places)
     low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
     step_m = nice(extent / 10.0)
-    low, high = low - 0.07 * extent, high + 0.07 * extent
+    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent)
+    low, high = low - margin, high + margin
     _draw_grid(canvas, f"{root}/grid", low - extent, high + extent, step_m)
     trail = trail_of(canvas, trail_s)
     return rrb.Spatial2DView(

@@ -17,6 +17,7 @@ from recorders.log import schemas
 from replay.engine.blocks import gather
 from replay.judging.evaluation import Errors, Floats, chi_square_interval, innovations_of
 from replay.timeline.canvas import (
+    DRAWN_ROWS,
     MUTED,
     PALETTE,
     TRUTH,
@@ -27,7 +28,7 @@ from replay.timeline.canvas import (
     entity_path,
     escaped,
     nice,
-    thin,
+    thin_curve,
 )
 
 SIGMAS = 2.0
@@ -49,8 +50,8 @@ class Squares(NamedTuple):
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Errors, NEES and NIS of a case: no plots where there is nothing to judge."""
-    parts = (draw_errors, draw_nees, draw_nis)
+    """Errors, NEES, NIS and effective particles of a case: no plots where there is nothing to judge."""
+    parts = (draw_errors, draw_nees, draw_nis, draw_effective)
     return [view for part in parts for view in part(canvas, scene, case)]
 
 
@@ -77,7 +78,8 @@ def _draw_error(
     plot = entity_path("plots", case, f"error_{component}")
     extents = []
     for errors in found:
-        rows, column = thin(errors.time_ns), errors.components.index(component)
+        column = errors.components.index(component)
+        rows = thin_curve(errors.time_ns, errors.error[:, column])
         error = scale * errors.error[rows, column]
         bound = scale * SIGMAS * np.sqrt(np.maximum(errors.covariance[rows, column, column], 0.0))
         extents.append(np.quantile(np.maximum(np.abs(error), bound), 0.99))
@@ -169,6 +171,15 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
     return views
 
 
+def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """What share of each filter's particles is effective."""
+    plot, found = entity_path("plots", case, "effective"), False
+    for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
+        share, found = stream["effective"] / stream["particles"], True
+        draw_curve(canvas, plot, estimator, scene.colour(estimator), stream.publish_time_ns, share, LINE)
+    return [plot_view(plot, "Effective share of the particles", (-0.05, 1.05))] if found else []
+
+
 def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     """One plot per component of a case's Gaussian estimates: every estimator's mean, and the truth."""
     found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
@@ -186,10 +197,17 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSer
 
 
 def draw_curve(
-    canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, values: Floats, style: Style
+    canvas: Canvas,
+    plot: str,
+    name: str,
+    colour: Colour,
+    time_ns: Times,
+    values: Floats,
+    style: Style,
+    most: int = DRAWN_ROWS,
 ) -> None:
-    """One curve of a plot: values (n,) over time."""
-    rows = thin(time_ns)
+    """One curve of a plot: values (n,) over time, at most so many of them, peaks kept."""
+    rows = thin_curve(time_ns, values, most)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
     canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
 

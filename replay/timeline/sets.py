@@ -13,7 +13,7 @@ from recorders.log import schemas
 from replay.judging.evaluation import Floats
 from replay.judging.set_evaluation import areas_of, frames_of
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, beside, draw_cases, entity_path
-from replay.timeline.events import draw_events
+from replay.timeline.events import above_events, draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -49,11 +49,8 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
         draw_dots(canvas, f"{root}/truth", stream.publish_time_ns, places, Stroke(TRUTH, 2.0))
         shown.append(places)
     reach, plots = draw_sets(canvas, scene, robot, root)
-    board = rrb.Vertical(
-        plane_view(canvas, root, [f"{ROOT}/landmarks"], [], np.concatenate([*shown, reach])),
-        draw_events(canvas, scene, robot),
-        row_shares=[4, 1],
-    )
+    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], [], np.concatenate([*shown, reach]))
+    board = above_events(plane, draw_events(canvas, scene, robot), 4.0)
     return beside(board, plots, robot)
 
 

@@ -7,11 +7,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.log import Clock, RunMetadata, Stream, Topic, schemas
+from recorders.log import Clock, Field, RunMetadata, Stream, Topic, schemas
 from replay.engine.failures import join_streams
 from replay.engine.sources import Source, is_sensed
-from replay.judging.evaluation import PER_ROW, Errors, errors_at
-from replay.timeline.canvas import DRAWN_ROWS
+from replay.judging.evaluation import PER_ROW, Errors, Floats, errors_at
+from replay.timeline.canvas import DRAWN_ROWS, extremes
 
 Times = NDArray[np.int64]
 # So many messages of a topic are kept; what is drawn of them is less, see `canvas.DRAWN_ROWS`.
@@ -22,7 +22,6 @@ KEPT_ERRORS = 20_000
 WHOLE = frozenset(
     schema.full_name
     for schema in (
-        schemas.LANDMARK,
         schemas.IDENTITY,
         schemas.SCORE_VECTOR,
         schemas.TRACK_ESTIMATE,
@@ -33,6 +32,8 @@ WHOLE = frozenset(
         schemas.OUTAGE,
     )
 )
+# A vector of more entries is no bundle of curves.
+WIDE = 12
 BLOCK_MESSAGES = 1 << 17
 # A cell of 2^62 ns is all time.
 LAST_SHIFT = 62
@@ -40,21 +41,24 @@ Rows = TypeVar("Rows", Stream, Errors)
 
 
 class Thinned(Generic[Rows]):
-    """The rows of a stream as they come, at most `limit` after a while.
+    """The rows of a stream as they come, about `limit` after a while and at most twice as many.
 
-    Time is cut into cells of a power of two of nanoseconds; of each, the rows of the last stamp are
-    kept. So what is kept does not depend on the blocks that it came in.
+    Time is cut into cells of a power of two of nanoseconds. Of each, what is kept are the rows of the
+    last stamp, and of those where one of the curves has its least and its greatest value there, so that
+    peaks stay. Cells lie in wider cells, so the blocks that the rows came in do not matter for that.
     """
 
     def __init__(
         self,
         limit: int | None,
         time_ns: Callable[[Rows], Times],
+        curves: Callable[[Rows], list[Floats]],
         take: Callable[[Rows, NDArray[np.bool_]], Rows],
         join: Callable[[Sequence[Rows]], Rows],
     ) -> None:
         self._limit = limit
         self._time_ns: Callable[[Rows], Times] = time_ns
+        self._curves: Callable[[Rows], list[Floats]] = curves
         self._take: Callable[[Rows, NDArray[np.bool_]], Rows] = take
         self._join: Callable[[Sequence[Rows]], Rows] = join
         self._parts: list[Rows] = []
@@ -64,7 +68,7 @@ class Thinned(Generic[Rows]):
     def add(self, rows: Rows) -> None:
         """Take in the next rows, sorted by time."""
         if self._shift:
-            rows = self._take(rows, last_of_cells(self._time_ns(rows), self._shift))
+            rows = self._take(rows, self._stays(rows) | self._is_first(rows))
         count = len(self._time_ns(rows))
         if count == 0 and self._parts:
             return
@@ -84,27 +88,31 @@ class Thinned(Generic[Rows]):
 
     def _coarsen(self, most: int) -> None:
         """Widen the cells until so many rows are left at most."""
-        time_ns = np.concatenate([self._time_ns(part) for part in self._parts])
-        while len(time_ns) > most and self._shift < LAST_SHIFT:
-            self._shift += 1
-            time_ns = time_ns[last_of_cells(time_ns, self._shift)]
         self._thin()
+        while self._count > most and self._shift < LAST_SHIFT:
+            self._shift += 1
+            self._thin()
 
     def _thin(self) -> None:
-        """Join the parts: of a cell that two of them share, the later one tells."""
+        """Join the parts, some of which may share a cell."""
         rows = self._parts[0] if len(self._parts) == 1 else self._join(self._parts)
         if self._shift:
-            rows = self._take(rows, last_of_cells(self._time_ns(rows), self._shift))
+            rows = self._take(rows, self._stays(rows))
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
+    def _stays(self, rows: Rows) -> NDArray[np.bool_]:
+        """Which rows are kept of their cells; of the widest one, which is all time, the last stamp's."""
+        time_ns = self._time_ns(rows)
+        cell = time_ns >> self._shift
+        kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
+        if self._shift < LAST_SHIFT:
+            kept += [extremes(cell, values) for values in self._curves(rows)]
+        return np.isin(time_ns, time_ns[np.concatenate(kept)])
 
-def last_of_cells(time_ns: Times, shift: int) -> NDArray[np.bool_]:
-    """Which rows have the last stamp of their cell of 2^shift ns; sorted by time."""
-    if len(time_ns) == 0:
-        return np.empty(0, bool)
-    cell = time_ns >> shift
-    last = np.flatnonzero(np.append(cell[1:] != cell[:-1], True))
-    return time_ns == np.repeat(time_ns[last], np.diff(last, prepend=-1))
+    def _is_first(self, rows: Rows) -> NDArray[np.bool_]:
+        """Which rows have the first stamp: others of it may have come in the block before."""
+        time_ns = self._time_ns(rows)
+        return time_ns == time_ns[:1]
 
 
 def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
@@ -112,6 +120,7 @@ def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
     return Thinned(
         None if schema_name in WHOLE else limit,
         lambda stream: stream.publish_time_ns,
+        lambda stream: [values for _, of_field in curves_of(stream) for values in of_field],
         lambda stream, rows: stream.take(rows),
         join_streams,
     )
@@ -119,7 +128,22 @@ def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
 
 def thinned_errors(limit: int) -> Thinned[Errors]:
     """For the errors of one run."""
-    return Thinned(limit, lambda errors: errors.time_ns, errors_at, _joined_errors)
+    return Thinned(
+        limit,
+        lambda errors: errors.time_ns,
+        lambda errors: list(errors.error.T),
+        errors_at,
+        _joined_errors,
+    )
+
+
+def curves_of(stream: Stream) -> Iterator[tuple[Field, Floats]]:
+    """The fields of a stream that are curves over time, as (curves, n); no covariances, nothing wide."""
+    for entry in stream.schema:
+        if entry.kind in ("real", "vector") and not entry.name.startswith("covariance"):
+            values = stream[entry.name].reshape(len(stream), -1 if len(stream) else 0).T
+            if len(values) <= WIDE:
+                yield entry, values
 
 
 def _joined_errors(parts: Sequence[Errors]) -> Errors:
@@ -220,12 +244,17 @@ class Held:
 
 
 class Sensed:
-    """The sensor streams and truths of a run, read along with a replay of it."""
+    """The sensor streams and truths of a source, read along with a replay of it.
+
+    Maps, and what is said but once, such as where a sensor is mounted, hold for every span of the run.
+    """
 
     def __init__(self, source: Source, *, is_live: bool) -> None:
-        self.source = source.whole()
+        self.source = source
         self._is_live = is_live
-        self._topics = [topic for topic in source.topics if is_sensed(source, topic)]
+        sensed = [topic for topic in source.topics if is_sensed(source, topic)]
+        self._lasting = source.read([topic for topic in sensed if self._is_lasting(topic)])
+        self._topics = [topic for topic in sensed if topic not in self._lasting]
         self._kept, self._fresh = self._empty(KEPT_ROWS), self._empty(DRAWN_ROWS)
         self._blocks = self.source.blocks(self._topics, "publish_time", BLOCK_MESSAGES)
         self._read_to_ns = -1
@@ -238,14 +267,11 @@ class Sensed:
         return kept
 
     def read_to(self, time_ns: int) -> Held:
-        """What comes up to a stamp, and has not come yet, thinned to what is drawn; maps whole."""
+        """What comes up to a stamp, and has not come yet, thinned to what is drawn."""
         self.advance(time_ns)
-        streams = {
-            topic: (self._kept if self._is_map(topic) else self._fresh)[topic].rows
-            for topic in self._topics
-        }
+        streams = {topic: fresh.rows for topic, fresh in self._fresh.items()}
         self._fresh = self._empty(DRAWN_ROWS)
-        return Held(self.source, streams)
+        return Held(self.source, {**self._lasting, **streams})
 
     def advance(self, time_ns: int) -> None:
         """Read on up to a stamp."""
@@ -256,10 +282,12 @@ class Sensed:
                     self._fresh[topic].add(stream)
                 self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
 
-    def _is_map(self, topic: str) -> bool:
-        return self.source.topics[topic].schema_name == schemas.LANDMARK.full_name
+    def _is_lasting(self, topic: str) -> bool:
+        stated = self.source.topics[topic]
+        return stated.schema_name == schemas.LANDMARK.full_name or stated.messages == 1
 
     def all(self) -> Held:
-        """The whole run, thinned."""
+        """All of it, thinned."""
         self.advance(np.iinfo(np.int64).max)
-        return Held(self.source, {topic: kept.rows for topic, kept in self._kept.items()})
+        kept = {topic: kept.rows for topic, kept in self._kept.items()}
+        return Held(self.source, {**self._lasting, **kept})

@@ -30,6 +30,7 @@ from replay.timeline.canvas import (
     Times,
 )
 from replay.timeline.events import draw_events
+from replay.timeline.geodetic import degrees_of, draw_fixes, map_view
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -39,10 +40,18 @@ from replay.timeline.plane import (
     draw_ellipses,
     draw_lines,
     draw_path,
+    draw_scans,
     plane_view,
     turn_up,
 )
-from replay.timeline.plots import LINE, draw_curve, draw_modes, draw_nees, plot_view
+from replay.timeline.plots import (
+    LINE,
+    draw_curve,
+    draw_effective,
+    draw_modes,
+    draw_nees,
+    plot_view,
+)
 
 CLOSE = f"{ROOT}/close"
 SENSOR = f"{ROOT}/sensor"
@@ -51,7 +60,6 @@ SEEN: Colour = (190, 110, 60)
 LINK = (255, 255, 255, 255)
 # Close-ups stand so far apart, and what is farther away from its vehicle is not drawn there.
 CELL_M, SHOWN_M = 8.0, 3.8
-MAP_ZOOM = 15.0
 
 
 class Vehicles(NamedTuple):
@@ -86,23 +94,26 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     _draw_map(canvas, scene, vehicles, tracks)
     _draw_close(canvas, scene, vehicles, tracks)
     raw = _points(scene, "/infrastructure/detection")
-    _draw_points(canvas, f"{SENSOR}/raw", raw, SEEN, 3.0)
+    draw_scans(canvas, f"{SENSOR}/raw", *raw, SEEN, 3.0)
     paths = [f"{ROOT}/map/{name}/{n}" for name in ("truth", *tracks) for n in range(vehicles.number)]
     places = vehicles.places.reshape(-1, 2)
     cells = CELL_M * np.array([[-0.5, -0.5], [vehicles.number - 0.5, 0.5]])
-    whole = plane_view(canvas, f"{ROOT}/map", [], paths, places)
+    run_s = (canvas.end_ns - canvas.epoch_ns) * 1e-9
+    whole = plane_view(canvas, f"{ROOT}/map", [], paths, places, trail_s=run_s)
     sensor = plane_view(canvas, SENSOR, [], [], raw.places if len(raw.places) else places)
     close = plane_view(canvas, CLOSE, [], [], cells)
     sensor.name = "Raw detections, sensor's frame"
     close.name = f"Close-up about the true places, {CELL_M:g} m each"
     board = rrb.Vertical(
-        rrb.Tabs(whole, sensor, _geodetic_view(canvas, scene), draw_events(canvas, scene, "")),
+        rrb.Tabs(whole, sensor, *_geodetic_views(canvas, scene), *draw_events(canvas, scene, "")),
         close,
-        row_shares=[3, 2],
+        row_shares=[3, 1] if scene.outputs else [3, 2],
     )
+    if not scene.outputs:
+        return board
     quality = rrb.Tabs(
         *(view for case in scene.cases for view in _nees(canvas, scene, case)),
-        *(view for case in scene.cases for view in _modes(canvas, scene, case)),
+        *(view for case in scene.cases for view in _own(canvas, scene, case)),
     )
     plots = rrb.Vertical(*_draw_errors(canvas, scene, vehicles, tracks), quality)
     return rrb.Horizontal(board, plots, column_shares=[3, 2])
@@ -116,9 +127,9 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
     return views
 
 
-def _modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Mode probabilities of a case, named by it."""
-    views = draw_modes(canvas, scene, case)
+def _own(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """Mode probabilities and effective particles of a case, named by it."""
+    views = [*draw_modes(canvas, scene, case), *draw_effective(canvas, scene, case)]
     for view in views:
         view.name = f"{view.name}, {case}"
     return views
@@ -148,15 +159,6 @@ def _points(scene: Scene, topic: str) -> Points:
         return Points(np.empty(0, np.int64), np.empty((0, 2)))
     stream = scene.read(topic)
     return Points(stream.publish_time_ns, stream["position_m"].reshape(-1, 2))
-
-
-def _draw_points(canvas: Canvas, entity: str, points: Points, colour: Colour, radius_px: float) -> None:
-    """All points of a stamp together, until those of the next."""
-    times, sizes = np.unique(points.time_ns, return_counts=True)
-    columns = rr.Points2D.columns(positions=points.places)
-    canvas.send(entity, times, columns.partition(sizes))
-    radii = rr.Radius.ui_points(radius_px)
-    canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii))
 
 
 def _registered(scene: Scene) -> list[tuple[str, Points]]:
@@ -207,9 +209,9 @@ def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str
             stroke = Stroke(scene.colour(name))
             draw_path(canvas, f"{root}/{name}/{n}", vehicles.time_ns[known], places[known, n], stroke)
         draw_clouds(canvas, scene, f"vehicle{n + 1}", f"{root}/vehicle{n + 1}")
-    _draw_points(canvas, f"{root}/fixes", _points(scene, "/network/detection"), FIX, 4.0)
+    draw_scans(canvas, f"{root}/fixes", *_points(scene, "/network/detection"), FIX, 4.0)
     for name, points in _registered(scene):
-        _draw_points(canvas, f"{root}/{name}/detections", points, SEEN, 3.0)
+        draw_scans(canvas, f"{root}/{name}/detections", *points, SEEN, 3.0)
     times, lines, _ = _links(scene)
     draw_lines(canvas, f"{root}/links", times, lines, np.tile(LINK, (len(lines), 1)).astype(np.uint8))
 
@@ -241,9 +243,9 @@ def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[s
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])
 
     fixes = near(_points(scene, "/network/detection"))
-    _draw_points(canvas, f"{CLOSE}/fixes", fixes, FIX, 4.0)
+    draw_scans(canvas, f"{CLOSE}/fixes", *fixes, FIX, 4.0)
     for name, points in _registered(scene):
-        _draw_points(canvas, f"{CLOSE}/{name}/detections", near(points), SEEN, 3.0)
+        draw_scans(canvas, f"{CLOSE}/{name}/detections", *near(points), SEEN, 3.0)
     for name in tracks:
         for n in range(vehicles.number):
             stream = scene.outputs[f"/estimates/{name}/vehicle{n + 1}/state"]
@@ -288,17 +290,14 @@ def _draw_ellipse(
     )
 
 
-def _geodetic_view(canvas: Canvas, scene: Scene) -> rrb.MapView:
-    """The fixes by latitude and longitude; the map's tiles come from the network."""
-    for topic in scene.source.topics:
-        if topic.endswith("/geodetic_fix"):
-            fixes = scene.read(topic)
-            degrees = np.stack([fixes["latitude_deg"], fixes["longitude_deg"]], axis=1)
-            entity = f"geodetic/{topic.split('/')[1]}"
-            canvas.send(entity, fixes.publish_time_ns, rr.GeoPoints.columns(positions=degrees))
-            look = rr.GeoPoints.from_fields(colors=[WRONG], radii=rr.Radius.ui_points(4.0))
-            canvas.fix(entity, look)
-    return rrb.MapView(origin="geodetic", name="Geodetic map", zoom=MAP_ZOOM)
+def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
+    """The fixes by latitude and longitude, where there are some."""
+    topics = [topic for topic in scene.source.topics if topic.endswith("/geodetic_fix")]
+    fixes = [stream for topic in topics if len(stream := scene.read(topic))]
+    for stream in fixes:
+        draw_fixes(canvas, f"geodetic/{stream.topic.split('/')[1]}", stream, WRONG)
+    degrees = [degrees_of(stream) for stream in fixes]
+    return [map_view(canvas, "geodetic", np.concatenate(degrees))] if degrees else []
 
 
 def _draw_errors(

@@ -33,7 +33,10 @@ Row = tuple[str, str, str, str]
 COMPILES_S, LOADS_S = 15.0, 1.0  # what a first and a second use may take
 # scenario, its parameters, estimator
 USED: tuple[tuple[str, Mapping[str, Any], str], ...] = (
-    *(("landmarks", {"duration_s": 2.0}, method) for method in ("ekf", "iekf", "ukf")),
+    *(
+        ("landmarks", {"duration_s": 2.0}, method)
+        for method in ("ekf", "iekf", "ukf", "smoother:iterated")
+    ),
     ("batch-reactor", {}, "ekf"),
     ("batch-reactor", {}, "lrkf:ukf"),
     ("batch-reactor", {}, "analytic"),

@@ -21,6 +21,7 @@ from replay.engine.sources import MemorySource, memory_source
 # Of each importer: what to give it in the folder of real data, and the archive that this is in.
 DATA = {
     "ais": ("solent_ais.csv.xz", ""),
+    "autoferry": ("autoferry", "autoferry.tar.xz"),
     "broad": ("broad", ""),
     "mrclam": ("mrclam6", "mrclam6.tar.xz"),
     "score-matrices": ("bssr1", "bssr1_set1.tar.xz"),
@@ -36,8 +37,11 @@ class Recipe:
         scenario: recorded in place of the experiment's.
         parameters: over those of the scenario.
         estimators: settings by label, over the experiment's.
+        alone: whether these are all estimators.
         run: which run of the experiment's seed.
         span_s: so many seconds of the log.
+        part: of the imported data, the folder that is one log.
+        late: what is done about late messages, in the order of their arrival.
         over: entries over those of an experiment without logs; its metrics are the golden.
     """
 
@@ -45,8 +49,11 @@ class Recipe:
     scenario: str = ""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     estimators: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    alone: bool = False
     run: int = 0
     span_s: float = np.inf
+    part: str = ""
+    late: str = ""
     over: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -57,6 +64,8 @@ class Recipe:
     @property
     def settings(self) -> dict[str, dict[str, Any]]:
         """Every estimator's settings by label; those that the experiment keeps for few runs as well."""
+        if self.alone:
+            return {label: dict(values) for label, values in self.estimators.items()}
         experiment = self.loaded
         return merge(experiment.estimators | experiment.options.get("few", {}), self.estimators)
 
@@ -72,6 +81,17 @@ class Recipe:
 
 
 SHORT = {"duration_s": 40.0}
+AUGMENTED = {
+    "estimate": ["bias_range_m"],
+    "estimate_sigma": {"bias_range_m": 0.5},
+    "estimate_drift": {"bias_range_m": 0.02},
+}
+# by which messages overtake one another, some by more than a window of 0.4 s
+OVERTAKING = {
+    "duration_s": 20.0,
+    "odometry_latency_s": 0.03,
+    "range_bearing": {"latency_s": 0.2, "latency_jitter_s": 0.3},
+}
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
@@ -80,6 +100,8 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
+    # scans that come late, and vessels that go side by side
+    "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
     "extended-target-failing": Recipe("extended-target", run=117),
     # delays, outliers, outages; ranges and bearings alone; the gate that the estimators have by default
@@ -89,6 +111,19 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         {**SHORT, "range": {"rate_hz": 2.0}, "bearing": {"rate_hz": 2.0}},
         {label: {"gate_probability": 0.999} for label in ("ekf", "iekf", "ukf")},
     ),
+    # the ranges' bias as a part of the state
+    "landmarks-augmented": Recipe(
+        "landmarks",
+        parameters=SHORT,
+        estimators=dict.fromkeys(("ekf", "iekf", "ukf"), AUGMENTED),
+        alone=True,
+    ),
+    **{
+        f"landmarks-late-{late.partition(':')[0]}": Recipe(
+            "landmarks", parameters=OVERTAKING, estimators={"ekf": {}, "ukf": {}}, alone=True, late=late
+        )
+        for late in ("rewind:0.4", "wait:0.4")
+    },
     "landmarks-particles": Recipe(
         "landmarks",
         parameters={"duration_s": 10.0},
@@ -153,7 +188,8 @@ def first_log(recipe: Recipe, places: Mapping[str, Path]) -> MemorySource:
     experiment = recipe.loaded
     if experiment.import_:
         given = experiment.import_
-        recording, run = import_run(given.source, places[given.source], given.parameters)
+        place = places[given.source] / recipe.part
+        recording, run = import_run(given.source, place, given.parameters)
     else:
         assert experiment.record
         [own, *_] = experiment.options.get("scenarios", [experiment.record.scenario])

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.ensemble import hash_streams, replay_in_memory
 from pipeline.experiment import run_experiment
+from pipeline.starting import order_of
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from tests.goldens.recipes import Recipe, first_log
@@ -67,7 +68,8 @@ def make(recipe: Recipe, places: Mapping[str, Path]) -> Golden:
             result = run_experiment(recipe.experiment, recipe.loaded, Path(folder) / "out")
         return {"arithmetic": arithmetic(), "input": "", "streams": {}, "metrics": result.metrics}
     source = first_log(recipe, places)
-    replayed = replay_in_memory([source], recipe.settings)
+    order, late = order_of(arrival_order=bool(recipe.late), late=recipe.late or None)
+    replayed = replay_in_memory([source], recipe.settings, order=order, late=late)
     outputs = {topic: each.stream for topic, each in replayed.items() if _is_estimated(each.stream)}
     columns = [column for stream in outputs.values() for column in stream.columns.values()]
     width = sum(math.prod(column.shape[1:]) for column in columns)

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline.results import read_result
 from recorders.log import Stream, open_log, read_streams
 from replay.engine.failures import sentences_of
 
@@ -73,3 +75,45 @@ def test_every_door_gives_the_same_and_says_what_is_left_out(log: Path, fuselog:
         estimates = fl.open(Path(place, "estimates", "run-0000.mcap"))
         np.testing.assert_array_equal(estimates[POSE]["mean"], found[POSE]["mean"])
     np.testing.assert_array_equal(done.estimates[0][POSE]["mean"], found[POSE]["mean"])
+    done.save("saved")
+    for place in ("optional", "stated", "saved"):
+        stated = read_result(Path(place)).settings
+        assert (stated["arrival_order"], stated["late"]) == (True, "drop")
+
+
+def test_the_report_counts_what_became_of_late_messages(log: Path, fuselog: Fuselog) -> None:
+    """Dropped, inserted with what was repeated for them, waited for: as the streams have them."""
+    seen = [fl.open(log)[f"/robot1/{name}"] for name in ("odometry", "range_bearing", "bearing")]
+    stamp, arrived = (
+        np.concatenate([getattr(each, f"{clock}_time_ns") for each in seen])
+        for clock in ("publish", "log")
+    )
+    order = np.argsort(arrived, kind="stable")
+    newest = np.maximum.accumulate(np.append(0, stamp[order]))[:-1]
+    is_behind, delay_s = stamp[order] < newest, (arrived - stamp)[order] * 1e-9
+    late = ["--logs", "1", "--arrival-order", "--late"]
+    for way in ("drop", "wait:0.3", "rewind:3"):
+        assert fuselog("run", log, "-e", "ekf", *late, way, "--out", way[:4]).code == 0
+    tables = {
+        way: pd.read_parquet(Path(way[:4], "tables/late.parquet"))
+        for way in ("drop", "wait:0.3", "rewind:3")
+    }
+    counts = {
+        way: dict(zip(each["became"], each["messages"], strict=True)) for way, each in tables.items()
+    }
+    assert counts["drop"] == {"dropped": is_behind.sum()}
+    assert counts["wait:0.3"]["waited for"] == (is_behind & (delay_s <= 0.3)).sum()
+    assert 0 < counts["wait:0.3"]["dropped"] <= (is_behind & (delay_s > 0.3)).sum()
+    np.testing.assert_allclose(tables["drop"]["late_s"], delay_s[is_behind].mean())
+    back = fl.open(Path("rewi", "estimates", "run-0000.mcap"))[REWOUND]
+    assert counts["rewind:3"] == {"inserted": len(back)}
+    assert tables["rewind:3"]["repeated"].tolist() == [back["repeated"].sum()]
+    times = pd.read_parquet(Path("drop", "tables/late-times.parquet"))
+    assert times["messages"].sum() == is_behind.sum()
+    assert fuselog("report", "drop", "wait", "rewi", "-o", "page.html").code == 0
+    page = Path("page.html").read_text()
+    for said in (
+        f"{is_behind.sum()} dropped",
+        f"{len(back)} inserted, {back['repeated'].sum()} used again",
+    ):
+        assert said in page

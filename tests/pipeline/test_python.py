@@ -239,6 +239,7 @@ def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -
     assert "reckoned" in repr(done)
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     "method",
     ["smoother:ekf:lag=500ms", "smoother:iterated", "particles:50", "bound:smoother", "imm:ekf"],

@@ -32,6 +32,7 @@ from pipeline.report import write_report
 from pipeline.report.verdict import verdict
 from pipeline.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput
+from recorders.log import open_log, read_streams
 
 pytestmark = pytest.mark.paper
 
@@ -441,3 +442,36 @@ def test_in_a_browser_tables_sort_by_numbers(shown: Any) -> None:
         assert values == sorted(values, reverse=order < 0)
         assert len(set(values)) == 3
     assert table.locator("th[aria-sort=descending]").count() == 1
+
+
+def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figure(
+    tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """At six times from the first to the last, as many of equal weight as give the estimate's mean."""
+    experiment, folder = tmp_path / "cloud.toml", tmp_path / "result"
+    experiment.write_text(
+        'title = "cloud"\nstudy = "localization"\n[record]\nscenario = "landmarks"\n'
+        '[estimators."particles:50"]\ncloud = true\n'
+    )
+    run = ["run", experiment, "--set", "duration_s=2", "--logs", "1", "--out", folder]
+    assert fuselog(*run).code == 0
+    write_report([folder], tmp_path / "page.html")
+    charts = Page((tmp_path / "page.html").read_text(encoding="utf-8")).charts
+    [plan] = [each for each in charts if "first run from above" in each["title"]]
+    assert plan["title"].endswith("with particles at 6 times")
+    [cloud] = [each for each in plan["panels"][0]["series"] if each["style"] == "dots"]
+    estimates = open_log(folder / "estimates/run-0000.mcap")
+    stem = "/estimates/particles:50/robot1"
+    found = read_streams(estimates, [f"{stem}/{leaf}" for leaf in ("pose", "particle", "effective")])
+    pose, particle, effective = found.values()
+    rows = np.linspace(0, len(pose) - 1, 6).round().astype(int)
+    drawn = np.column_stack([cloud["x"], cloud["y"]]).reshape(6, -1, 2)
+    places = particle["mean"].reshape(len(pose), 50, 3)[rows, :, :2]
+    for points, of_stamp, row in zip(drawn, places, rows, strict=True):
+        apart = np.abs(points[:, None] - of_stamp).max(axis=2).min(axis=1)
+        assert apart.max() < 1e-6  # seven digits are in the page
+        spread = np.sqrt(pose["covariance"].reshape(-1, 3, 3)[row, 0, 0])
+        assert abs(points[:, 0].mean() - pose["mean"][row, 0]) < 0.2 * spread
+    [shares] = [each for each in charts if "that is effective" in each["title"]]
+    [curve] = shares["panels"][0]["series"]
+    np.testing.assert_allclose(curve["y"], effective["effective"] / 50, rtol=1e-6)

@@ -11,9 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.ensemble import Part, replay_parts
 from recorders.errors import BadInput
-from recorders.log import Stream, open_log, read_streams, write_log
+from recorders.log import RunMetadata, Stream, open_log, read_streams, write_log
 from recorders.recording import SIMULATION_EPOCH_NS, record_run
 from replay.engine.sources import LogSource
+from tests.replay.timeline.test_timeline import read
 
 Fuselog = Callable[..., Any]
 SECOND = 10**9
@@ -259,3 +260,32 @@ def test_the_library_refuses_an_old_prior_too(run_log: Path) -> None:
     with pytest.raises(BadInput, match="30 s older than its span"):
         replay_parts([part], {"ekf": {}}, gap_limit_s=0.2)
     assert not list(Path().iterdir())
+
+
+def test_a_view_shows_a_span_of_a_log_and_of_estimates(fuselog: Fuselog) -> None:
+    """Only what is in it, at its time in the run; the map holds for good."""
+    write_log(Path("run.mcap"), *_recorded())
+    assert fuselog("replay", "run.mcap", "-e", "dead-reckoning", "-o", "est.mcap").code == 0
+    for log in ("run.mcap", "est.mcap"):
+        said = fuselog("view", log, "--start", "1", "--end", "2", "--save", f"{log}.rrd")
+        assert said.code == 0, said.err
+        found = read(Path(f"{log}.rrd"))
+        moving = {entity: columns for entity, columns in found.items() if entity.endswith("/pose")}
+        assert set(moving) == {
+            f"/map/robot1/{name}/pose"
+            for name in (("truth", "dead-reckoning") if log == "est.mcap" else ("truth",))
+        }
+        for columns in moving.values():
+            times = np.array(columns["sim_time"])
+            assert SECOND <= times.min() < 1.1 * SECOND
+            assert 1.9 * SECOND < times.max() <= 2 * SECOND
+        assert "/map/landmarks" in read(Path(f"{log}.rrd"), static=True)
+    refused = fuselog("view", "run.mcap", "--start", "9", "--save", "none.rrd")
+    assert refused.code == 2
+    assert "nothing in this span; the log goes from 0 to 4 s" in refused.err
+    assert not Path("none.rrd").exists()
+
+
+def _recorded() -> tuple[list[Stream], RunMetadata]:
+    recording, run = record_run("landmarks", {"duration_s": 4.0}, 0)
+    return recording.streams, run

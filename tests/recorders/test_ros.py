@@ -555,6 +555,13 @@ stamp = "at"
     assert wheels["value"].tolist() == expected
     assert wheels.components == ["left_mps", "right_mps", "a", "b", "c"]
     assert wheels.publish_time_ns.tolist() == [START_NS - 1000, START_NS - 999, START_NS - 998]
+    mapping.write_text(text.replace("factors = { value = 2.0 }", 'units = { value = "km/h" }'))
+    assert "the unit 'km/h' does not fit: a is a mere number" in refusal(path, mapping=str(mapping))
+    in_units = 'units = { value = ["km/h", "cm/s", "", "", ""] }\nwhere = { "left.speed" = 3.5 }'
+    mapping.write_text(text.replace("factors = { value = 2.0 }", in_units))
+    wheels = imported(path, mapping=str(mapping))[0]["/wheels"]
+    expected = [[3.5 / 3.6, m.right.speed / 100, *m.raw] for _, _, m in sent]
+    np.testing.assert_allclose(wheels["value"], expected)
     for old, new, sentence in [
         (
             '"left.speed"',

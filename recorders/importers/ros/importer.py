@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PositiveFloat
 
 from recorders.errors import BadInput, choices
+from recorders.importers.mapping import checked, not_finite
 from recorders.importers.ros.bags import Bag, open_bag
 from recorders.importers.ros.layouts import Messages, MessageType, Undecodable, by_size, definitions_of
 from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
@@ -34,7 +35,6 @@ from recorders.importers.ros.messages import (
 from recorders.importers.ros.raw import Batch, Connection
 from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
 from recorders.log import Schema, Stream, make_stream, schemas
-from recorders.models.orientation import require_unit
 from recorders.parameters import Parameters
 from recorders.recording import Blocks, Importer
 
@@ -46,7 +46,6 @@ Distribution = Literal[
 # A block ends when it has so many messages, or bytes.
 _BLOCK_MESSAGES = 1 << 17
 _BLOCK_BYTES = 1 << 24
-_UNIT_TOLERANCE = 1e-3
 
 
 def _as_list(value: object) -> object:
@@ -412,11 +411,7 @@ class _Import:
         size = len(next(iter(part.columns.values())))
         keep = np.ones(size, bool)
         dropped = dict(part.dropped)
-        for entry in part.schema:
-            column = part.columns.get(entry.name)
-            if column is not None and column.dtype.kind == "f" and not entry.may_be_nan:
-                is_bad = ~np.isfinite(column).reshape(size, -1).all(axis=1)
-                dropped["NaN or infinite"] = dropped.get("NaN or infinite", False) | is_bad
+        dropped["NaN or infinite"] = not_finite(part.schema, part.columns)
         if stamp_ns is not None and self._parameters.clock == "header":
             own = stamp_ns if part.rows is None else stamp_ns[part.rows]
             dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0
@@ -450,7 +445,8 @@ class _Import:
         """Take up the rows (k,) of a part for a stream, with their stamps and places in the topic."""
         size = len(next(iter(part.columns.values())))
         which = slice(None) if len(rows) == size else rows
-        columns = {key: self._checked(topic, key, column[which]) for key, column in part.columns.items()}
+        where = f"{self.path}: topic {topic}"
+        columns = {key: checked(where, key, column[which]) for key, column in part.columns.items()}
         constants = {key: column[which] for key, column in part.constants.items()}
         widths = {key: column.shape[1] for key, column in columns.items() if column.ndim == 2}
         if name not in self._written:
@@ -471,20 +467,6 @@ class _Import:
         published = log_time_ns if self._parameters.clock == "bag" else sensed
         written.pieces.append(_Piece(places, published, log_time_ns, sensed, columns))
         self._came_of[topic][name] = None
-
-    def _checked(self, topic: str, field: str, column: NDArray) -> NDArray:
-        """A column's values, of which those that nothing can mean are refused."""
-        where = f"{self.path}: topic {topic}"
-        limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
-        if limit is not None and len(column) and np.abs(column).max() > limit:
-            worst = column[np.abs(column).argmax()]
-            raise BadInput(
-                f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}"
-            )
-        if field == "quaternion":
-            return require_unit(column, f"{where}: its quaternions", _UNIT_TOLERANCE)
-        is_infinite = np.isinf(column) if column.dtype.kind == "f" else np.zeros(0, bool)
-        return np.where(is_infinite, np.nan, column) if is_infinite.any() else column
 
     def _take_transforms(
         self, topic: str, messages: Messages, log_time_ns: NDArray[np.int64], *, is_static: bool

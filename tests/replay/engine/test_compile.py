@@ -20,6 +20,7 @@ import replay.engine.compile
 from recorders.errors import BadInput
 from recorders.importers.ros import ros1_file
 from recorders.log import loops
+from replay.engine.cache import in_turn
 from replay.engine.compile import _load, cache_folder, compile_over_runs, compiled
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
@@ -80,6 +81,59 @@ def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp
     assert imported(MODULE, tmp_path, cache)[0] == "1.0 4.0 7.0 cached"
     changed = MODULE.replace("value + 1.0", "value - 1.0")
     assert imported(changed, tmp_path, cache)[0] == "-1.0 2.0 5.0 compiled"
+
+
+# Both are ready before either compiles.
+TOGETHER = MODULE.replace(
+    "    loop(3, columns)", '    print("ready", flush=True)\n    input()\n    loop(3, columns)'
+)
+# Keeps the others waiting until it is killed.
+HOLDER = """
+    import sys
+    from pathlib import Path
+    from replay.engine.cache import in_turn
+
+    with in_turn(Path(sys.argv[1])):
+        print("held", flush=True)
+        input()
+"""
+
+
+def started(text: str, *arguments: str | Path) -> subprocess.Popen[str]:
+    """A process of its own with this program, with the environment of this one."""
+    command = [sys.executable, "-c", textwrap.dedent(text), *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def test_of_two_processes_that_want_a_kernel_one_compiles(
+    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The other waits, and loads what the first has kept; no lock is left behind."""
+    (tmp_path / "third_party.py").write_text(textwrap.dedent(TOGETHER))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
+    both = [started("import third_party") for _ in range(2)]
+    assert [process.stdout.readline() for process in both] == ["ready\n"] * 2
+    for process in both:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    said = sorted(process.communicate()[0] for process in both)
+    assert said == ["1.0 4.0 7.0 cached\n", "1.0 4.0 7.0 compiled\n"]
+    assert [path.suffix for path in kernels.iterdir()] == [".bin"]
+
+
+def test_nobody_waits_long_for_a_kernel_and_not_at_all_for_the_killed(
+    kernels: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = kernels / "kernel.bin"
+    holder = started(HOLDER, path)
+    assert holder.stdout.readline() == "held\n"
+    monkeypatch.setattr("replay.engine.cache._TURN_S", 0.1)
+    with in_turn(path) as waited:
+        assert waited
+    holder.kill()
+    holder.communicate()
+    with in_turn(path) as waited:
+        assert not waited
 
 
 # A function that numba compiles by what another module says of it, as jets are.

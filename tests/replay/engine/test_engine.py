@@ -22,11 +22,13 @@ from replay.engine.sources import Ensemble, LogSource, MemorySource, Source, mem
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 
 # Late messages (latency with jitter, so that they overtake one another), equal stamps of odometry and
-# sensors (20, 5 and 10 Hz), messages before the prior (a sensor that stamps early).
+# sensors (20, 5 and 10 Hz), messages before the prior (a sensor that stamps early). All kinds of sensors
+# as in the tests of localization, since another choice of them is another kernel.
 LATE = {
     "duration_s": 15.0,
     "odometry_latency_s": 0.03,
     "range_bearing": {"rate_hz": 5.0, "latency_s": 0.2, "latency_jitter_s": 0.3},
+    "range": {"rate_hz": 5.0},
     "bearing": {"rate_hz": 10.0, "latency_s": 0.05, "stamp_offset_s": -0.1},
 }
 # Runs of one ensemble whose schedules have nothing in common.

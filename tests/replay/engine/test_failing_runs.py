@@ -330,7 +330,7 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
         assert CASES[mode] in sentence
     bad = [replace(part, sources=[make_run(RAISE)], estimates=()) for part in parts]
     with pytest.raises(BadInput, match="estimator m raised ZeroDivisionError"):
-        ensemble.replay_parts(bad, {"m": {}}, gap_limit_s=0.2)
+        ensemble.replay_parts(bad, {"m": {}}, gap_limit_s=0.2).check()
 
 
 @pytest.mark.parametrize(

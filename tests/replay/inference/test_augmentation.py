@@ -95,6 +95,7 @@ def with_bias(source: MemorySource) -> MemorySource:
     return MemorySource({**source.streams, "/prior": longer}, source.run, source.name)
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("method", ["ekf", "ukf", "smoother"])
 def test_it_is_the_model_that_has_it_in_its_state(method: str) -> None:
     source = vehicle_a.source(vehicle_a.simulate(7)[0])
@@ -200,6 +201,7 @@ ON_A_LINE = Model(
 )
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_a_time_offset_is_a_parameter_too() -> None:
     """A model whose state says how it moves lets its sensor see the state of another time."""
     rng, delay_s, count = np.random.default_rng(3), 0.2, 400

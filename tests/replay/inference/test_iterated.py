@@ -18,7 +18,7 @@ from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import modelled_by
-from replay.inference.iterated import robust
+from replay.inference.gauss_newton import robust
 from replay.inference.model import Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
@@ -44,6 +44,7 @@ def solved(start: str) -> Any:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 def test_the_sheets_row() -> None:
     """Section 2: states, traces, the cost of the start and of the end, six iterations."""
     found = solved("smoother")
@@ -65,6 +66,7 @@ def test_the_sheets_row() -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("start", "cost", "iterations"), [("prior", 7086.12968525, 12), ("motion", 10730.8608525, None)]
 )

@@ -297,6 +297,7 @@ def delayed(source: MemorySource, seed: int, *topics: str) -> MemorySource:
     return MemorySource(streams, source.run, source.name)
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("model", "method", "values"),
     [
@@ -320,6 +321,7 @@ def test_angles_maps_gates_and_missing_components(
         assert_array_equal(back["innovation"][name], in_order["innovation"][name])
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("method", ["ekf", "smoother"])
 def test_waiting_with_an_interpolated_control_and_smoothers(method: str) -> None:
     """Long enough it is the replay in order; what waits for a control does so after its own wait."""

@@ -272,6 +272,7 @@ def test_what_the_reset_changes(variances: list[float], changes: list[float]) ->
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("name", "q", "bias", "variances", "likelihood"),
     [

@@ -84,6 +84,7 @@ TABLE: dict[tuple[str, float], Any] = {
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(("forward", "kappa"), TABLE)
 def test_smoothers_give_the_sheets_table(forward: str, kappa: float) -> None:
     """Section 2; nodes are the 160 stamps and the prior's."""
@@ -97,6 +98,7 @@ def test_smoothers_give_the_sheets_table(forward: str, kappa: float) -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("forward", "kappa", "mean", "trace"),
     [

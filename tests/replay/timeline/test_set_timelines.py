@@ -127,6 +127,9 @@ def test_particles_are_drawn_where_they_are_with_their_weights(tmp_path):
     np.testing.assert_allclose(places, cloud["mean"][:, :2], rtol=1e-5)
     radii = np.concatenate([np.array(list(row)) for row in found["Points2D:radii"]])
     np.testing.assert_allclose(radii**2, 1.5**2 * 50 * cloud["weight"], rtol=1e-4, atol=1e-9)
+    curve = read(tmp_path / "run.rrd")["/plots/robot1/effective/cloud"]["Scalars:scalars"]
+    effective = outputs["/estimates/cloud/robot1/effective"]["effective"]
+    np.testing.assert_allclose(np.ravel(curve), effective / 50, rtol=1e-12)
 
 
 def test_the_bound_is_a_band_about_no_error_and_has_no_nees(tmp_path):

@@ -11,11 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
+from numpy.typing import NDArray
 
 from pipeline.ensemble import Part, replay_parts
 from recorders.log import make_stream, open_log, schemas, write_log
 from recorders.recording import record_run
 from replay.engine.sources import LogSource
+from replay.timeline.canvas import thin_curve
 from replay.timeline.thinning import thinned_stream
 from replay.timeline.viewer import listen
 from tests.replay.timeline.test_timeline import read
@@ -40,6 +42,42 @@ def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[in
             assert np.sum(kept.publish_time_ns == stamp) == np.sum(times == stamp)
     if len(times) <= 40:
         assert_array_equal(whole.rows.publish_time_ns, times)
+
+
+@given(st.lists(st.integers(1, 20_000), max_size=4), st.integers(1, 19_999), st.integers(0, 5))
+def test_peaks_stay_in_any_blocks(cuts: list[int], peak: int, missing: int) -> None:
+    """The least and the greatest of each curve are kept, NaN beside them or not; nothing is made up."""
+    times = np.arange(20_000) * 10**6
+    value = np.stack([np.sin(times * 1e-9), np.zeros(len(times))], axis=1)
+    value[peak] += [7.0, -9.0]
+    value[peak - missing : peak] = np.nan
+    stream = make_stream("/x", schemas.SCORE_VECTOR, times, **_scores(value))
+    kept = thinned_stream("x", 100)
+    for rows in np.split(np.arange(len(times)), sorted(cuts)):
+        kept.add(stream.take(rows))
+    assert len(kept.rows) <= 200
+    found = kept.rows["scores"]
+    assert_array_equal(found, value[np.searchsorted(times, kept.rows.publish_time_ns)])
+    assert np.nanmax(found[:, 0]) == np.nanmax(value[:, 0])
+    assert np.nanmin(found[:, 1]) == -9.0
+
+
+def _scores(value: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Columns of a schema whose numbers may be missing."""
+    numbers = np.zeros(len(value), np.uint32)
+    return {"probe_id": numbers, "gallery_id": numbers, "scores": value}
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(10, 60))
+def test_a_curve_keeps_its_peaks(seed: int, rows: int) -> None:
+    rng = np.random.default_rng(seed)
+    times, values = np.sort(rng.integers(0, 10**6, 500)), rng.normal(size=500)
+    values[rng.integers(0, 500, 100)] = np.nan
+    kept = thin_curve(times, values, rows)
+    assert len(kept) <= rows
+    assert np.all(np.diff(kept) > 0)
+    assert np.nanmin(values[kept]) == np.nanmin(values)
+    assert np.nanmax(values[kept]) == np.nanmax(values)
 
 
 @pytest.mark.paper

@@ -24,7 +24,7 @@ from mcap.writer import Writer
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import make_stream, open_log, schemas
+from recorders.log import RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import bind
@@ -36,7 +36,7 @@ from replay.judging.judge import Judge
 from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
 from replay.timeline.landmarks import GATED
 from replay.timeline.plane import ellipses
-from replay.timeline.show import show
+from replay.timeline.show import Drawing, show
 from replay.timeline.sinks import open_recording
 from replay.timeline.viewer import Listener, listen, screenshot, view
 
@@ -192,6 +192,7 @@ def test_vehicles_have_their_particles_and_a_tab_for_their_modes(tmp_path: Path)
             curve = found[f"/plots/{case}/{topic}/imm/stand"]["Scalars:scalars"]
             assert np.array_equal(np.ravel(curve), probability[:, 2])
         tabs = {f"Modes of imm, {case}", f"Smoothed modes of imm, {case}"}
+        tabs.add(f"Effective share of the particles, {case}")
         assert tabs <= views(tmp_path / "run.rrd")
     assert 0 < left_out < 250
 
@@ -240,6 +241,9 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
             log_time_ns=[begin_ns + 2 * 10**9 + 250_000_000],
             repeated=[3],
         ),
+        make_stream(
+            "/estimates/ekf/robot1/waited", schemas.WAITED, [begin_ns + 3 * 10**9], behind_s=[0.125]
+        ),
     ]
     outputs = {each.topic: gather([each]) for each in told}
     show(ensemble.sources[0], outputs, [], save=tmp_path / "late.rrd")
@@ -247,6 +251,7 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
     assert dict(zip(events["utc"], events["TextLog:text"], strict=True)) == {
         begin_ns + 10**9: ["ekf: not used: too late"],
         begin_ns + 2 * 10**9: ["ekf: came 0.250 s late: went back and used 3 after it again"],
+        begin_ns + 3 * 10**9: ["ekf: came late, 0.125 s behind newer ones, which waited for it"],
     }
 
 
@@ -416,6 +421,96 @@ def test_a_log_that_no_family_draws_is_drawn_by_schema(tmp_path: Path) -> None:
     (event,) = found["/events/log"]["TextLog:text"]
     assert "/said is not drawn" in event[0]
     assert "/map/landmarks" in read(tmp_path / "bare.rrd", static=True)
+
+
+def drawn_bare(streams: list[Stream], path: Path) -> dict[str, Columns]:
+    """What is drawn of streams that no family knows."""
+    source = MemorySource({each.topic: each for each in streams}, RunMetadata("unheard-of"), "bare")
+    show(source, {}, [], save=path)
+    return read(path)
+
+
+def test_what_sensors_see_is_drawn_about_them_and_on_the_map(tmp_path: Path) -> None:
+    """Ranges are circles, bearings rays, detections points; landmarks are sighted from the robot."""
+    time_ns = np.arange(0, 10**9, 10**8)
+    truth = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
+    twice, ids = np.repeat(time_ns, 2), np.tile([1, 2], 10)
+    away_m, angle_rad = np.linspace(1.0, 3.0, 20), np.linspace(0.0, 6.0, 20)
+    seen = np.stack([away_m * np.cos(angle_rad), away_m * np.sin(angle_rad)], axis=1)
+    streams = [
+        make_stream(
+            "/landmarks", schemas.LANDMARK, [0, 0], landmark_id=[1, 2], position_m=[[5, 0], [0, 5]]
+        ),
+        make_stream("/truth", schemas.TRUTH_STATE, time_ns, metadata=truth, state=np.ones((10, 3))),
+        make_stream("/beacon", schemas.RANGE, twice, target_id=ids, range_m=away_m),
+        make_stream("/camera", schemas.BEARING, twice, target_id=ids, bearing_rad=angle_rad),
+        make_stream(
+            "/lidar", schemas.RANGE_BEARING, twice, target_id=ids, range_m=away_m, bearing_rad=angle_rad
+        ),
+        make_stream(
+            "/radar", schemas.DETECTION, twice, scan_id=np.repeat(range(10), 2), position_m=seen
+        ),
+    ]
+    found = drawn_bare(streams, tmp_path / "bare.rrd")
+    circles = np.array(found["/about/beacon/seen"]["LineStrips2D:strips"][:10])
+    np.testing.assert_allclose(np.linalg.norm(circles, axis=3)[..., 0].ravel(), away_m, rtol=1e-6)
+    rays = np.array(found["/about/lidar/seen"]["LineStrips2D:strips"][:10]).reshape(20, 2, 2)
+    np.testing.assert_allclose(rays[:, 1], seen, rtol=1e-5, atol=1e-6)
+    assert not rays[:, 0].any()
+    directions = np.array(found["/about/camera/seen"]["LineStrips2D:strips"][:10]).reshape(20, 2, 2)
+    np.testing.assert_allclose(directions[:, 1], seen / away_m[:, None], rtol=1e-5, atol=1e-6)
+    points = found["/about/radar/detections"]["Points2D:positions"]
+    np.testing.assert_allclose(np.array(points).reshape(20, 2), seen, rtol=1e-6)
+    sights = np.array(found["/map/sights"]["LineStrips2D:strips"][0])
+    assert sights.tolist() == [[[1, 1], [5, 0]], [[1, 1], [0, 5]]]
+    assert "Events" not in views(tmp_path / "bare.rrd")  # nothing happened
+
+
+def test_poses_orientations_and_geodetic_fixes_have_their_places(tmp_path: Path) -> None:
+    """Poses lie on the plane of their frame, what stands still is left out; rotations are angles."""
+    time_ns = np.arange(0, 10**10, 10**9)
+    yaw = np.linspace(0.0, 1.0, 10)
+    turned = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
+    places = np.stack([np.arange(10.0), -np.arange(10.0), np.ones(10)], axis=1)
+    unknown = np.full((10, 36), np.nan)
+    still = {"position_m": np.ones((10, 3)), "quaternion": turned, "covariance": unknown}
+    moving = {**still, "position_m": places}
+    degrees = {"latitude_deg": 49.0 + 1e-4 * yaw, "longitude_deg": np.full(10, 8.0)}
+    streams = [
+        make_stream("/odom", schemas.POSE, time_ns, metadata={"frame_id": "odom"}, **moving),
+        make_stream("/pose", schemas.POSE, time_ns, metadata={"frame_id": "world/a"}, **moving),
+        make_stream("/wheel", schemas.POSE, time_ns, metadata={"frame_id": "base"}, **still),
+        make_stream("/imu/orientation", schemas.ORIENTATION, time_ns, quaternion=turned),
+        make_stream("/gps", schemas.GEODETIC_FIX, time_ns, altitude_m=np.full(10, np.nan), **degrees),
+    ]
+    found = drawn_bare(streams, tmp_path / "bare.rrd")
+    for entity in ("/frames/odom/odom", "/frames/world/a/pose"):
+        arrows = found[f"{entity}/pose"]
+        np.testing.assert_allclose(np.array(arrows["Arrows2D:origins"])[:, 0], places[:, :2])
+        vectors = np.array(arrows["Arrows2D:vectors"])[:, 0]
+        np.testing.assert_allclose(np.arctan2(vectors[:, 1], vectors[:, 0]), yaw, atol=1e-6)
+    assert not any(entity.startswith("/frames/base") for entity in found)
+    for topic in ("odom", "wheel", "imu/orientation"):
+        angle = np.ravel(found[f"/plots/{topic}/quaternion/yaw"]["Scalars:scalars"])
+        np.testing.assert_allclose(angle, np.degrees(yaw))
+    triads = np.array(found["/space/imu/orientation"]["Transform3D:quaternion"])[:, 0]
+    np.testing.assert_allclose(triads, np.roll(turned, -1, axis=1), atol=1e-7)
+    fixes = np.array(found["/geodetic/gps"]["GeoPoints:positions"])[:, 0]
+    np.testing.assert_allclose(fixes, np.stack([*degrees.values()], axis=1))
+    assert {"Frame odom, grid 1 m", "OpenStreetMap", "Orientation"} <= views(tmp_path / "bare.rrd")
+
+
+@pytest.mark.parametrize("scenario", ["acoustic-shots", "optical-los"])
+def test_a_moment_in_which_sensors_are_silent_is_drawn(scenario: str, tmp_path: Path) -> None:
+    """What is said but once, as where a sensor stands, holds for every span."""
+    source = memory_source(*record_run(scenario, {}, 1))
+    first_ns, last_ns = source.extent("publish_time")
+    middle_ns = (first_ns + last_ns) // 2
+    moment = replace(source, start_ns=middle_ns, end_ns=middle_ns + 10**6)
+    with Drawing(moment, identity="moment", save=tmp_path / "moment.rrd"):
+        pass
+    times = [stamp for columns in read(tmp_path / "moment.rrd").values() for stamp in columns["utc"]]
+    assert all(stamp < middle_ns + 10**9 for stamp in times)
 
 
 def test_a_log_with_nothing_to_draw_says_so(tmp_path: Path) -> None:

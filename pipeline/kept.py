@@ -1,0 +1,160 @@
+"""What a campaign that is not finished has done so far, in a folder beside its result.
+
+    OUT.unfinished/
+        fuselog.lock    held by the process that works on the campaign
+        KEY.bin         what a cell left, checked; KEY is a hash of its description and of the code
+        KEY/            the files of that cell: logs and estimates of the first runs, the timeline
+
+The folder is there when the first cell is done, and goes when the result is in its place.
+"""
+
+import logging
+import os
+import pickle
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from pipeline.results import ERRORS, join_tables
+from recorders.errors import BadInput
+from replay.engine.cache import is_private, read_checked, write_checked
+
+_LOCK, _SUFFIX = "fuselog.lock", ".bin"
+_KEY = re.compile(r"[0-9a-f]{64}")
+_LOG = logging.getLogger("fuselog")
+
+
+class Kept:
+    """The folder, whose lock is held."""
+
+    def __init__(self, folder: Path, lock: FileLock) -> None:
+        self.folder = folder
+        self._lock = lock
+
+    def begin(self) -> None:
+        """Make the folder, if it is not there, and lock it.
+
+        Raises BadInput where another process holds it, or it holds what is not ours.
+        """
+        if self._lock.is_locked:
+            return
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock.acquire()
+        except Timeout:
+            raise BadInput(
+                f"{self.folder}: another fuselog is at work on this; wait, or give another --out"
+            ) from None
+        except OSError as error:
+            raise BadInput(f"{self.folder}: cannot be written ({error.strerror or error})") from error
+        foreign = [each.name for each in self.folder.iterdir() if not _is_ours(each)]
+        if foreign or not is_private(self.folder):
+            self._lock.release()
+            what = f"holds {foreign[0]}, which" if foreign else "can be written by others:"
+            raise BadInput(
+                f"{self.folder}: {what} is not fuselog's; move it away, or give another --out"
+            )
+
+    def place_of(self, key: str) -> Path:
+        """Where the files of a cell go."""
+        return self.folder / key
+
+    def has(self, key: str) -> bool:
+        """Whether a cell is done, with all its files."""
+        return self._content(key) is not None
+
+    def read(self, key: str) -> Any:
+        """What a cell left, which is done."""
+        content = self._content(key)
+        assert content is not None
+        return pickle.loads(
+            pickle.loads(content)[0]
+        )  # checked, in a folder that only this user can write
+
+    def write(self, key: str, left: bytes) -> None:
+        """Keep what a cell left, pickled, when its files are written."""
+        files = [path.relative_to(self.folder).as_posix() for path in self._files(key)]
+        write_checked(self.folder / f"{key}{_SUFFIX}", pickle.dumps((left, files)), "a cell")
+
+    def hand_over(self, keys: Sequence[str], folder: Path) -> None:
+        """Put the files of all cells, in their order, into a folder; tables of errors are joined."""
+        tables: dict[Path, list[Path]] = {}
+        for key in keys:
+            for path in self._files(key):
+                name = path.relative_to(self.place_of(key))
+                if name.is_relative_to(ERRORS):
+                    tables.setdefault(name, []).append(path)
+                    continue
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _copy(path, folder / name)
+        for name, parts in tables.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            join_tables(parts, folder / name)
+
+    def end(self, *, is_done: bool) -> None:
+        """Let go of the folder; it stays where there is something to go on with."""
+        if not self._lock.is_locked:
+            return
+        done = sum(1 for path in self.folder.iterdir() if path.suffix == _SUFFIX)
+        if done and not is_done:
+            self._lock.release()
+            _LOG.warning(
+                "%s: keeps %d finished cells; the same command goes on from there", self.folder, done
+            )
+            return
+        for path in self.folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.suffix == _SUFFIX:
+                path.unlink(missing_ok=True)
+        self._lock.release()
+        with suppress(OSError):
+            (self.folder / _LOCK).unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    def _content(self, key: str) -> bytes | None:
+        content = read_checked(self.folder / f"{key}{_SUFFIX}")
+        if content is None:
+            return None
+        _, files = pickle.loads(content)
+        return content if all((self.folder / name).is_file() for name in files) else None
+
+    def _files(self, key: str) -> list[Path]:
+        return sorted(path for path in self.place_of(key).rglob("*") if path.is_file())
+
+
+@contextmanager
+def kept_cells(place: Path) -> Iterator[Kept]:
+    """The kept cells of the campaign whose result goes to a place; they go when all went well."""
+    place = place if place.name not in ("", "..") else place.resolve()
+    folder = place.with_name(f"{place.name}.unfinished")
+    kept = Kept(folder, FileLock(folder / _LOCK, timeout=0))
+    try:
+        yield kept
+    except BaseException:
+        kept.end(is_done=False)
+        raise
+    kept.end(is_done=True)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a member of the folder is what this module puts there."""
+    if path.is_symlink():
+        return False
+    is_cell = _KEY.fullmatch(path.stem) is not None
+    if path.is_dir():
+        return is_cell and not path.suffix
+    return path.name == _LOCK or (is_cell and path.suffix == _SUFFIX)
+
+
+def _copy(path: Path, place: Path) -> None:
+    """The file in another place of the disk, without its bytes where the disk can do that."""
+    try:
+        os.link(path, place)
+    except OSError:
+        shutil.copyfile(path, place)

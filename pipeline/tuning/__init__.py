@@ -1,0 +1,1 @@
+"""Tuning: which parameters of an estimator explain logs best, and how well the logs tell them."""

@@ -1,0 +1,94 @@
+"""The command `fuselog tune`: it prints what a tuning found, and writes the result folder."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.commands import read_settings, settings_of_estimators
+from pipeline.outputs import check_folder
+from pipeline.terminal import print_json, print_metrics, print_table, say, status
+from pipeline.tuning.objective import Best, By
+from pipeline.tuning.outcome import SETTINGS
+from pipeline.tuning.tuning import tune
+from recorders.errors import BadInput
+from recorders.log import open_log
+from recorders.parameters import parse_settings
+from replay.engine.sources import LogSource
+
+
+def tune_logs(
+    logs: Sequence[Path],
+    *,
+    label: str,
+    free: Sequence[str],
+    by: By,
+    bounds: Sequence[str],
+    grid: int,
+    held_out: Sequence[Path],
+    folds: int,
+    out: Path,
+    model: str | None,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Tune, write the result folder, and print values, notes and metrics."""
+    check_folder(out, {"log": [*logs, *held_out]})
+    given = parse_settings(settings) | ({} if model is None else {"model": model})
+    chosen = settings_of_estimators([label], given, read_settings(settings_file, [label]))
+    with status() as show:
+
+        def tell(best: Best) -> None:
+            values = ", ".join(
+                f"{name} {value:.4g}" for name, value in zip(free, best.point, strict=True)
+            )
+            show(f"{best.evaluations} evaluations; best so far: {values}")
+
+        found = tune(
+            [LogSource(open_log(path, recover=recover)) for path in logs],
+            chosen,
+            free,
+            by=by,
+            bounds=dict(map(_bound, bounds)),
+            grid=grid,
+            validate=[LogSource(open_log(path, recover=recover)) for path in held_out],
+            folds=folds,
+            gap_limit_s=gap_limit_s,
+            on_best=tell,
+        )
+    saved = found.save(out)
+    parameters = found.parameters.replace({np.nan: None}).to_dict("records")
+    if as_json:
+        print_json(
+            {
+                "parameters": parameters,
+                "correlation": found.correlation.replace({np.nan: None}).to_dict(),
+                "notes": found.notes,
+                "metrics": saved.result.metrics,
+                "bounds": saved.result.bounds,
+                "written": [str(out)],
+            }
+        )
+        return
+    columns = ("parameter", "start", "value", "95 % from", "to")
+    print_table(columns, [list(row.values()) for row in parameters])
+    for sentence in found.notes:
+        say(sentence)
+    print_metrics(saved.result.metrics, saved.result.bounds)
+    say(f"{out / SETTINGS}: for --settings; {out}: tables, figures, timeline, result.json")
+
+
+def _bound(text: str) -> tuple[str, tuple[float, float]]:
+    """A parameter and its bounds, from NAME=LOW:HIGH."""
+    name, _, ends = text.rpartition("=")
+    low, _, high = ends.partition(":")
+    try:
+        found = float(low), float(high)
+    except ValueError:
+        found = (0.0, 0.0)
+    if not (name and found[0] < found[1]):
+        raise BadInput(f"--bound {text}: expected NAME=LOW:HIGH, as sigma_range_m=0.01:1")
+    return name, found

@@ -1,0 +1,134 @@
+"""How well logs tell parameters: intervals, correlations, profiles, and in words what they cannot tell.
+
+All by the curvature of minus the log-likelihood at its least: its inverse is the parameters' covariance.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pipeline.tuning.search import UNIT, Coordinates, Cost, Free
+
+Floats = NDArray[np.float64]
+LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
+LARGEST_CONDITION = 1e3
+INVOLVED = 0.3  # of a direction of length one
+QUANTILE = float(norm.ppf(0.975))
+PROFILE_POINTS = 9
+PROFILE_ERRORS = 3.0  # standard errors to either side
+MEANINGLESS = 100.0  # a factor that leaves nothing known
+WIDEST = 3.0  # in coordinates: times or divided by 20
+
+
+class Confidence(NamedTuple):
+    """What the curvature tells of m of k parameters, those that lie at no bound.
+
+    Attributes:
+        places: (m,) which of them.
+        curvature: (m, m) the second derivatives of the cost, by coordinates.
+        covariance: (m, m) its inverse; infinite variances of what the cost does not rise along.
+    """
+
+    places: Sequence[int]
+    curvature: Floats
+    covariance: Floats
+
+    @property
+    def errors(self) -> Floats:
+        """The standard errors (m,) of the coordinates."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def correlation(self) -> Floats:
+        """(m, m); NaN where a variance is infinite."""
+        with np.errstate(invalid="ignore"):
+            return self.covariance / np.outer(self.errors, self.errors)
+
+
+def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
+    """What a curvature (m, m) tells of the parameters at these places."""
+    values, vectors = np.linalg.eigh(curvature)
+    rises = values > 0.0
+    covariance = (vectors / np.where(rises, values, np.inf)) @ vectors.T
+    unknown = np.sum(vectors[:, ~rises] ** 2, axis=1) > INVOLVED**2
+    covariance[unknown, unknown] = np.inf
+    return Confidence(places, curvature, covariance)
+
+
+def interval(told: Confidence | None, coordinates: Coordinates, values: Floats) -> tuple[Floats, Floats]:
+    """The 95 % intervals (k,), (k,) of values (k,); NaN where nothing is told."""
+    errors = np.full(len(values), np.nan)
+    if told is not None:
+        errors[list(told.places)] = told.errors
+    point, reach = coordinates.of(values), QUANTILE * errors
+    return coordinates.unbounded(point - reach), coordinates.unbounded(point + reach)
+
+
+def doubts(told: Confidence, free: Sequence[Free]) -> Iterator[str]:
+    """A sentence for every direction of the parameters (k,) of which the logs tell little."""
+    own = [free[place] for place in told.places]
+    is_log = np.array([each.is_positive for each in own])
+    diagonal = np.diagonal(told.curvature)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(is_log | (diagonal <= 0.0), 1.0, UNIT / np.sqrt(diagonal))
+    values, vectors = np.linalg.eigh(told.curvature * np.outer(scale, scale))
+    weak = [index for index, value in enumerate(values) if value < LEAST_CURVATURE]
+    if not weak and values[-1] > LARGEST_CONDITION * values[0]:
+        weak = [0]
+    for index in weak:
+        yield _in_words(vectors[:, index], values[index], [each.name for each in own])
+
+
+def _in_words(direction: Floats, value: float, names: Sequence[str]) -> str:
+    """What it means that the cost has only this curvature along a direction (m,) of length one."""
+    order = np.argsort(-np.abs(direction))
+    first, *others = (place for place in order if abs(direction[place]) > INVOLVED)
+    if not others:
+        factor = np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0))
+        known = f"within a factor of {factor:.2g} (95 %)" if factor < MEANINGLESS else "not at all"
+        return f"{names[first]}: the logs tell it {known}"
+    turned = [
+        f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
+        for place in others
+    ]
+    return (
+        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly tell them apart; "
+        f"a larger {names[first]} with {' and '.join(turned)} explains them almost as well"
+    )
+
+
+class Profile(NamedTuple):
+    """The cost along one parameter, all others following at their best to second order.
+
+    Attributes:
+        name: of the parameter.
+        along: (n,) its values.
+        rise: (n,) how much more that costs than the least; infinity where it cannot be used.
+        parabola: (n,) the same by the curvature alone.
+    """
+
+    name: str
+    along: Floats
+    rise: Floats
+    parabola: Floats
+
+
+def profiles(cost: Cost, coordinates: Coordinates, point: Floats, told: Confidence) -> list[Profile]:
+    """The profiles of all parameters that have a standard error, about the point (k,) of least cost."""
+    found = []
+    for index, place in enumerate(told.places):
+        error, free = told.errors[index], coordinates.free[place]
+        if not np.isfinite(error):
+            continue
+        reach = min(PROFILE_ERRORS * error, WIDEST if free.is_positive else np.inf)
+        way = np.linspace(-reach, reach, PROFILE_POINTS)
+        points = np.tile(point, (PROFILE_POINTS, 1))
+        points[:, list(told.places)] += np.outer(way, told.covariance[:, index] / error**2)
+        values = coordinates.values(points)
+        costs = cost(values)
+        rise = costs - costs[PROFILE_POINTS // 2]
+        found.append(Profile(free.name, values[:, place], rise, 0.5 * (way / error) ** 2))
+    return found

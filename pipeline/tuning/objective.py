@@ -1,0 +1,250 @@
+"""What a tuning minimises: logs replayed with other parameters, and what their replays cost.
+
+Every log is replayed by itself; a point costs what the sums over all logs do, in their order. Logs and
+points are shared among threads, whose kernels run side by side.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import RunMetadata, Stream, schemas
+from recorders.parameters import merge, nested
+from replay.engine.blocks import Ragged
+from replay.engine.estimator import Bound, bind
+from replay.engine.failures import sentences_of
+from replay.engine.replaying import collect, replay
+from replay.engine.sources import Ensemble, MemorySource, Source
+from replay.judging.judge import Judge
+from replay.judging.metrics import Sums, plus
+from replay.judging.whiteness import whitened
+
+Floats = NDArray[np.float64]
+By = Literal["likelihood", "nis", "nees", "rmse"]
+INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
+
+
+class Run(NamedTuple):
+    """A log in memory as it is replayed again and again."""
+
+    ensemble: Ensemble[MemorySource]
+    name: str
+
+
+def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
+    """What estimators read of a log, and its truths, in memory."""
+    topics = {topic for each in bound for topic in (*each.whole, *each.streams)}
+    topics |= {
+        name
+        for name, topic in source.topics.items()
+        if topic.schema_name == schemas.TRUTH_STATE.full_name and not name.startswith("/estimates/")
+    }
+    if isinstance(source, MemorySource):
+        return Run(Ensemble([source]), source.name)
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    held = MemorySource(source.read(sorted(topics)), run, source.name)
+    return Run(Ensemble([held]), source.name)
+
+
+def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]]:
+    """The innovation streams of one log's outputs, by topic."""
+    for topic, rows in outputs.items():
+        if rows.stream.schema.full_name == INNOVATION and len(rows):
+            yield topic, rows.stream
+
+
+def _likelihood(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
+    told = [float(stream["log_likelihood"].sum()) for _, stream in innovations_in(outputs)]
+    return {"log_likelihood": sum(told)} if told else {}
+
+
+def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
+    """The squares of whitened innovations by measured component, and how many there are."""
+    found: Sums = {}
+    for topic, stream in innovations_in(outputs):
+        for name, column in zip(stream.components, whitened(stream).T, strict=True):
+            known = column[np.isfinite(column)]
+            found[f"{topic} {name}"] = np.array([np.sum(known**2), len(known)])
+    return found
+
+
+def _nees(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
+    """NEES by case, and how many components they are of."""
+    found: Sums = {}
+    for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
+        known = errors.nees[np.isfinite(errors.nees)]
+        found[errors.case] = np.array([np.sum(known), len(known) * len(errors.components)])
+    return found
+
+
+def _rmse(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
+    """Squared errors of the position, else of what is judged first, and how many there are."""
+    found: Sums = {}
+    for errors in Judge(run.ensemble, {}, gap_limit_s=gap_limit_s).add(outputs).errors:
+        squared = errors.error[:, errors.main.columns] ** 2
+        found = plus(found, {errors.main.rmse: np.array([np.sum(squared), len(squared)])})
+    return found
+
+
+def _cost_of_likelihood(sums: Sums) -> float:
+    return -float(sums["log_likelihood"])
+
+
+def _cost_of_ratios(sums: Sums) -> float:
+    """How far mean squares are from one, each by its own standard deviation, 1/2 sum n/2 log(s/n)^2."""
+    squares = np.array(list(sums.values()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(squares[:, 0] / squares[:, 1])
+    return float(np.sum(0.25 * squares[:, 1] * logs**2))
+
+
+def _cost_of_squares(sums: Sums) -> float:
+    """The logarithms of the RMSEs, of which there is one but for logs that have other truths."""
+    squares = np.array(list(sums.values()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(0.5 * np.sum(np.log(squares[:, 0] / squares[:, 1])))
+
+
+class Criterion(NamedTuple):
+    """What a tuning goes by.
+
+    Attributes:
+        sums: what is summed over logs, of one log's outputs.
+        cost: what the sums cost; nothing of a run that told nothing.
+        opens_gate: whether measurements must not be left out by a gate.
+        lacks: what a log lacks that has no such sums.
+    """
+
+    sums: Callable[[Run, Mapping[str, Ragged], float], Sums]
+    cost: Callable[[Sums], float]
+    opens_gate: bool
+    lacks: str
+
+
+CRITERIA: dict[By, Criterion] = {
+    "likelihood": Criterion(_likelihood, _cost_of_likelihood, True, "innovations with a likelihood"),
+    "nis": Criterion(_nis, _cost_of_ratios, True, "innovations"),
+    "nees": Criterion(_nees, _cost_of_ratios, False, "truth to judge its estimates by"),
+    "rmse": Criterion(_rmse, _cost_of_squares, False, "truth to judge its estimates by"),
+}
+
+
+class Best(NamedTuple):
+    """The best point (k,) of a search so far, what it costs, and how many points were tried."""
+
+    evaluations: int
+    point: Floats
+    cost: float
+
+
+@dataclass
+class Objective:
+    """The cost of parameter values over logs.
+
+    Attributes:
+        label, settings: the estimator, and its parameters but for those that are searched for.
+        names: of these.
+        runs: the logs.
+        by: what it goes by.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        executor: what logs and points are shared among.
+        on_best: is told of the best point after every batch.
+        best: of all points until now.
+    """
+
+    label: str
+    settings: Mapping[str, Any]
+    names: Sequence[str]
+    runs: Sequence[Run]
+    by: By
+    gap_limit_s: float
+    executor: Executor
+    on_best: Callable[[Best], None]
+    best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
+    _told: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, points: Floats) -> Floats:
+        """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements."""
+        tried = [(point, run) for point in points for run in self.runs]
+        sums = iter(list(self.executor.map(self._sums, *zip(*tried, strict=True))))
+        costs = np.array([self._cost([next(sums) for _ in self.runs]) for _ in points])
+        least = int(np.argmin(costs))
+        best = Best(self.best.evaluations + len(points), points[least], float(costs[least]))
+        if self.best.cost <= best.cost:
+            best = self.best._replace(evaluations=best.evaluations)
+        self.best = best
+        self.on_best(best)
+        return costs
+
+    def begin(self, start: Floats) -> None:
+        """Note what every log tells at the start (k,).
+
+        Raises BadInput where a run fails there, or the log lacks what is minimised.
+        """
+        for run in self.runs:
+            outputs = self.outputs(start, run)
+            failures = _failures(outputs)
+            if failures:
+                raise BadInput(
+                    f"{run.name}: {self.label} fails at the values that the search starts from "
+                    f"({failures[0]}); give others with --set"
+                )
+            cost = self._cost([self._measured(run, outputs)])
+            if not np.isfinite(cost):
+                raise BadInput(
+                    f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
+                    f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
+                )
+            self._told[run.name] = _count(outputs)
+
+    def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
+        """What the estimator makes of a log with these values (k,), by topic; BadInput as `replay`."""
+        chosen = with_values(self.settings, self.names, values)
+        return collect(replay(run.ensemble, bind(self.label, run.ensemble, chosen)))
+
+    def _sums(self, values: Floats, run: Run) -> Sums | None:
+        """What a log tells at these values; None where not all of it was used."""
+        try:
+            outputs = self.outputs(values, run)
+        except BadInput:  # as of a batch that does not converge
+            return None
+        if _failures(outputs) or _count(outputs) != self._told[run.name]:
+            return None
+        return self._measured(run, outputs)
+
+    def _measured(self, run: Run, outputs: Mapping[str, Ragged]) -> Sums:
+        return CRITERIA[self.by].sums(run, outputs, self.gap_limit_s)
+
+    def _cost(self, of_runs: Sequence[Sums | None]) -> float:
+        told = [each for each in of_runs if each is not None]
+        total: Sums = reduce(plus, told, {})
+        if len(told) < len(of_runs) or not total:
+            return np.inf
+        cost = CRITERIA[self.by].cost(total)
+        return cost if np.isfinite(cost) else np.inf
+
+
+def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:
+    """Settings with these values (k,) of parameters by their full names."""
+    pairs = zip(names, values.tolist(), strict=True)
+    return reduce(merge, (nested(name, value) for name, value in pairs), dict(settings))
+
+
+def _failures(outputs: Mapping[str, Ragged]) -> list[str]:
+    return [
+        sentence
+        for rows in outputs.values()
+        if rows.stream.schema.full_name == FAILURE
+        for sentence in sentences_of(rows.stream)
+    ]
+
+
+def _count(outputs: Mapping[str, Ragged]) -> int:
+    """How many messages the estimator gave."""
+    return sum(len(rows) for rows in outputs.values())

@@ -1,0 +1,307 @@
+"""What a tuning found: tables, figures, sentences, settings to replay with, a result folder."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import tomli_w
+from numpy.typing import NDArray
+
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.door import ResultFolder
+from pipeline.outputs import check_folder
+from pipeline.replays import Replay, replay
+from pipeline.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.studies.localization import summarise, summary_table
+from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, interval
+from pipeline.tuning.objective import By
+from pipeline.tuning.search import Coordinates
+from replay.engine.sources import LogSource, MemorySource
+from replay.judging.judge import joined
+from replay.judging.metrics import metric_key
+
+Floats = NDArray[np.float64]
+Source = LogSource | MemorySource
+START, TUNED = "start", "tuned"  # what the estimator is called with either values
+SETTINGS = "settings.toml"
+IMPROBABLE = 1e-3  # of white innovations: they are none
+
+
+class Found(NamedTuple):
+    """Where a search ended.
+
+    Attributes:
+        coordinates: what was searched for.
+        optimum: (k,) the values of that at which the cost is least.
+        told: how well the logs tell them; None where the search was no maximum likelihood, was
+            stopped, or ended at bounds alone.
+        profiles: the log-likelihood along each parameter.
+        has_converged, was_stopped: how it ended.
+    """
+
+    coordinates: Coordinates
+    optimum: Floats
+    told: Confidence | None = None
+    profiles: Sequence[Profile] = ()
+    has_converged: bool = True
+    was_stopped: bool = False
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tuning:
+    """What a tuning found.
+
+    Attributes:
+        label: the estimator's.
+        logs, held_out_logs: what the search went by, and other logs to judge it by.
+        by: what was best.
+        found: where the search ended.
+        settings: of the estimator with the values it started from, and with those that were found.
+        costs: (2,) of the logs with either values; minus the log-likelihood where that is what was best.
+        held_out_costs: (2,) the same of the logs held out, if any.
+        folds: a row per fold: the values by all other logs, and what its own logs cost with them.
+        whiteness: a row per measured component with either values: how many innovations, the mean square
+            of the normalised ones, their correlation with the next, Ljung and Box's Q, and how probable
+            a larger one is if they are white.
+        gate: the probability of the gate that was open in the search.
+        evaluations: how many values were tried.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+    """
+
+    label: str
+    logs: Sequence[Source]
+    held_out_logs: Sequence[Source]
+    by: By
+    found: Found
+    settings: Mapping[str, Mapping[str, Any]]
+    costs: Floats
+    held_out_costs: Floats | None
+    folds: pd.DataFrame
+    whiteness: pd.DataFrame
+    gate: float
+    evaluations: int
+    gap_limit_s: float
+
+    def __repr__(self) -> str:
+        title = f"{self.label} tuned by {self.by} over {_named(self.logs)}"
+        return "\n".join([title, self.parameters.to_string(index=False), *self.notes])
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """A row per parameter: its start, its value, its 95 % interval (NaN where there is none)."""
+        free = self.found.coordinates.free
+        low, high = interval(self.found.told, self.found.coordinates, self.found.optimum)
+        return pd.DataFrame(
+            {
+                "parameter": [each.name for each in free],
+                "start": [each.start for each in free],
+                "value": self.found.optimum,
+                "low": low,
+                "high": high,
+            }
+        )
+
+    @property
+    def correlation(self) -> pd.DataFrame:
+        """How the errors of what was searched for (logarithms, where positive) hang together."""
+        if self.found.told is None:
+            return pd.DataFrame()
+        names = [self.found.coordinates.free[place].name for place in self.found.told.places]
+        return pd.DataFrame(self.found.told.correlation, names, names)
+
+    @property
+    def profile(self) -> pd.DataFrame:
+        """Along each parameter its value, and the log-likelihood less its greatest."""
+        tables = [
+            {
+                "parameter": each.name,
+                "value": each.along,
+                "log_likelihood": -each.rise,
+                "by_curvature": -each.parabola,
+            }
+            for each in self.found.profiles
+        ]
+        return joined(map(pd.DataFrame, tables))
+
+    @cached_property
+    def replay(self) -> Replay:
+        """The logs replayed with either values: the estimators `start` and `tuned`."""
+        return replay(self.logs, self.settings, gap_limit_s=self.gap_limit_s)
+
+    @cached_property
+    def held_out(self) -> Replay | None:
+        """The logs held out, likewise; None where there are none."""
+        if not self.held_out_logs:
+            return None
+        named = {f"{label}-held-out": values for label, values in self.settings.items()}
+        return replay(self.held_out_logs, named, gap_limit_s=self.gap_limit_s)
+
+    @property
+    def replays(self) -> list[Replay]:
+        """Both."""
+        return [self.replay, *([self.held_out] if self.held_out else [])]
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row per metric of all logs with either values: estimator, quantity, case, value."""
+        return joined(each.metrics for each in self.replays)
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """A sentence for everything that one has to know of the values."""
+        return [
+            *self._notes_of_search(),
+            *self._notes_of_innovations(),
+            *self._notes_of_truth(),
+            *self._notes_of_others(),
+        ]
+
+    def _notes_of_search(self) -> Iterator[str]:
+        found, free = self.found, self.found.coordinates.free
+        if found.was_stopped:
+            yield (
+                f"stopped after {self.evaluations} evaluations: these are the best values so far, "
+                "and nothing is known of how well the logs tell them"
+            )
+        elif not found.has_converged:
+            yield "the search was ended before it converged; start from these values once more"
+        if self.gate < 1.0:
+            yield (
+                f"the gate (gate_probability = {self.gate:g}) was open in the search: what it keeps out "
+                "costs nothing, so that the best values would keep out as much as they can"
+            )
+        if self.by != "likelihood":
+            yield f"by {self.by} there are no intervals, and other values may do as well"
+        beyond = found.coordinates.at_bounds(found.coordinates.of(found.optimum))
+        for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
+            if is_beyond:
+                side = "lower" if value < each.start else "upper"
+                yield (
+                    f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
+                    "a wider one, or leave it out of what is searched for"
+                )
+        if found.told is not None:
+            yield from doubts(found.told, free)
+
+    def _notes_of_innovations(self) -> Iterator[str]:
+        rows = self.whiteness.to_dict("records")
+        for row in (each for each in rows if each["estimator"] == TUNED):
+            if row["probability"] < IMPROBABLE:
+                what = " ".join(filter(None, (row["case"], row["component"])))
+                negative = row["next_correlation"] < 0
+                yield (
+                    f"{what}: the tuned innovations are not white (Ljung-Box {row['ljung_box']:.4g}, by "
+                    f"chance {row['probability']:.1g}); each correlates with the next by "
+                    f"{row['next_correlation']:.2g}, as where the "
+                    f"{'measurement' if negative else 'process'} noise is too small, or of another kind"
+                )
+
+    def _notes_of_truth(self) -> Iterator[str]:
+        """What innovations do not see: errors that the state follows."""
+        metrics, bounds = self.replay.judge.metrics, self.replay.judge.bounds
+        for key, (_, high) in bounds.items():
+            estimator, quantity, case = split_metric(key)
+            nis = metrics.get(metric_key(estimator, "nis_per_component", case), math.nan)
+            if (estimator, quantity) == (TUNED, "nees") and metrics[key] > high and abs(nis - 1.0) < 0.1:
+                yield (
+                    f"{case or self.label}: NEES is {metrics[key]:.3g}, if consistent up to {high:.3g}, "
+                    f"while NIS is {nis:.3g} per component: innovations do not see errors that change "
+                    "slowly, a sensor's bias say; let these be estimated"
+                )
+
+    def _notes_of_others(self) -> Iterator[str]:
+        """Whether logs that were not searched by are explained better too."""
+        if self.held_out_costs is not None:
+            before, after = self.held_out_costs
+            what, sign = ("log-likelihood", -1.0) if self.by == "likelihood" else ("cost", 1.0)
+            yield (
+                f"logs held out: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
+                f"{'better' if after < before else 'no better'}"
+            )
+        if len(self.folds):
+            better = int((self.folds[f"cost_{TUNED}"] < self.folds[f"cost_{START}"]).sum())
+            yield f"{better} of {len(self.folds)} folds are explained better by what the others give"
+
+    @property
+    def toml(self) -> str:
+        """The tuned settings, as --settings takes them."""
+        values = {name: each for name, each in self.settings[TUNED].items() if _is_toml(each)}
+        if values.get("kind") == self.label:
+            del values["kind"]
+        return tomli_w.dumps({self.label: values})
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write settings.toml, tables, figures, metrics and a timeline as a result folder.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        check_folder(place, {"input": [path for each in self.replays for path in each.paths]})
+        outcome = Outcome(input_sha256=self.replay.input_sha256)
+        for each in self.replays:
+            found = summarise(each.judge)
+            outcome.metrics |= found.metrics
+            outcome.bounds |= found.bounds
+            if each is self.replay:
+                outcome.tables, outcome.figures = found.tables, found.figures
+        outcome.tables |= {
+            name: table
+            for name, table in {
+                "summary": summary_table(outcome.metrics),
+                "parameters": self.parameters,
+                "correlation": self.correlation.rename_axis("parameter").reset_index(),
+                "profile": self.profile,
+                "whiteness": self.whiteness,
+                "folds": self.folds,
+            }.items()
+            if len(table)
+        }
+        if self.found.profiles:
+            outcome.figures["profiles"] = self.profile_chart
+        settings = {
+            "title": f"{self.label} tuned by {self.by} over {_named(self.logs)}",
+            "logs": [log.name for log in self.logs],
+            "held_out": [log.name for log in self.held_out_logs],
+            "by": self.by,
+            "estimators": json.loads(json.dumps(self.settings, default=str)),
+            "notes": list(self.notes),
+            "gap_limit_s": self.gap_limit_s,
+        }
+        with result_folder(place) as part:
+            (part / SETTINGS).write_text(self.toml, encoding="utf-8")
+            self.replay.view(save=part / "timeline.rrd")
+            return ResultFolder(place, write_outcome(part, "tune", settings, outcome))
+
+    @property
+    def profile_chart(self) -> Chart:
+        """The log-likelihood along each parameter, and where 95 % of it ends."""
+        positive = {each.name: each.is_positive for each in self.found.coordinates.free}
+        panels = [
+            Panel(
+                x=Axis(label=each.name, log=positive[each.name]),
+                y=Axis(label="log-likelihood less its greatest"),
+                series=[
+                    level("95 %", each.along, -0.5 * QUANTILE**2),
+                    curve("by curvature", each.along, -each.parabola, "dashed", reference=True),
+                    curve("log-likelihood", each.along, -each.rise, "line+markers"),
+                ],
+            )
+            for each in self.found.profiles
+        ]
+        title = "along each parameter, all others following"
+        return Chart(title=title, panels=panels, columns=min(2, len(panels)))
+
+
+def _is_toml(value: Any) -> bool:
+    """Whether a setting can be written: an estimator of a program's own cannot, nor can None."""
+    return isinstance(value, bool | int | float | str | list | dict)
+
+
+def _named(logs: Sequence[Source]) -> str:
+    return logs[0].name if len(logs) == 1 else f"{len(logs)} logs"

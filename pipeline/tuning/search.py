@@ -1,0 +1,182 @@
+"""The search for the parameters of least cost.
+
+It goes over the logarithm of what is positive, a standard deviation say; anything else has a unit of its
+own. Gradient and curvature are central differences, whose points are handed over together.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+# Points (n, k) of k values -> what each costs (n,); infinity where it cannot be used.
+Cost = Callable[[Floats], Floats]
+
+STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
+ITERATIONS = 200
+LOOKS = 3  # at how far a parameter that is not positive reaches
+UNIT = 10.0  # standard errors that it has alone
+
+MOST_GRID_POINTS = 10_000
+
+
+class Free(NamedTuple):
+    """A parameter that is searched for: where from, and between what bounds.
+
+    Where it is positive, its logarithm is searched for.
+    """
+
+    name: str
+    start: float
+    low: float
+    high: float
+    is_positive: bool
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """What is searched over: of k parameters the logarithm, or the value in a unit of its own."""
+
+    free: Sequence[Free]
+    units: Floats
+
+    def of(self, values: Floats) -> Floats:
+        """The coordinates (..., k) of values."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self._is_log, np.log(values), values / self.units)
+
+    def values(self, coordinates: Floats) -> Floats:
+        """The values (..., k) at coordinates, never beyond the bounds by rounding."""
+        return np.clip(self.unbounded(coordinates), *self._ends)
+
+    def unbounded(self, coordinates: Floats) -> Floats:
+        """The values (..., k) at coordinates, which may lie beyond the bounds."""
+        with np.errstate(over="ignore"):
+            return np.where(self._is_log, np.exp(coordinates), coordinates * self.units)
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """The bounds (k,), (k,) in coordinates."""
+        low, high = map(self.of, self._ends)
+        return low, high
+
+    def at_bounds(self, point: Floats) -> NDArray[np.bool_]:
+        """Which coordinates (k,) of a point lie at a bound."""
+        low, high = self.bounds
+        return (point - low < CURVATURE_STEP) | (high - point < CURVATURE_STEP)
+
+    @property
+    def _is_log(self) -> NDArray[np.bool_]:
+        return np.array([each.is_positive for each in self.free])
+
+    @property
+    def _ends(self) -> tuple[Floats, Floats]:
+        return np.array([each.low for each in self.free]), np.array([each.high for each in self.free])
+
+
+def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
+    """The coordinates to search in.
+
+    Raises BadInput where the cost does not change with a parameter.
+    """
+    start = np.array([each.start for each in free])
+    units = np.ones(len(free))
+    for place, each in enumerate(free):
+
+        def near(steps: Sequence[float], place: int = place, each: Free = each) -> Floats:
+            """What it costs so far from the start along this parameter."""
+            points = np.tile(start, (len(steps), 1))
+            points[:, place] = np.clip(each.start + np.array(steps), each.low, each.high)
+            return cost(points)
+
+        if each.is_positive:
+            below, middle, above = near([-0.3 * each.start, 0.0, 0.3 * each.start])
+        else:
+            units[place], (below, middle, above) = _unit(near, each)
+        if below == middle == above:
+            raise BadInput(
+                f"{each.name}: nothing in the logs depends on it, so that they cannot tell its value; "
+                "leave it out of --free"
+            )
+    return Coordinates(free, units)
+
+
+def _unit(near: Callable[[Sequence[float]], Floats], each: Free) -> tuple[float, Floats]:
+    """UNIT standard errors of one parameter alone, by the curvature about the start; the last costs."""
+    step = 1e-3 * max(abs(each.start), 1.0)
+    for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
+        costs = near([-step, 0.0, step])
+        bend = (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
+        step = bend**-0.5 if 0.0 < bend < np.inf else step * (10.0 if bend <= 0.0 else 0.1)
+    return UNIT * step, costs
+
+
+def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
+    """The start (k,) in coordinates, or the point of a grid between the bounds that costs less.
+
+    Raises BadInput where the grid has no end, or too many points.
+    """
+    low, high = coordinates.bounds
+    for each, begin, end in zip(coordinates.free, low, high, strict=True):
+        if not np.isfinite(end - begin):
+            raise BadInput(
+                f"{each.name}: a grid goes from bound to bound; give them, --bound {each.name}=LOW:HIGH"
+            )
+    count = points ** len(low)
+    if count > MOST_GRID_POINTS:
+        raise BadInput(
+            f"--grid {points}: that is {count} points of {len(low)} parameters; give a coarser one, of "
+            f"{MOST_GRID_POINTS} at most"
+        )
+    axes = [np.linspace(begin, end, points) for begin, end in zip(low, high, strict=True)]
+    start = coordinates.of(np.array([each.start for each in coordinates.free]))
+    tried = np.array([start, *product(*axes)])
+    return tried[np.argmin(cost(coordinates.values(tried)))]
+
+
+def minimum(cost: Cost, coordinates: Coordinates, start: Floats) -> tuple[Floats, bool]:
+    """Where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
+
+    By L-BFGS-B, in coordinates.
+    """
+    low, high = coordinates.bounds
+    # what cannot be used is a wall that a line search turns back from
+    wall = 10.0 * abs(float(cost(coordinates.values(start[None]))[0])) + 1e6
+
+    def with_gradient(point: Floats) -> tuple[float, Floats]:
+        steps = STEP * np.eye(len(point))
+        points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
+        costs = np.minimum(cost(coordinates.values(points)), wall)
+        above, below = np.split(points[1:], 2)
+        ahead, behind = np.split(costs[1:], 2)
+        return float(costs[0]), (ahead - behind) / np.diagonal(above - below)
+
+    bounds = list(zip(low, high, strict=True))
+    options = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-5}
+    found = minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return found.x, bool(found.nit < ITERATIONS)
+
+
+def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
+    """The second derivatives (m, m) of the cost at a point (k,), by m of its coordinates."""
+    m, h = len(places), CURVATURE_STEP
+    along = h * np.eye(len(point))[list(places)]
+    pairs = list(combinations(range(m), 2))
+    corners = [
+        point + first * along[i] + second * along[j]
+        for i, j in pairs
+        for first, second in product((1, -1), repeat=2)
+    ]
+    costs = cost(coordinates.values(np.array([point, *(point + along), *(point - along), *corners])))
+    ahead, behind, crossed = np.split(costs[1:], [m, 2 * m])
+    found = np.diag((ahead - 2.0 * costs[0] + behind) / h**2)
+    for (i, j), (both, plus, minus, neither) in zip(pairs, crossed.reshape(-1, 4), strict=True):
+        found[i, j] = found[j, i] = (both - plus - minus + neither) / (4.0 * h**2)
+    return found

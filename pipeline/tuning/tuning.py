@@ -1,0 +1,268 @@
+"""The search for the parameters of an estimator that explain logs best.
+
+By maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012,
+chapter 7.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pipeline.replays import Kind, Log, settings_of, sources_of
+from pipeline.tuning.confidence import confidence, profiles
+from pipeline.tuning.objective import (
+    CRITERIA,
+    Best,
+    By,
+    Objective,
+    Run,
+    in_memory,
+    innovations_in,
+    with_values,
+)
+from pipeline.tuning.outcome import START, TUNED, Found, Source, Tuning
+from pipeline.tuning.search import (
+    Free,
+    coordinates_of,
+    curvature,
+    least_of_grid,
+    minimum,
+)
+from recorders.errors import BadInput, choices
+from recorders.parameters import bounds_of, merge
+from replay.engine.channels import stated
+from replay.engine.estimator import Bound, bind
+from replay.judging.evaluation import split_topic
+from replay.judging.whiteness import whitened, whiteness
+
+Floats = NDArray[np.float64]
+REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
+OPEN = {"gate_probability": 1.0}
+
+
+def silent(_: Best) -> None:
+    """Tell nobody of the search."""
+
+
+def tune(
+    logs: Log | Iterable[Log],
+    estimator: str | Mapping[str, Kind],
+    free: str | Sequence[str],
+    *,
+    by: By = "likelihood",
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    grid: int = 1,
+    validate: Log | Sequence[Log] = (),
+    folds: int = 0,
+    gap_limit_s: float = 0.2,
+    on_best: Callable[[Best], None] = silent,
+) -> Tuning:
+    """Search the parameters of an estimator that explain logs best.
+
+    Args:
+        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        estimator: a registered name, or a label of your own with what it stands for; see `replay`.
+        free: the parameters to search for, by their full names.
+        by: "likelihood" of the measurements, which needs no truth; "nis", mean squares of the normalised
+            innovations of one; "nees" of one; or the least "rmse".
+        set: other parameters, and where the search starts; by default what the log's channels state.
+        bounds: between what values a parameter lies; where both are positive, so is the parameter.
+        grid: the search starts from the best of so many values of each parameter between the bounds.
+        validate: logs that are held out, to judge the values by.
+        folds: cut the logs into so many parts, and judge what all others give by each.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        on_best: is told of the best values again and again.
+
+    Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
+    Raises BadInput where there is nothing to search, or no log can be replayed at the start.
+
+    >>> from pipeline.door import record
+    >>> log = record("landmarks", duration_s=20.0)
+    >>> found = tune(log, "ekf", "sigma_range_m", set={"sigma_range_m": 0.5})
+    >>> found.parameters["value"].round(1).tolist()
+    [0.1]
+    """
+    if by not in CRITERIA:
+        raise BadInput(f"--by {by}: {choices(by, CRITERIA)}")
+    sources, held_out = sources_of(logs), sources_of(validate) if validate else []
+    if folds and not 2 <= folds <= len(sources):
+        raise BadInput(f"--folds {folds}: {len(sources)} logs can be cut into 2 to {len(sources)} parts")
+    chosen = settings_of(estimator)
+    if len(chosen) > 1:
+        raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
+    [(label, own)] = chosen.items()
+    settings = {"kind": label, **merge(own, set or {})}
+    bound = bind(label, sources, settings)
+    searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
+    start = np.array([each.start for each in searched])
+    runs = [in_memory(source, bound) for source in sources]
+    others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
+    opened = merge(settings, OPEN) if CRITERIA[by].opens_gate and _gate(bound) < 1.0 else settings
+    with ThreadPoolExecutor(os.cpu_count()) as executor:
+
+        def objective(runs: Sequence[Run]) -> Objective:
+            names = [each.name for each in searched]
+            made = Objective(label, opened, names, runs, by, gap_limit_s, executor, on_best)
+            made.begin(start)
+            return made
+
+        whole, beyond = objective(runs), objective(others) if others else None
+        found = _search(whole, searched, grid)
+        compared = np.array([start, found.optimum])
+        parts = [
+            (runs[fold::folds], [run for run in runs if run not in runs[fold::folds]])
+            for fold in range(folds)
+        ]
+        rows = [
+            _row_of_fold(number, objective(left_out), objective(rest), searched, grid)
+            for number, (left_out, rest) in enumerate(parts)
+        ]
+        return Tuning(
+            label,
+            sources,
+            held_out,
+            by,
+            found,
+            {
+                name: with_values(settings, whole.names, values)
+                for name, values in zip((START, TUNED), compared, strict=True)
+            },
+            costs=whole(compared),
+            held_out_costs=beyond(compared) if beyond else None,
+            folds=pd.DataFrame(rows),
+            whiteness=_whiteness_table(whole, compared),
+            gate=_gate(bound) if opened is not settings else 1.0,
+            evaluations=whole.best.evaluations,
+            gap_limit_s=gap_limit_s,
+        )
+
+
+def _gate(bound: Sequence[Bound]) -> float:
+    """The probability that a measurement is let in by the gate, if there is one."""
+    return float(getattr(bound[0].parameters, "gate_probability", 1.0))
+
+
+def _searched(
+    names: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    by: By,
+    source: Source,
+    bound: Sequence[Bound],
+) -> list[Free]:
+    """What is searched for, by the parameters that an estimator was bound with.
+
+    Raises BadInput where a name is none, stands twice, or its start or bounds cannot be.
+    """
+    if not names:
+        raise BadInput("--free: name at least one parameter to search for")
+    for name in bounds:
+        if name not in names:
+            raise BadInput(f"--bound {name}: is not searched for; {choices(name, names)}")
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise BadInput(f"--free {name}: is named twice; once is enough")
+        if name in OPEN and CRITERIA[by].opens_gate:
+            raise BadInput(
+                f"--free {name}: more innovations are kept out than explained; tune it --by nees"
+            )
+    return [_free(name, bounds.get(name), source, bound[0]) for name in names]
+
+
+def _free(name: str, given: tuple[float, float] | None, source: Source, bound: Bound) -> Free:
+    parameters = bound.parameters
+    assert parameters is not None
+    try:
+        least, greatest = bounds_of(type(parameters), name)
+    except BadInput as error:
+        raise BadInput(f"--free {name}: {error}") from None
+    start: Any = parameters
+    for part in name.split("."):
+        start = start.get(part) if isinstance(start, Mapping) else getattr(start, part, None)
+    if start is None:
+        read = [source.topics[topic] for topic in (*bound.streams, *bound.whole)]
+        start = stated(read, name, type(parameters))
+    is_positive = least >= 0.0 or (given is not None and given[0] > 0.0)
+    if is_positive and start <= 0.0:
+        raise BadInput(
+            f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
+            f"above zero, --set {name}=..."
+        )
+    low, high = given or ((start / REACH, start * REACH) if is_positive else (least, greatest))
+    if not (low < start < high and (low > 0.0 if is_positive else low >= least)):
+        raise BadInput(
+            f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
+            f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
+        )
+    return Free(name, start, low, min(high, greatest), is_positive)
+
+
+def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
+    """The values of least cost, and how well they are told.
+
+    Raises BadInput where the cost does not change with one of them.
+    """
+    coordinates = coordinates_of(objective, free)
+    try:
+        point = coordinates.of(np.array([each.start for each in free]))
+        if grid > 1:
+            point = least_of_grid(objective, coordinates, grid)
+        point, has_converged = minimum(objective, coordinates, point)
+        found = Found(coordinates, coordinates.values(point), has_converged=has_converged)
+        inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
+        if objective.by != "likelihood" or not inner:
+            return found
+        told = confidence(inner, curvature(objective, coordinates, point, inner))
+        return found._replace(told=told, profiles=profiles(objective, coordinates, point, told))
+    except KeyboardInterrupt as stopped:
+        if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
+            raise
+        return Found(coordinates, objective.best.point, was_stopped=True)
+
+
+def _row_of_fold(
+    number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
+) -> dict[str, Any]:
+    """What all other logs give, and what the logs of a fold cost with that."""
+    found = _search(rest, free, grid)
+    start = np.array([each.start for each in free])
+    costs = left_out(np.array([start, found.optimum]))
+    return {
+        "fold": number,
+        "left_out": ", ".join(run.name for run in left_out.runs),
+        **dict(zip(rest.names, found.optimum.tolist(), strict=True)),
+        f"cost_{START}": costs[0],
+        f"cost_{TUNED}": costs[1],
+    }
+
+
+def _whiteness_table(objective: Objective, points: Floats) -> pd.DataFrame:
+    """A row per measured component at each of the points: those of start and tuned values."""
+    rows = []
+    for label, values in zip((START, TUNED), points, strict=True):
+        series: dict[tuple[str, str], list[Floats]] = {}
+        for run in objective.runs:
+            for topic, innovations in innovations_in(objective.outputs(values, run)):
+                columns = zip(innovations.components, whitened(innovations).T, strict=True)
+                for name, column in columns:
+                    series.setdefault((split_topic(topic)[1], name), []).append(column)
+        for (case, name), found in series.items():
+            told = whiteness(found)
+            rows.append(
+                {
+                    "estimator": label,
+                    "case": case,
+                    "component": name,
+                    "count": told.size,
+                    "mean_square": told.mean_square,
+                    "next_correlation": told.correlation[0],
+                    "ljung_box": told.ljung_box,
+                    "probability": told.probability,
+                }
+            )
+    return pd.DataFrame(rows)

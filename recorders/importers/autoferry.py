@@ -1,0 +1,289 @@
+"""Autoferry: lidar, radar and camera detections of vessels from a moving one, with their GPS as truth.
+
+Helgesen et al., "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a littoral
+environment", Ocean Engineering 252, 2022; data CC0 1.0. A scenario is a folder with a list of scans,
+NAME_detections.json, and one of the targets' positions, NAME_groundTruth.json.
+
+The log's plane has x east and y north. Detections are places relative to the ownship (/ownship/fix, a
+message for every scan), bearings anticlockwise from east; both are turned to the plane's axes, since the
+files do not state a heading. A scan reaches the log at the latest stamp so far: one that comes after a
+younger one is late by the difference. Every scan is there, empty ones too.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.states import state_metadata
+from recorders.parameters import Parameters
+from recorders.parsing import parse_json
+from recorders.recording import Importer, Recording
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+LIDAR, RADAR, INFRARED, ELECTRO_OPTICAL = 1, 2, 3, 4
+PLACES = {LIDAR: "lidar", RADAR: "radar"}
+CAMERAS = {INFRARED: "infrared", ELECTRO_OPTICAL: "electro_optical"}
+SENSORS = PLACES | CAMERAS
+PLANE = ("x_m", "y_m")
+
+
+class PlaceSensor(Parameters):
+    """What a sensor of places is taken to be like; its channels state it to trackers.
+
+    The error has `sigma_m` along the line of sight, and across it also `sigma_across_rad` of the range.
+    Detections are where a thing was `lag_s` ago. The probability of a detection holds up to
+    `near_range_m`, falls linearly to `far_detection_probability` at `far_range_m` and is that beyond.
+    Detections within `joined_within_m` of one another are of one thing.
+    """
+
+    sigma_m: PositiveFloat
+    sigma_across_rad: NonNegativeFloat = 0.0
+    lag_s: NonNegativeFloat = 0.0
+    detection_probability: Probability
+    near_range_m: NonNegativeFloat
+    far_range_m: NonNegativeFloat
+    far_detection_probability: Probability
+    clutter_per_m2: PositiveFloat
+    joined_within_m: NonNegativeFloat = 0.0
+    gate_probability: Probability = 0.9973
+
+
+class Camera(Parameters):
+    """What a camera's bearings are taken to be like; its channels state it to trackers.
+
+    The error's variance is `sigma_rad` squared and, for where a box lies on a hull, the square of
+    `sigma_across_m` over the range. Errors stay alike for seconds: a track takes one bearing every
+    `interval_s`.
+    """
+
+    sigma_rad: PositiveFloat = 0.04
+    sigma_across_m: NonNegativeFloat = 15.0
+    detection_probability: Probability
+    clutter_per_rad: PositiveFloat = 0.8
+    gate_probability: Probability = 0.99
+    interval_s: NonNegativeFloat = 1.0
+
+
+class AutoferryParameters(Parameters):
+    """What the files do not say: what the sensors are like, the same in all scenarios."""
+
+    lidar: PlaceSensor = PlaceSensor(
+        sigma_m=2.0,
+        detection_probability=0.7,
+        near_range_m=70.0,
+        far_range_m=130.0,
+        far_detection_probability=0.02,
+        clutter_per_m2=1e-4,
+        joined_within_m=12.0,
+    )
+    radar: PlaceSensor = PlaceSensor(
+        sigma_m=5.0,
+        sigma_across_rad=0.03,
+        lag_s=1.5,
+        detection_probability=0.85,
+        near_range_m=400.0,
+        far_range_m=400.0,
+        far_detection_probability=0.425,
+        clutter_per_m2=3e-5,
+    )
+    infrared: Camera = Camera(detection_probability=0.4)
+    electro_optical: Camera = Camera(detection_probability=0.6)
+
+
+class Scans(NamedTuple):
+    """The scans (n,) of a file in its order: sensor, stamp, arrival, ownship (n, 2), what was seen.
+
+    What was seen is (detections, 2) places east and north of the ownship, or (detections, 1) bearings.
+    """
+
+    sensor: Integers
+    time_ns: Integers
+    arrival_ns: Integers
+    ownship: Floats
+    seen: list[Floats]
+
+
+def read(folder: Path, parameters: AutoferryParameters) -> Recording:
+    """Read a scenario; the notes count its scans, and those that are empty or late.
+
+    Raises BadInput that names the file and the entry where one is missing or not as published.
+    """
+    scans = _scans(_file(folder, "detections"))
+    truths = _truths(_file(folder, "groundTruth"))
+    notes: dict[str, str] = {}
+    ownship = make_stream(
+        "/ownship/fix",
+        schemas.POSITION_FIX,
+        scans.time_ns,
+        log_time_ns=scans.arrival_ns,
+        metadata=state_metadata(PLANE),
+        position_m=scans.ownship,
+        covariance_m2=np.full((len(scans.time_ns), 4), np.nan),
+    )
+    streams = [ownship]
+    for sensor, name in SENSORS.items():
+        rows = np.flatnonzero(scans.sensor == sensor)
+        if len(rows):
+            sheet = {key: repr(value) for key, value in getattr(parameters, name)}
+            streams += _sensor_streams(f"/{name}", rows, scans, sheet)
+            _tell(notes, name, rows, scans)
+    for target, (time_ns, place) in truths.items():
+        truth = make_stream(
+            f"/target{target}/truth",
+            schemas.TRUTH_STATE,
+            time_ns,
+            metadata=state_metadata(PLANE),
+            state=place,
+        )
+        streams.append(truth)
+    return Recording(streams, int(scans.time_ns.min()), notes)
+
+
+def _file(folder: Path, kind: str) -> Path:
+    """The one file of a kind in a scenario's folder."""
+    found = sorted(folder.glob(f"*_{kind}.json")) if folder.is_dir() else []
+    if len(found) != 1:
+        raise BadInput(
+            f"{folder}: {len(found) or 'no'} files *_{kind}.json; give the folder of one Autoferry "
+            "scenario, such as scenario2"
+        )
+    return found[0]
+
+
+def _entries(path: Path) -> list[Any]:
+    try:
+        entries = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: cannot be read as JSON ({error})") from None
+    if not isinstance(entries, list) or not entries:
+        raise BadInput(f"{path}: holds no list of entries; give the file as published")
+    return entries
+
+
+def _scans(path: Path) -> Scans:
+    sensors, stamps, ownships, seen = [], [], [], []
+    for number, entry in enumerate(_entries(path)):
+        where = f"{path}: scan {number}"
+        sensor = _of(entry, "sensorID", where)
+        if type(sensor) is not int or sensor not in SENSORS:
+            raise BadInput(f"{where}: sensorID is {sensor}; known are {', '.join(map(str, SENSORS))}")
+        sensors.append(sensor)
+        stamps.append(_stamp_ns(entry, where))
+        ownships.append(_numbers(_of(entry, "ownshipPosition", where), where, "ownshipPosition", 2))
+        detections = _of(entry, "measurement", where)
+        seen.append((_places if sensor in PLACES else _bearings)(detections, where))
+    time_ns = np.array(stamps, np.int64)
+    ownship = np.array(ownships)[:, ::-1]
+    return Scans(np.array(sensors), time_ns, np.maximum.accumulate(time_ns), ownship, seen)
+
+
+def _places(measurement: Any, where: str) -> Floats:
+    """Places (n, 2) east and north: none is [], one is [N, E], more are [[N ...], [E ...]]."""
+    if measurement == []:
+        return np.empty((0, 2))
+    rows = measurement if isinstance(measurement, list) else [measurement]
+    if len(rows) != 2 or isinstance(rows[0], list) != isinstance(rows[1], list):
+        raise BadInput(f"{where}: measurement is not [], [N, E] or [[N ...], [E ...]]")
+    several = isinstance(rows[0], list)
+    north, east = (
+        _numbers(row if several else [row], where, "measurement", len(rows[0]) if several else 1)
+        for row in rows
+    )
+    return np.stack([east, north], axis=1)
+
+
+def _bearings(measurement: Any, where: str) -> Floats:
+    """Bearings (n, 1) anticlockwise from east; one is a bare number, clockwise from north."""
+    values = measurement if isinstance(measurement, list) else [measurement]
+    clockwise = _numbers(values, where, "measurement", len(values))
+    return np.pi - (clockwise[:, None] + np.pi / 2.0) % (2.0 * np.pi)
+
+
+def _truths(path: Path) -> dict[int, tuple[Integers, Floats]]:
+    """By target the distinct stamps (n,), ascending, and the places (n, 2) then."""
+    found: dict[int, dict[int, tuple[float, ...]]] = {}
+    for number, entry in enumerate(_entries(path)):
+        where = f"{path}: entry {number}"
+        for target in entry if isinstance(entry, list) else [entry]:
+            name = _of(target, "targetID", where)
+            if not isinstance(name, int) or not 0 <= name < 2**32:
+                raise BadInput(f"{where}: targetID is {name}; expected a whole number")
+            north, east, *_ = _numbers(_of(target, "position", where), where, "position", 3)
+            stamps = found.setdefault(name, {})
+            if stamps.setdefault(_stamp_ns(target, where), (east, north)) != (east, north):
+                raise BadInput(f"{where}: target {name} is at two places at one time; leave one out")
+    return {
+        target: (np.array(sorted(stamps), np.int64), np.array([stamps[each] for each in sorted(stamps)]))
+        for target, stamps in sorted(found.items())
+    }
+
+
+def _of(entry: Any, key: str, where: str) -> Any:
+    if not isinstance(entry, dict) or key not in entry:
+        raise BadInput(f"{where}: has no {key}; give the file as published")
+    return entry[key]
+
+
+def _stamp_ns(entry: Any, where: str) -> int:
+    """The time of an entry; whole seconds apart, since a double of 1e9 s has no nanoseconds to lose."""
+    [time_s] = _numbers([_of(entry, "time", where)], where, "time", 1)
+    if not 0.0 <= time_s < 9e9:
+        raise BadInput(f"{where}: time is {time_s:g}; expected seconds since 1970")
+    return int(time_s) * 10**9 + round((time_s - int(time_s)) * 1e9)
+
+
+def _numbers(values: Any, where: str, name: str, count: int) -> Floats:
+    are_numbers = isinstance(values, list) and all(type(each) in (int, float) for each in values)
+    if not are_numbers or len(values) != count:
+        raise BadInput(f"{where}: {name} is not {count} numbers as published")
+    return np.array(values, float)
+
+
+def _sensor_streams(
+    prefix: str, rows: Integers, scans: Scans, sheet: dict[str, str]
+) -> Iterator[Stream]:
+    """The scans of one sensor, and what it saw."""
+    counts = np.array([len(scans.seen[row]) for row in rows])
+    owner, seen = np.repeat(rows, counts), np.concatenate([scans.seen[row] for row in rows])
+    scan_id = np.repeat(np.arange(len(rows)), counts)
+    yield make_stream(
+        f"{prefix}/scan",
+        schemas.SCAN,
+        scans.time_ns[rows],
+        log_time_ns=scans.arrival_ns[rows],
+        metadata={**sheet, "origin": "/ownship/fix"},
+        scan_id=np.arange(len(rows)),
+        detections=counts,
+    )
+    make: Callable[..., Stream] = make_stream
+    clocks = {"publish_time_ns": scans.time_ns[owner], "log_time_ns": scans.arrival_ns[owner]}
+    if seen.shape[1] == 2:
+        yield make(f"{prefix}/detection", schemas.DETECTION, **clocks, scan_id=scan_id, position_m=seen)
+    else:
+        yield make(
+            f"{prefix}/bearing", schemas.SCAN_BEARING, **clocks, scan_id=scan_id, bearing_rad=seen[:, 0]
+        )
+
+
+def _tell(notes: dict[str, str], name: str, rows: Integers, scans: Scans) -> None:
+    empty = sum(len(scans.seen[row]) == 0 for row in rows)
+    late_s = (scans.arrival_ns - scans.time_ns)[rows] * 1e-9
+    late = late_s > 0.0
+    behind = f", {late.sum()} late by up to {late_s.max():.3f} s" if late.any() else ""
+    notes[f"{name} scans"] = f"{len(rows)}, {empty} of them empty{behind}"
+
+
+AUTOFERRY = Importer(
+    "Autoferry scenarios: lidar, radar and camera scans of vessels from a moving one; a folder of JSON",
+    AutoferryParameters,
+    read,
+)

@@ -1,0 +1,347 @@
+"""One language for mappings: how fields of fuselog's messages are made of what others log.
+
+The mappings of ROS messages (`importers.ros.mapping`) and of tables (`importers.tables`) say this alike;
+what a source is, a field of a message or a column, is theirs.
+
+becomes = "InertialSample"                        # one of fuselog's messages
+fields = { specific_force_mps2 = ["ax", "ay", "az"], turn_rate_radps = ["gx", "gy", "gz"] }
+units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }   # of the sources
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput, choices
+from recorders.importers.units import conversion
+from recorders.log import Schema, schemas
+from recorders.models.orientation import require_unit
+from recorders.parameters import Parameters
+
+Floats = NDArray[np.float64]
+Value = TypeVar("Value")
+# The name of a source, or a number that stands for every message.
+Source = str | float
+OneOrMore: TypeAlias = Value | list[Value]
+# Gives the numbers (n,) or (n, width) of a source.
+Read = Callable[[str], NDArray]
+# Whether each of n messages is where a source has one of some values.
+Holds = Callable[[str, Sequence[Source]], NDArray[np.bool_]]
+
+# How many numbers a vector has that may be missing.
+_WIDTHS = {"covariance_m2": 9, "covariance_m2ps2": 9, "covariance": 36, "covariance_ut2": 9}
+_WIDTHS |= {"magnetic_field_ut": 3}
+# How many numbers other vectors have; positions and velocities may be of the plane.
+_LENGTHS: dict[str, tuple[int, ...]] = {
+    "specific_force_mps2": (3,), "turn_rate_radps": (3,), "magnetic_field_ut": (3,),
+    "position_m": (2, 3), "velocity_mps": (2, 3), "quaternion": (4,),
+}  # fmt: skip
+# Vectors whose components the channel states.
+_STATED = ("value", "state", "mean")
+_UNIT_TOLERANCE = 1e-3
+# Fields in the axes of the body, by message, and the covariances of these.
+_IN_BODY = {
+    "InertialSample": (("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut"), ""),
+    "MagneticField": (("magnetic_field_ut",), "covariance_ut2"),
+    "Twist": (("velocity_mps", "turn_rate_radps"), "covariance"),
+}
+
+
+class Inflation(Parameters):
+    """Where a source has one of some values, standard deviations are multiplied `by` this."""
+
+    where: dict[str, OneOrMore[Source]] = Field(min_length=1)
+    by: PositiveFloat
+
+
+class StreamMapping(Parameters):
+    """What becomes one of fuselog's messages.
+
+    Attributes:
+        becomes: the name of the message.
+        fields: for each of its fields a source, or a list of them for a vector; numbers are constants.
+        factors, offsets: what sources are multiplied by, and what is added then.
+        units: what sources (with factors and offsets) are in; without one, in fuselog's unit.
+        deviations: for a covariance the standard deviations, as `fields`.
+        cross_deviations: the roots of its other entries with their signs: those of 1 and 2, 1 and 3,
+            2 and 3.
+        inflated: where standard deviations are larger than they say.
+        where: the values that sources must have for a row to be taken.
+        missing: numbers that stand for a value that is missing.
+        each: of every row one message for each of these, with further fields.
+        mounting_deg: roll, pitch, yaw that turn the sensor's axes into the body's (Rz Ry Rx); vectors
+            are turned, and orientations become the body's.
+        components, kinds: those of a vector that states them, with commas; kinds are linear else.
+    """
+
+    becomes: str
+    fields: dict[str, OneOrMore[Source]] = {}
+    factors: dict[str, OneOrMore[float]] = {}
+    offsets: dict[str, OneOrMore[float]] = {}
+    units: dict[str, OneOrMore[str]] = {}
+    deviations: dict[str, list[Source]] = {}
+    cross_deviations: dict[str, Annotated[list[Source], Field(min_length=3, max_length=3)]] = {}
+    inflated: list[Inflation] = []
+    where: dict[str, OneOrMore[Source]] = {}
+    missing: list[float] = []
+    each: list[dict[str, OneOrMore[Source]]] = []
+    mounting_deg: tuple[float, float, float] | None = None
+    components: str = ""
+    kinds: str = ""
+
+    def sources(self) -> Iterator[str]:
+        """The names of all sources of numbers; some may come again."""
+        for fields in (self.fields, *self.each):
+            for given in fields.values():
+                yield from (source for source in _listed(given) if isinstance(source, str))
+        for listed in (*self.deviations.values(), *self.cross_deviations.values()):
+            yield from (source for source in listed if isinstance(source, str))
+
+    def conditions(self) -> Iterator[tuple[str, list[Source]]]:
+        """The sources that are compared, and with what."""
+        for where in (self.where, *(each.where for each in self.inflated)):
+            for source, values in where.items():
+                yield source, _listed(values)
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the stream's channel states."""
+        if not self.components:
+            return {}
+        linear = ",".join("linear" for _ in self.components.split(","))
+        return {"components": self.components, "kinds": self.kinds or linear}
+
+
+def schema_of(mapping: StreamMapping, where: str) -> Schema:
+    """The message that a mapping gives; raises BadInput where fuselog lacks it or one of its fields."""
+    known = {schema.name: schema for schema in schemas.SCHEMAS.values()}
+    if mapping.becomes not in known:
+        raise BadInput(
+            f"{where}: fuselog has no message '{mapping.becomes}'; {choices(mapping.becomes, known)}"
+        )
+    schema = known[mapping.becomes]
+    entries = {entry.name: entry for entry in list(schema)[1:]}
+    given = {*mapping.fields, *mapping.deviations}.union(*mapping.each)
+    scaled = {*mapping.factors, *mapping.offsets, *mapping.units, *mapping.cross_deviations}
+    for field in sorted(given | scaled):
+        if field not in entries:
+            raise BadInput(f"{where}: {schema.name} has no field '{field}'; {choices(field, entries)}")
+    for entry in entries.values():
+        is_needed = not (entry.may_be_nan or entry.may_be_absent or entry.kind == "identifier")
+        if is_needed and entry.name not in given:
+            raise BadInput(f"{where}: gives no field for {schema.name}'s {entry.name}")
+    return schema
+
+
+class Mapped(NamedTuple):
+    """Messages (k,) that were made: their columns, of which row (n,) each is, and which are left out."""
+
+    columns: dict[str, NDArray]
+    rows: NDArray[np.int64]
+    dropped: dict[str, NDArray[np.bool_]]
+
+
+def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: str) -> Mapped:
+    """Make messages of `size` rows.
+
+    Raises BadInput that begins with `where` if units do not fit or a list has another length than it
+    must; what `read` and `holds` raise goes through.
+    """
+    schema = schema_of(mapping, where)
+    maker = _Maker(mapping, schema, size, read, where)
+    stretch = np.ones(size)
+    for inflation in mapping.inflated:
+        stretch[_all_hold(inflation.where, size, holds)] *= inflation.by
+    left_out = ~_all_hold(mapping.where, size, holds)
+    if not mapping.each:
+        columns, parts = maker.columns(mapping.fields, stretch), 1
+    else:
+        made = [maker.columns({**mapping.fields, **fields}, stretch) for fields in mapping.each]
+        parts = len(made)
+        columns = {
+            name: np.stack([each[name] for each in made], axis=1).reshape(
+                size * parts, *column.shape[1:]
+            )
+            for name, column in made[0].items()
+        }
+    if mapping.mounting_deg is not None:
+        _mount(columns, mapping, schema, where)
+    dropped = {"not chosen by its 'where'": np.repeat(left_out, parts)} if mapping.where else {}
+    return Mapped(columns, np.repeat(np.arange(size), parts), dropped)
+
+
+class _Maker(NamedTuple):
+    """What makes columns of the sources."""
+
+    mapping: StreamMapping
+    schema: Schema
+    size: int
+    read: Read
+    where: str
+
+    def columns(self, fields: Mapping[str, OneOrMore[Source]], stretch: Floats) -> dict[str, NDArray]:
+        """A column for every field of the message but the sensor's clock."""
+        made: dict[str, NDArray] = {}
+        for entry in list(self.schema)[1:]:
+            if entry.name in self.mapping.deviations:
+                made[entry.name] = self._covariance(entry.name, stretch)
+            elif entry.name in fields:
+                values = self._values(entry.name, fields[entry.name])
+                made[entry.name] = values if entry.kind == "vector" else values[:, 0]
+            elif entry.kind == "identifier":
+                made[entry.name] = np.zeros(self.size, np.uint32)
+            elif entry.kind == "real":
+                made[entry.name] = np.full(self.size, np.nan)
+            else:
+                made[entry.name] = np.full((self.size, _WIDTHS.get(entry.name, 0)), np.nan)
+        return made
+
+    def _values(self, name: str, given: OneOrMore[Source]) -> NDArray:
+        """A field's values (n, width), in fuselog's unit."""
+        values = self._numbers(_listed(given))
+        mapping, width = self.mapping, values.shape[1]
+        stated = len(mapping.components.split(","))
+        lengths = (stated,) if name in _STATED and mapping.components else _LENGTHS.get(name, (width,))
+        if width not in lengths:
+            wanted = " or ".join(map(str, lengths))
+            raise BadInput(f"{self.where}: field {name} is given {width} numbers; expected {wanted}")
+        if name not in {**mapping.factors, **mapping.offsets, **mapping.units}:
+            return values
+        factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
+        offsets = self._spread(mapping.offsets.get(name, 0.0), width, f"offsets of {name}")
+        return (values * factors + offsets) * self._conversions(name, width)
+
+    def _covariance(self, name: str, stretch: Floats) -> Floats:
+        """A covariance (n, width * width) of standard deviations."""
+        mapping = self.mapping
+        deviations = self._numbers(mapping.deviations[name])
+        width = deviations.shape[1]
+        size = (
+            stretch * self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")[:, None]
+        )
+        size = size.T * self._conversions(name, width)
+        covariance = np.zeros((self.size, width, width))
+        covariance[:, range(width), range(width)] = (deviations * size) ** 2
+        if name in mapping.cross_deviations:
+            if width != 3:
+                raise BadInput(
+                    f"{self.where}: cross_deviations of {name} are of 3 deviations, not {width}"
+                )
+            crossed = self._numbers(mapping.cross_deviations[name])
+            for column, (row, other) in enumerate(((0, 1), (0, 2), (1, 2))):
+                value = crossed[:, column] * np.abs(crossed[:, column]) * size[:, row] * size[:, other]
+                covariance[:, row, other] = covariance[:, other, row] = value
+        return covariance.reshape(self.size, -1)
+
+    def _numbers(self, sources: Sequence[Source]) -> NDArray:
+        """The numbers (n, width) of sources."""
+        parts = []
+        for source in sources:
+            if isinstance(source, str):
+                found = self.read(source)
+                if self.mapping.missing:
+                    found = np.where(np.isin(found, self.mapping.missing), np.nan, found)
+            else:
+                found = np.full(self.size, source)
+            parts.append(found if found.ndim == 2 else found[:, None])
+        return np.concatenate(parts, axis=1)
+
+    def _conversions(self, name: str, width: int) -> Floats:
+        """By what each entry of a field is multiplied."""
+        if name not in self.mapping.units:
+            return np.ones(width)
+        stated = name in (*_STATED, "covariance") and self.mapping.components
+        names = self.mapping.components.split(",") if stated else [name] * width
+        given = self._spread(self.mapping.units[name], width, f"units of {name}")
+        try:
+            return np.array([conversion(*pair) for pair in zip(given, names, strict=True)])
+        except BadInput as error:
+            raise BadInput(f"{self.where}: {error}") from None
+
+    def _spread(self, given: OneOrMore, width: int, what: str) -> NDArray:
+        """One for each entry of a vector."""
+        values = _listed(given)
+        if len(values) not in (1, width):
+            raise BadInput(f"{self.where}: {what} are {len(values)}; expected one, or {width}")
+        return np.array(values * (width // len(values)))
+
+
+def _all_hold(where: Mapping[str, OneOrMore[Source]], size: int, holds: Holds) -> NDArray[np.bool_]:
+    found = np.ones(size, bool)
+    for source, values in where.items():
+        found &= holds(source, _listed(values))
+    return found
+
+
+def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, where: str) -> None:
+    """Turn what is in the sensor's axes into the body's."""
+    turn = Rotation.from_euler("xyz", mapping.mounting_deg, degrees=True)
+    vectors, covariance = _IN_BODY.get(schema.name, ((), ""))
+    for name in vectors:
+        if columns[name].shape[1] == 3:
+            columns[name] = columns[name] @ turn.as_matrix().T
+    if covariance:
+        parts = columns[covariance].shape[1] and len(vectors)
+        whole = np.kron(np.eye(parts), turn.as_matrix())
+        square = columns[covariance].reshape(-1, 3 * parts, 3 * parts)
+        columns[covariance] = (whole @ square @ whole.T).reshape(len(square), -1)
+    kinds = mapping.kinds.split(",")
+    if "quaternion" in columns:
+        columns["quaternion"] = _turned_back(columns["quaternion"], turn)
+    elif "quaternion" in kinds:
+        which = [index for index, kind in enumerate(kinds) if kind == "quaternion"]
+        state = columns["state"] = columns["state"].astype(float)
+        state[:, which] = _turned_back(state[:, which], turn)
+    elif not vectors:
+        raise BadInput(f"{where}: {schema.name} has nothing in the body's axes; leave mounting_deg out")
+
+
+def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
+    """Orientations (n, 4) of the body where `quaternion` has the sensor's; NaN stays."""
+    known = np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
+    turned = quaternion.astype(float)
+    sensor = Rotation.from_quat(quaternion[known], scalar_first=True)
+    turned[known] = (sensor * turn.inv()).as_quat(scalar_first=True)
+    return turned
+
+
+def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:
+    """Which messages (n,) lack a number that they must have, or have none at all.
+
+    `columns` may be without some fields.
+    """
+    size = len(next(iter(columns.values())))
+    lacks, finite = np.zeros(size, bool), []
+    for entry in schema:
+        column = columns.get(entry.name)
+        if column is None or column.dtype.kind != "f":
+            continue
+        is_finite = np.isfinite(column).reshape(size, -1)
+        if is_finite.size and entry.kind != "identifier":
+            finite.append(is_finite.any(axis=1))
+        if not entry.may_be_nan:
+            lacks |= ~is_finite.all(axis=1)
+    return lacks | ~np.any(finite, axis=0) if finite else lacks
+
+
+def checked(where: str, field: str, column: NDArray) -> NDArray:
+    """A column's values; raises BadInput, which begins with `where`, for such as nothing can mean.
+
+    Where a value may be missing, infinite ones become NaN.
+    """
+    limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
+    if limit is not None and len(column) and np.abs(column).max() > limit:
+        worst = column[np.abs(column).argmax()]
+        raise BadInput(f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}")
+    if field == "quaternion":
+        return require_unit(column, f"{where}: its quaternions", _UNIT_TOLERANCE)
+    is_infinite = np.isinf(column) if column.dtype.kind == "f" else np.zeros(0, bool)
+    return np.where(is_infinite, np.nan, column) if is_infinite.any() else column
+
+
+def _listed(given: OneOrMore[Value]) -> list[Value]:
+    return given if isinstance(given, list) else [given]

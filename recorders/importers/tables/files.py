@@ -1,0 +1,362 @@
+"""Files that hold tables, opened one like another: the names of their columns, and batches of rows.
+
+CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), and the trajectories of
+benchmarks. A batch has an Arrow array for each column that is asked for; memory holds one at a time.
+"""
+
+import bz2
+import gzip
+import io
+import lzma
+import re
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+import pyarrow.json
+import pyarrow.parquet
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput, choices
+from recorders.trajectories import read_trajectory
+
+Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory"]
+Batch = dict[str, pa.Array]
+# Gives the batches with these columns, and which of them are wanted as text.
+Read = Callable[[Mapping[str, bool]], Iterator[Batch]]
+
+_SUFFIXES: dict[str, Format] = {
+    ".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".npz": "npz", ".pos": "rtklib",
+}  # fmt: skip
+_OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
+_BLOCK_BYTES = 1 << 23
+_BLOCK_ROWS = 1 << 17
+_COMMENTS = (b"%", b"#")
+_DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
+
+
+@dataclass
+class Table:
+    """A file's table: its columns, what gives its rows, what was left out of them, and was mended."""
+
+    path: Path
+    columns: list[str]
+    _read: Read
+    left_out: Counter[str] = field(default_factory=Counter)
+    mended: str = ""
+
+    def column(self, name: str) -> str:
+        """A column by its name, or by its number from 1 on; raises BadInput where there is none."""
+        if name in self.columns:
+            return name
+        if name.isdecimal() and 0 < int(name) <= len(self.columns):
+            return self.columns[int(name) - 1]
+        raise BadInput(f"{self.path}: has no column '{name}'; {choices(name, self.columns)}")
+
+    def batches(self, numbers: Collection[str], texts: Collection[str] = ()) -> Iterator[Batch]:
+        """The rows with these columns, block by block.
+
+        Empty cells are null. Raises BadInput where the file is damaged, or a cell of `numbers` is none.
+        """
+        try:
+            yield from self._read(dict.fromkeys(numbers, False) | dict.fromkeys(texts, True))
+        except BadInput:
+            raise
+        except _DAMAGED as error:
+            raise BadInput(f"{self.path}: {_said(error, self)}") from None
+
+
+def open_table(
+    path: Path,
+    format: Format | None = None,  # noqa: A002
+    *,
+    names: Sequence[str] = (),
+    has_header: bool | None = None,
+    delimiter: str | None = None,
+    decimal: str = ".",
+) -> Table:
+    """Open a file that holds a table.
+
+    Args:
+        path: the file; .gz, .bz2 and .xz are decompressed.
+        format: what it holds; by default its suffix tells, and CSV is what has no other.
+        names: of the columns, where the file does not name them.
+        has_header: whether the first line names the columns; by default its cells tell.
+        delimiter: between cells; " " is for any white space. By default the first line tells.
+        decimal: the mark before fractions.
+
+    Raises BadInput where the file cannot be read, or holds no rows.
+    """
+    suffix = path.suffixes[-2:][0] if path.suffix in _OPENERS and len(path.suffixes) > 1 else path.suffix
+    format = format or _SUFFIXES.get(suffix.lower(), "csv")  # noqa: A001
+    try:
+        if format == "csv":
+            found = _open_text(path, names, has_header, delimiter, decimal)
+        elif format == "rtklib":
+            found = _open_rtklib(path)
+        else:
+            found = {"parquet": _open_parquet, "json": _open_json, "npz": _open_npz}.get(
+                format, _open_trajectory
+            )(path)
+    except _DAMAGED as error:
+        raise BadInput(f"{path}: cannot be read as {format} ({_first_line(error)})") from None
+    return found
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _said(error: Exception, table: Table) -> str:
+    """What Arrow says of a cell, with the column's name and the mend."""
+    found = re.search(r"In CSV column #(\d+):.*invalid value '(.*)'", str(error))
+    if not found:
+        return f"is damaged ({_first_line(error)})"
+    name = table.columns[int(found[1])]
+    return f"column {name} holds '{found[2]}'; expected numbers: mend the cell, or empty it"
+
+
+def _open(path: Path) -> BinaryIO:
+    opener = _OPENERS.get(path.suffix)
+    return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
+
+
+# Text.
+
+
+def _open_text(
+    path: Path, names: Sequence[str], has_header: bool | None, delimiter: str | None, decimal: str
+) -> Table:
+    comments: list[str] = []
+    skipped = 0
+    with _open(path) as file:
+        for line in file:
+            text = line.decode("utf-8-sig" if skipped == 0 else "utf-8").strip("\r\n")
+            if text.strip() and not line.startswith(_COMMENTS):
+                break
+            if text.strip():
+                comments.append(text.lstrip("#% "))
+            skipped += 1
+        else:
+            raise BadInput(f"{path}: holds no rows; give a table with some")
+        following = file.readline().decode("utf-8")
+    # the first line may be cut, as that of a logger whose file began in the middle of one
+    whole = following.strip() or text
+    delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in whole), " ")
+    cells = _cells(text, delimiter)
+    width = max(len(cells), len(_cells(following, delimiter)))
+    if has_header or (has_header is None and not any(map(_is_value, cells))):
+        named, skipped = cells, skipped + 1
+        if not following.strip():
+            raise BadInput(f"{path}: has a header line but no rows; give a table with some")
+    else:
+        named = _cells(comments[-1], delimiter) if comments else []
+        named = named if len(named) == width else []
+    columns, left_out = _unique(names or named, width, path), Counter[str]()
+
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        with _open(path) as file:
+            for _ in range(skipped):
+                file.readline()
+            yield from _text_batches(file, columns, wanted, delimiter, decimal, left_out)
+
+    return Table(path, columns, read, left_out)
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    cells = line.split() if delimiter == " " else line.split(delimiter)
+    return [cell.strip().strip('"') for cell in cells]
+
+
+def _is_value(cell: str) -> bool:
+    """Whether a cell is a number or a time, as no name of a column is."""
+    return bool(re.match(r"[-+]?\.?\d", cell))
+
+
+def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
+    """Names of columns; such as are empty, come again or are lacking are numbers from 1 on."""
+    if len(names) > width:
+        raise BadInput(f"{path}: {len(names)} columns are named, and its rows have {width}")
+    counts = Counter(names)
+    padded = [*names, *[""] * (width - len(names))]
+    return [name if name and counts[name] == 1 else str(number) for number, name in enumerate(padded, 1)]
+
+
+def _text_batches(
+    file: BinaryIO,
+    columns: list[str],
+    wanted: Mapping[str, bool],
+    delimiter: str,
+    decimal: str,
+    left_out: Counter[str],
+) -> Iterator[Batch]:
+    def leave_out(row: pyarrow.csv.InvalidRow) -> str:
+        left_out[f"of another number of cells than {row.expected_columns}"] += 1
+        return "skip"
+
+    is_spaced = delimiter == " "
+    batches = pyarrow.csv.open_csv(
+        _Delimited(file) if is_spaced else file,
+        pyarrow.csv.ReadOptions(column_names=columns, block_size=_BLOCK_BYTES),
+        pyarrow.csv.ParseOptions(
+            delimiter="," if is_spaced else delimiter, invalid_row_handler=leave_out
+        ),
+        pyarrow.csv.ConvertOptions(
+            column_types={
+                name: pa.string() if is_text else pa.float64() for name, is_text in wanted.items()
+            },
+            include_columns=list(wanted),
+            decimal_point=decimal,
+            strings_can_be_null=True,
+        ),
+    )
+    for batch in map(_by_name, batches):
+        if decimal != ".":  # Arrow minds it in numbers alone
+            for name in wanted:
+                if wanted[name]:
+                    batch[name] = pc.replace_substring(batch[name], decimal, ".")
+        yield batch
+
+
+class _Delimited(io.RawIOBase):
+    """Lines whose cells stand between white space, as such with commas; comments are passed over."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._rest = file, b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        while not self._rest:
+            lines = self._file.readlines(len(buffer))
+            if not lines:
+                return 0
+            self._rest = b"".join(
+                b",".join(line.split()) + b"\n" for line in lines if not line.startswith(_COMMENTS)
+            )
+        size = min(len(buffer), len(self._rest))
+        buffer[:size] = self._rest[:size]
+        self._rest = self._rest[size:]
+        return size
+
+
+def _open_rtklib(path: Path) -> Table:
+    """A solution of RTKLIB: its header names two columns, date and time, by one word."""
+    named: list[str] = []
+    with _open(path) as file:
+        for line in file:
+            if not line.startswith(b"%"):
+                break
+            words = line[1:].decode("utf-8", "replace").replace(",", " ").split()
+            if words and words[0] in ("GPST", "UTC", "JST"):
+                named = ["date", "time", *words[1:]]
+    if not named:
+        raise BadInput(f"{path}: has no header line of RTKLIB, which begins with '%  GPST'")
+    return _open_text(path, named, False, None, ".")
+
+
+# Binary files, and JSON.
+
+
+def _open_parquet(path: Path) -> Table:
+    columns = [each.name for each in pyarrow.parquet.ParquetFile(path).schema_arrow]
+
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        file = pyarrow.parquet.ParquetFile(path)
+        names = list({name.partition(".")[0]: None for name in wanted})
+        for batch in file.iter_batches(_BLOCK_ROWS, columns=names):
+            yield from _flat_batches(pa.table(batch))
+
+    first = next(read(dict.fromkeys(columns, False)), None)
+    if first is None:
+        raise BadInput(f"{path}: holds no rows; give a table with some")
+    return Table(path, list(first), read)
+
+
+def _open_json(path: Path) -> Table:
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        with _open(path) as file:
+            while lines := file.readlines(_BLOCK_BYTES):
+                block = pa.BufferReader(b"".join(lines))
+                for batch in _flat_batches(pyarrow.json.read_json(block)):
+                    missing = pa.nulls(len(next(iter(batch.values()))))
+                    yield {name: batch.get(name, missing) for name in wanted} or batch
+
+    first = next(read({}), None)
+    if first is None:
+        raise BadInput(f"{path}: holds no rows; give one JSON object in a line")
+    return Table(path, list(first), read)
+
+
+def _open_npz(path: Path) -> Table:
+    """Arrays of one length; those with a second axis are columns NAME.0, NAME.1, ..."""
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
+    except zipfile.BadZipFile as error:
+        raise ValueError(error) from None
+    flat: dict[str, np.ndarray] = {}
+    for name, array in arrays.items():
+        if array.ndim == 2:
+            flat |= {f"{name}.{index}": column for index, column in enumerate(array.T)}
+        else:
+            flat[name] = array
+    sizes = {name: array.shape for name, array in flat.items()}
+    if not flat or len(set(sizes.values())) > 1 or next(iter(flat.values())).ndim != 1:
+        told = ", ".join(f"{name} {arrays[name].shape}" for name in arrays) or "none"
+        raise BadInput(f"{path}: its arrays are no columns of one length: {told}")
+
+    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        for begin in range(0, len(next(iter(flat.values()))), _BLOCK_ROWS):
+            rows = slice(begin, begin + _BLOCK_ROWS)
+            yield {name: pa.array(flat[name][rows]) for name in wanted}
+
+    return Table(path, list(flat), read)
+
+
+def _open_trajectory(path: Path) -> Table:
+    """TUM, KITTI or EuRoC: time_ns (not of KITTI), x, y, z and the quaternion qw, qx, qy, qz."""
+    found = read_trajectory(path)
+    columns = dict(zip("xyz", found.position_m.T, strict=True))
+    if found.rotation is not None:
+        quaternion = Rotation.from_matrix(found.rotation).as_quat(scalar_first=True)
+        columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternion.T, strict=True))
+    whole: Batch = {} if found.time_ns is None else {"time_ns": pa.array(found.time_ns)}
+    whole |= {name: pa.array(np.ascontiguousarray(column)) for name, column in columns.items()}
+    mended = "; ".join(note.removeprefix(f"{path}: ") for note in found.notes)
+    return Table(
+        path, list(whole), lambda wanted: iter([{name: whole[name] for name in wanted}]), mended=mended
+    )
+
+
+def _by_name(batch: pa.RecordBatch) -> Batch:
+    return dict(zip(batch.schema.names, batch.columns, strict=True))
+
+
+def _flat_batches(table: pa.Table) -> Iterator[Batch]:
+    """What a table has, with structures and lists taken apart: NAME.PART, NAME.0, NAME.1, ..."""
+    while any(pa.types.is_struct(kind) for kind in table.schema.types):
+        table = table.flatten()
+    for batch in table.combine_chunks().to_batches():
+        columns: Batch = {}
+        for name, column in _by_name(batch).items():
+            if not _is_list(column.type):
+                columns[name] = column
+                continue
+            width = pc.max(pc.list_value_length(column)).as_py() or 0
+            if pc.min(pc.list_value_length(column)).as_py() == width:
+                columns |= {f"{name}.{index}": pc.list_element(column, index) for index in range(width)}
+        yield columns
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)

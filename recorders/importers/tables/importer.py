@@ -1,0 +1,130 @@
+"""The importer of tables: rows become messages by a mapping, and what is left out is told."""
+
+import heapq
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.mapping import checked, mapped, schema_of
+from recorders.importers.tables.mapping import (
+    ConstantStream,
+    LogMapping,
+    find_files,
+    read_mapping,
+    shipped,
+)
+from recorders.importers.tables.plane import Plane
+from recorders.importers.tables.rows import Rows, Told
+from recorders.log import Stream, make_stream
+from recorders.parameters import Parameters
+from recorders.recording import Blocks, Importer
+
+
+class TableParameters(Parameters):
+    """The mapping, a name (walk) or a file (own.toml), and more files and folders that it is of."""
+
+    mapping: str = ""
+    more: list[str] = []
+
+
+def read(path: Path, parameters: TableParameters) -> Blocks:
+    """Read tables block by block; what is left out, doubtful or not taken is told in the notes.
+
+    The blocks raise BadInput where a file or the mapping cannot be used, or a value cannot be: latitudes
+    beyond 90 deg, quaternions that are not unit, tables of several clocks.
+    """
+    if not parameters.mapping:
+        raise BadInput(
+            f"{path}: say what its columns are with --mapping, a file or one of {', '.join(shipped())}; "
+            "--guess -o FILE.toml writes a mapping to start from"
+        )
+    paths = [path, *map(Path, parameters.more)]
+    for each in paths:
+        if not each.exists():
+            raise BadInput(f"{each}: no such file or folder; give the tables to import")
+    found = Blocks(iter(()))
+    found.blocks = _blocks(paths, read_mapping(parameters.mapping), found)
+    return found
+
+
+def _blocks(paths: list[Path], mapping: LogMapping, told: Blocks) -> Iterator[list[Stream]]:
+    files, others = find_files(mapping, paths)
+    counts: Told = Counter()
+    sources = [Rows(file, counts) for file in files]
+    firsts = {
+        number: first
+        for number, source in enumerate(sources)
+        if (first := source.first_ns()) is not None
+    }
+    if not firsts:
+        raise BadInput(f"{paths[0]}: no row of it has a time; nothing can be imported")
+    told.epoch_ns = min(firsts.values())
+    _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)
+    origin = mapping.origin or next(filter(None, (source.first_fix() for source in sources)), None)
+    plane = None if origin is None else Plane(origin, mapping.projection)
+    yield [_constant(each, told.epoch_ns) for each in mapping.constants]
+    # the file that is furthest behind comes next, so that the log is nearly in the order of time
+    queue = [(first, number) for number, first in firsts.items()]
+    heapq.heapify(queue)
+    while queue:
+        _, number = heapq.heappop(queue)
+        yield sources[number].block(plane)
+        if not sources[number].is_done:
+            heapq.heappush(queue, (sources[number].reached_ns, number))
+    if not any(source.messages.total() for source in sources):
+        facts = "; ".join(f"{topic}: {fact}" for topic, fact in counts) or "it has no rows"
+        raise BadInput(f"{paths[0]}: nothing of it could be imported: {facts}")
+    told.notes.update(_notes(sources, plane, mapping))
+    told.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
+    if others:
+        told.notes["files not taken"] = ", ".join(sorted({other.name for other in others}))
+
+
+def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:
+    """Raise BadInput where files begin so far apart that their clocks have nothing in common."""
+    early, late = min(firsts, key=lambda each: firsts[each]), max(firsts, key=lambda each: firsts[each])
+    apart_s = (firsts[late] - firsts[early]) * 1e-9
+    if apart_s > mapping.clock_tolerance_s:
+        raise BadInput(
+            f"mixed time bases: {early} begins {apart_s:.6g} s before {late}; give unit, zero and "
+            "utc_offset_h of their times, or a larger clock_tolerance_s in the mapping"
+        )
+
+
+def _constant(own: ConstantStream, time_ns: int) -> Stream:
+    """The messages that stand in a mapping."""
+
+    def read_none(source: str, *_: object) -> NDArray:
+        raise BadInput(f"{own.topic}: '{source}' is no number; constants have no columns")
+
+    found = mapped(own.mapping, 1, read_none, read_none, own.topic)
+    columns = {name: checked(own.topic, name, column) for name, column in found.columns.items()}
+    times = np.full(len(found.rows), time_ns)
+    schema = schema_of(own.mapping, own.topic)
+    return make_stream(own.topic, schema, times, metadata=own.mapping.metadata, **columns)
+
+
+def _notes(sources: list[Rows], plane: Plane | None, mapping: LogMapping) -> dict[str, str]:
+    """The clock, the plane, and what was read of each file."""
+    spans = [source.span_ns for source in sources if source.span_ns is not None]
+    ends = min(low for low, _ in spans), max(high for _, high in spans)
+    notes = {"clock": " to ".join(str(pd.Timestamp(stamp)) for stamp in ends)}
+    if plane is not None:
+        here = plane.origin
+        place = f"{here.latitude_deg:.9g}, {here.longitude_deg:.9g} deg, {here.altitude_m:.6g} m"
+        notes["origin"] = place if mapping.origin else f"{place}, the first fix"
+    for source in sources:
+        notes |= source.notes()
+    return notes
+
+
+TABLE = Importer(
+    "tables by a mapping: CSV, TSV, Parquet, JSON lines, .npz, RTKLIB .pos, TUM, KITTI, EuRoC",
+    TableParameters,
+    read,
+)

@@ -1,0 +1,218 @@
+"""Mappings of tables: a TOML file says which files, which columns, and what becomes of them.
+
+[[tables]]
+files = "imu_{unit}.csv"                          # {unit} stands for anything, and is {unit} below
+time = { column = "stamp", unit = "ms", zero = "2026-01-31" }
+
+[[tables.streams]]
+topic = "/{unit}/inertial"
+becomes = "InertialSample"
+fields = { specific_force_mps2 = ["ax", "ay", "az"], turn_rate_radps = ["gx", "gy", "gz"] }
+units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }
+"""
+
+import re
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, PositiveFloat
+
+from recorders.errors import BadInput, choices
+from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
+from recorders.importers.tables.files import Format
+from recorders.importers.tables.times import TimeMapping
+from recorders.parameters import Parameters, build
+from recorders.parsing import read_toml
+
+_SHIPPED = resources.files("fuselog_data") / "mappings"
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+
+
+class Origin(Parameters):
+    """Where the local plane of east, north and up touches, and how high above the WGS 84 ellipsoid."""
+
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    altitude_m: float = 0.0
+
+
+class Geodetic(Parameters):
+    """Columns with a place, altitudes in m; with them there are columns east_m, north_m and up_m."""
+
+    latitude: str
+    longitude: str
+    altitude: str | None = None
+    unit: str = "deg"
+
+
+class Attitude(Parameters):
+    """Columns with angles of a body of forward, left, up; with them there are quaternion_w to _z.
+
+    They turn to a frame of east, north, up. `heading` is clockwise from north, `pitch` then nose up and
+    `roll` right side down, as aircraft have them; `yaw` is anticlockwise from east, `pitch` nose down.
+    """
+
+    heading: str | None = None
+    yaw: str | None = None
+    pitch: str | None = None
+    roll: str | None = None
+    unit: str = "deg"
+
+
+class TableStream(StreamMapping):
+    """A stream of a table's rows.
+
+    What it says was measured `delay_s` before its stamp; with `only_first` the first row alone is taken,
+    as for a prior.
+    """
+
+    topic: str = Field(pattern=r"^/\S+$")
+    delay_s: float = 0.0
+    only_first: bool = False
+
+
+class TableMapping(Parameters):
+    """The files of one kind, and the streams of their rows.
+
+    Attributes:
+        files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
+            stand for anything, ? for one letter.
+        optional: there may be none.
+        format, columns, header, delimiter, decimal: what the content does not tell; see `open_table`.
+        time: when a row was measured.
+        arrival: when it reached the recorder, if that is stated.
+        geodetic, attitude: columns that are made of others.
+    """
+
+    files: str = "*"
+    optional: bool = False
+    format: Format | None = None
+    columns: list[str] = []
+    header: bool | None = None
+    delimiter: str | None = None
+    decimal: str = "."
+    time: TimeMapping
+    arrival: TimeMapping | None = None
+    geodetic: Geodetic | None = None
+    attitude: Attitude | None = None
+    streams: list[TableStream] = Field(min_length=1)
+
+
+class ConstantStream(Parameters):
+    """Messages that stand in the mapping itself, such as anchors; their stamps are the log's first."""
+
+    topic: str = Field(pattern=r"^/\S+$")
+    becomes: str
+    rows: list[dict[str, OneOrMore[Source]]] = Field(min_length=1)
+    components: str = ""
+    kinds: str = ""
+
+    @property
+    def mapping(self) -> StreamMapping:
+        """The same in the language of streams: one row, and messages for each of these."""
+        rows = [dict(row) for row in self.rows]
+        return StreamMapping(
+            becomes=self.becomes, each=rows, components=self.components, kinds=self.kinds
+        )
+
+
+class LogMapping(Parameters):
+    """A mapping: what it is for, where the origin is (else the first fix), tables, and constants.
+
+    The plane is tangent to the ellipsoid, or the map of a `projection` that pyproj knows, from the
+    origin on. Tables that begin further apart than `clock_tolerance_s` are of several clocks.
+    """
+
+    summary: str = ""
+    origin: Origin | None = None
+    projection: str | None = None
+    tables: list[TableMapping] = Field(min_length=1)
+    constants: list[ConstantStream] = []
+    clock_tolerance_s: PositiveFloat = 3600.0
+
+
+def shipped() -> list[str]:
+    """The names of the mappings that ship."""
+    return sorted(
+        each.name.removesuffix(".toml") for each in _SHIPPED.iterdir() if each.name.endswith(".toml")
+    )
+
+
+def read_mapping(name: str) -> LogMapping:
+    """A mapping by its name or file; raises BadInput where there is none, or what it names is none."""
+    path = Path(name)
+    if not name.endswith(".toml"):
+        known = shipped()
+        if name not in known:
+            raise BadInput(f"no mapping '{name}'; {choices(name, known)}; a file of yours ends in .toml")
+        with resources.as_file(_SHIPPED / f"{name}.toml") as file:
+            return build(LogMapping, read_toml(file), f"mapping {name}")
+    found = build(LogMapping, read_toml(path), name)
+    for table in found.tables:
+        for stream in table.streams:
+            schema_of(stream, f"{name}: {stream.topic}")
+    for constant in found.constants:
+        schema_of(constant.mapping, f"{name}: {constant.topic}")
+    return found
+
+
+class Found(NamedTuple):
+    """A file, its mapping, and what the names in braces stand for."""
+
+    path: Path
+    table: TableMapping
+    names: dict[str, str]
+
+
+def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], list[Path]]:
+    """The files of a mapping among files and folders, and those of the folders that are none of them.
+
+    A file of a folder is that of the first table whose pattern it fits. Raises BadInput where a table
+    has no file, or a file that is given has no table.
+    """
+    found: list[Found] = []
+    others: list[Path] = []
+    for path in paths:
+        inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+        for file in inside:
+            name = file.relative_to(path).as_posix() if path.is_dir() else file.name
+            own = next(_matches(mapping, file, name, is_alone=len(paths) == 1 == len(inside)), None)
+            if own is not None:
+                found.append(own)
+            elif path.is_dir():
+                others.append(file)
+            else:
+                patterns = ", ".join(table.files for table in mapping.tables)
+                raise BadInput(f"{file}: is none of the mapping's files ({patterns})")
+    for table in mapping.tables:
+        if not table.optional and not any(each.table is table for each in found):
+            where = ", ".join(map(str, paths))
+            raise BadInput(
+                f"{where}: has no file {table.files}, which the mapping needs; give it too, or set "
+                "optional = true for its table"
+            )
+    return found, others
+
+
+def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[Found]:
+    """The tables that a file is one of; the only file of the only table may have any name."""
+    for table in mapping.tables:
+        pattern = (
+            table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]
+        )
+        parts = re.split(r"\{(\w+)\}", pattern)
+        expression = "".join(
+            f"(?P<{part}>[^/]+)"
+            if index % 2
+            else re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
+            for index, part in enumerate(parts)
+        )
+        match = re.fullmatch(expression, name)
+        if match:
+            yield Found(file, table, match.groupdict())
+        elif is_alone and len(mapping.tables) == 1:
+            yield Found(file, table, dict.fromkeys(parts[1::2], file.stem))

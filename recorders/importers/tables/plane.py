@@ -1,0 +1,65 @@
+"""The plane that a log's positions are in, made of places on the earth."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.tables.mapping import Origin
+from recorders.models.geodesy import into_tangent_plane
+
+Floats = NDArray[np.float64]
+
+
+class Plane(NamedTuple):
+    """East, north and up from an origin: tangent to the ellipsoid, or on the map of a projection."""
+
+    origin: Origin
+    projection: str | None = None
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the channels of streams in the plane state."""
+        stated = {f"origin_{name}": repr(value) for name, value in self.origin}
+        # a model would take stated origins for those of a tangent plane
+        return stated if self.projection is None else {"projection": self.projection}
+
+    def place(
+        self, latitude_deg: Floats, longitude_deg: Floats, altitude_m: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """East, north and up (n,) in m of places on WGS 84.
+
+        Raises BadInput where pyproj is needed and not installed, or knows no such projection.
+        """
+        here = self.origin
+        if self.projection is None:
+            touch = (here.latitude_deg, here.longitude_deg, here.altitude_m)
+            east, north, up = into_tangent_plane((latitude_deg, longitude_deg, altitude_m), touch)
+            return np.asarray(east), np.asarray(north), np.asarray(up)
+        onto_map = _onto_map(self.projection)
+        east, north = onto_map.transform(longitude_deg, latitude_deg)
+        zero_east, zero_north = onto_map.transform(here.longitude_deg, here.latitude_deg)
+        is_on_map = np.isfinite(east) & np.isfinite(latitude_deg)
+        place = np.where(is_on_map, [east - zero_east, north - zero_north], np.nan)
+        return place[0], place[1], altitude_m - here.altitude_m
+
+
+@cache
+def _onto_map(projection: str) -> Any:
+    try:
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError
+    except ImportError:
+        raise BadInput(
+            f"projection {projection}: needs pyproj; pip install 'fuselog[maps]', or leave it out and "
+            "have the tangent plane"
+        ) from None
+    try:
+        crs = CRS.from_user_input(projection)
+    except CRSError:
+        raise BadInput(f"no projection '{projection}'; give one such as EPSG:25832") from None
+    if not crs.is_projected:
+        raise BadInput(f"projection {projection}: is none; give one with east and north, as EPSG:25832")
+    return Transformer.from_crs("EPSG:4326", crs, always_xy=True)

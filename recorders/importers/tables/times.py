@@ -1,0 +1,199 @@
+"""Stamps of tables: numbers since some zero, dates, GPS weeks, or none but a rate; exact to the ns."""
+
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat, model_validator
+
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+
+Stamps = NDArray[np.int64]
+# How many digits after the second (or what else the unit is) are nanoseconds.
+_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+_GPS_ZERO = "1980-01-06"
+_WEEK_NS = 7 * 86400 * 10**9
+# A stamp that is missing.
+NOT_A_TIME = np.iinfo(np.int64).min
+
+
+class TimeMapping(Parameters):
+    """Where a row's time stands.
+
+    Attributes:
+        column: one column, or several whose texts belong together, such as date and time.
+        unit: of numbers; "date" is for dates and times as text.
+        zero: the date that numbers count from.
+        week: the column of GPS weeks; `column` then has the seconds of the week.
+        rate_hz: rows of files without stamps are so many a second, from `zero` on.
+        utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
+        format: of dates that are not as ISO 8601 has them, in the letters of strptime.
+        leap_seconds: are subtracted; GPS time is otherwise kept as it is written.
+        tag: beside each file, one of its name and this suffix says when its counter started, and how
+            fast it goes (RTKLIB's time tags).
+    """
+
+    column: str | list[str] = []
+    unit: Literal["s", "ms", "us", "ns", "date"] = "s"
+    zero: str = "1970-01-01"
+    week: str | None = None
+    rate_hz: PositiveFloat | None = None
+    utc_offset_h: Annotated[float, Field(ge=-15, le=15)] = 0.0
+    format: str = "ISO8601"
+    leap_seconds: float = 0.0
+    tag: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "TimeMapping":
+        if bool(self.columns) == (self.rate_hz is not None):
+            raise ValueError("give either the column that has the time, or rate_hz")
+        if len(self.columns) > 1 + bool(self.week) and self.unit != "date":
+            raise ValueError('several columns make a date; give unit = "date", or one column')
+        try:
+            _date_ns(self.zero)
+        except ValueError:
+            raise ValueError(
+                f"zero is '{self.zero}', expected a date such as 2026-01-31T12:00:00Z"
+            ) from None
+        return self
+
+    @property
+    def columns(self) -> list[str]:
+        """All columns that are read, in order."""
+        texts = [self.column] if isinstance(self.column, str) else self.column
+        return [*texts, *([self.week] if self.week else [])]
+
+    @property
+    def zero_ns(self) -> int:
+        """What numbers count from, less leap seconds and the offset from UTC."""
+        since = _date_ns(_GPS_ZERO if self.week else self.zero)
+        return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
+
+
+def _date_ns(text: str) -> int:
+    stamp = pd.Timestamp(text)
+    return int((stamp.tz_localize("UTC") if stamp.tzinfo is None else stamp).as_unit("ns").value)
+
+
+def stamps_ns(
+    mapping: TimeMapping, columns: Mapping[str, pa.Array], first_row: int, size: int, where: str
+) -> Stamps:
+    """The stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
+
+    `first_row` is the number of rows before these. Raises BadInput, which begins with `where`, where a
+    cell holds no time, or one beyond what a log can hold.
+    """
+    if mapping.rate_hz is not None:
+        seconds = (first_row + np.arange(size)) / mapping.rate_hz
+        return mapping.zero_ns + np.rint(seconds * 1e9).astype(np.int64)
+    cells = [columns[name] for name in mapping.columns]
+    label = f"{where}: column {' and '.join(mapping.columns)}"
+    if mapping.unit == "date":
+        found = _dates_ns(mapping, cells, label)
+    else:
+        found = _counted_ns(cells[0], _DIGITS[mapping.unit], label)
+        if mapping.week:
+            weeks = _counted_ns(cells[1], 0, label)
+            is_known = (weeks != NOT_A_TIME) & (found != NOT_A_TIME)
+            found = np.where(is_known, weeks * _WEEK_NS + found, NOT_A_TIME)
+    known = found != NOT_A_TIME
+    shifted = np.where(known, found + mapping.zero_ns, NOT_A_TIME)
+    if np.any(shifted[known] < 0):
+        raise BadInput(
+            f"{label}: a stamp is before 1970 or beyond the year 2262; give the unit, and in zero the "
+            "date that it counts from"
+        )
+    return shifted
+
+
+def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
+    """Numbers as ns; texts are read to the last digit, where a double of today has 200 ns."""
+    if pa.types.is_timestamp(cells.type):
+        return cells.cast(pa.timestamp("ns")).cast(pa.int64()).fill_null(NOT_A_TIME).to_numpy()
+    if pa.types.is_integer(cells.type):
+        known = cells.is_valid().to_numpy(zero_copy_only=False)
+        whole = cells.cast(pa.int64()).fill_null(0).to_numpy()
+        return np.where(known, whole * 10**digits, NOT_A_TIME)
+    if pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type):
+        texts = pc.utf8_trim_whitespace(cells)
+        try:
+            exact = pc.round(texts.cast(pa.decimal128(38, digits + 11)), digits)
+        except pa.ArrowInvalid:  # more digits than that, or no number
+            try:
+                cells = texts.cast(pa.float64())
+            except pa.ArrowInvalid as error:
+                said = str(error).splitlines()[0]
+                raise BadInput(f'{label} holds no numbers ({said}); dates need unit = "date"') from None
+        else:
+            # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
+            scaled = exact.cast(pa.decimal128(38, digits))
+            low = np.frombuffer(scaled.buffers()[1], "<i8").reshape(-1, 2)[:, 0]
+            known = cells.is_valid().to_numpy(zero_copy_only=False)
+            return np.where(known, low[scaled.offset : scaled.offset + len(scaled)], NOT_A_TIME)
+    numbers = cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    known = np.abs(numbers * 10.0**digits) < 2**63
+    filled = np.where(known, numbers, 0.0)
+    whole = np.floor(filled)
+    ns = whole.astype(np.int64) * 10**digits + np.rint((filled - whole) * 10.0**digits).astype(np.int64)
+    return np.where(known, ns, NOT_A_TIME)
+
+
+def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps:
+    """Dates as ns since 1970, as if their own offset were the mapping's."""
+    if pa.types.is_timestamp(cells[0].type):
+        return _counted_ns(cells[0], 0, label)
+    texts = [pc.utf8_trim_whitespace(each.cast(pa.string())) for each in cells]
+    joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
+    series = joined.to_pandas()
+    try:
+        dates = pd.to_datetime(series, format=mapping.format, utc=True)
+    except ValueError as error:
+        said = str(error).splitlines()[0]
+        raise BadInput(
+            f"{label} holds no dates ({said}); give their format, or the unit of numbers"
+        ) from None
+    return dates.dt.tz_localize(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
+
+
+class Counter(NamedTuple):
+    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes."""
+
+    first_ns: int
+    start_ns: int
+    rate: float
+
+    def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
+        """The stamps (n,) of readings; a reading before the first is of a line that was cut off."""
+        since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
+        return np.where(ticks_ns < self.first_ns, NOT_A_TIME, self.start_ns + since)
+
+
+def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
+    """The counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
+
+    A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
+    76 on pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are all readings.
+
+    Raises BadInput where there is no such file, or it is none.
+    """
+    tag = path.with_name(path.name + suffix)
+    try:
+        data = tag.read_bytes()
+    except OSError as error:
+        raise BadInput(f"{tag}: {error.strerror}; {path.name} needs it for its start") from None
+    if not data.startswith(b"TIMETAG RTKLIB") or len(data) < 84:
+        raise BadInput(f"{tag}: is no time tag of RTKLIB; {path.name} needs one for its start")
+    seconds, fraction = struct.unpack_from("<Id", data, 64)
+    last_ms = np.frombuffer(data, "<u4", (len(data) - 76) // 8 * 2, 76)[-2]
+    every = np.concatenate([ticks[ticks != NOT_A_TIME] for ticks in ticks_ns] or [np.empty(0, np.int64)])
+    if len(every) < 2 or every.max() <= every[0]:
+        raise BadInput(f"{path}: its counter does not go on; {tag.name} cannot tell its times")
+    rate = float(last_ms) * 1e6 / float(every.max() - every[0])
+    return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate)

@@ -1,0 +1,86 @@
+"""Companions: messages of other makers' schemas beside a log's streams, for viewers alone.
+
+A companion's channel states in its metadata which stream it accompanies, and is none of the log's
+topics. Its messages have no fixed layout; they are written one by one, into chunks of their own.
+"""
+
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf import descriptor_pb2
+from google.protobuf.message import Message
+from mcap.opcode import Opcode
+
+from recorders.log.chunks import RECORD_HEAD, Span
+from recorders.log.packing import INDEX_ENTRY, Chunk
+
+# The key of a channel's metadata that names the stream.
+COMPANION_OF = "companion_of"
+# Opcode, length of the rest, channel, sequence number, log time, publish time.
+_HEAD = struct.Struct("<BQHIQQ")
+
+
+class Companion(NamedTuple):
+    """A message, its topic, the topic of the stream that it accompanies, and its two clocks."""
+
+    topic: str
+    of: str
+    message: Message
+    log_time_ns: int
+    publish_time_ns: int
+
+
+class Numbered(NamedTuple):
+    """A companion with its channel and its number there."""
+
+    channel_id: int
+    sequence: int
+    companion: Companion
+
+
+def descriptor_set(message: Message) -> bytes:
+    """The serialised FileDescriptorSet of a message with all that it is made of."""
+    files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
+
+    def add(file: Any) -> None:
+        for needed in file.dependencies:
+            add(needed)
+        if file.name not in files:
+            files[file.name] = descriptor_pb2.FileDescriptorProto.FromString(file.serialized_pb)
+
+    add(message.DESCRIPTOR.file)
+    return descriptor_pb2.FileDescriptorSet(file=files.values()).SerializeToString(deterministic=True)
+
+
+def chunks_of_companions(companions: Sequence[Numbered], chunk_bytes: int) -> Iterator[Chunk]:
+    """Chunks of about `chunk_bytes`, in the order of log time; ties keep the order given."""
+    rows: list[tuple[Numbered, bytes]] = []
+    size = 0
+    for row in sorted(companions, key=lambda each: each.companion.log_time_ns):
+        data = row.companion.message.SerializeToString(deterministic=True)
+        rows.append((row, data))
+        size += _HEAD.size + len(data)
+        if size >= chunk_bytes:
+            yield _chunk(rows)
+            rows, size = [], 0
+    if rows:
+        yield _chunk(rows)
+
+
+def _chunk(rows: Sequence[tuple[Numbered, bytes]]) -> Chunk:
+    data = bytearray()
+    entries: dict[int, list[tuple[int, int]]] = {}
+    for (channel_id, sequence, companion), message in rows:
+        clocks = companion.log_time_ns, companion.publish_time_ns
+        entries.setdefault(channel_id, []).append((companion.log_time_ns, len(data)))
+        length = _HEAD.size - RECORD_HEAD.size + len(message)
+        data += _HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, *clocks) + message
+    published = [row.companion.publish_time_ns for row, _ in rows]
+    return Chunk(
+        memoryview(data),
+        Span(rows[0][0].companion.log_time_ns, rows[-1][0].companion.log_time_ns),
+        Span(min(published), max(published)),
+        {channel: np.array(each, INDEX_ENTRY).tobytes() for channel, each in entries.items()},
+    )

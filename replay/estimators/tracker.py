@@ -1,0 +1,574 @@
+"""Tracks of vessels and other targets from the unordered scans of several sensors at once.
+
+    tracker:nearest     the surest pair of track and detection first
+    tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
+    tracker:jpda        all maps, weighted
+    tracker:jipda       all maps, weighted, and how probable it is that each track exists
+
+Targets keep their velocity but for white acceleration; sensors are those that state what they are like
+on the channels of their scans, see `PLACES` and `BEARINGS`. Places begin tracks, bearings only sharpen
+those that are confirmed. What is in `replay.inference.tracking` does the work.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from scipy.stats import chi2
+
+from recorders.errors import BadInput
+from recorders.log import Topic, make_stream, schemas
+from recorders.models.constant_velocity import noise_moments
+from recorders.models.planar import Component, Components
+from recorders.models.states import PLANE_MOTION, state_metadata
+from replay.engine.arrays import Floats, Integers
+from replay.engine.blocks import Block, Ragged, gather, join
+from replay.engine.channels import stated
+from replay.engine.estimator import Bound, Estimator, Recursive
+from replay.engine.failures import reason_stream
+from replay.engine.measurements import PLANE
+from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.inference.binding import number_fields
+from replay.inference.model import Model, ModelParameters, Motion
+from replay.inference.tracking import (
+    NEVER,
+    Scans,
+    ScanSensor,
+    Told,
+    Tracker,
+    Tracks,
+    in_time,
+    no_tracks,
+    of_last,
+    take_scans,
+    track_scans,
+)
+
+UNUSED = (
+    "there is no room for more tracks; give --set most_tracks=...",
+    "the scan came after a younger one; give --late rewind:SECONDS",
+)
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class TrackerParameters(ModelParameters):
+    """How targets move, how tracks begin and end, and what sensors are like.
+
+    What is None is what the channel of a sensor's scans states; given here, it holds for all sensors.
+    `sensors` are those to use, such as ["radar", "lidar"]; where it is empty all are.
+
+    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks.
+    With hits_needed = 0 they are managed by their existence; else by hits, and their existence is
+    `birth_existence` until they are confirmed.
+    """
+
+    association: Literal["nearest", "hungarian", "jpda", "jipda"] = "jipda"
+    sensors: tuple[str, ...] = ()
+    acceleration_density: PositiveFloat = 0.1
+    birth_sigma_mps: PositiveFloat = 3.0
+    birth_distance_m: NonNegativeFloat = 30.0
+    birth_existence: Probability | None = None
+    confirming_existence: Probability = 0.97
+    ending_existence: Probability = 0.02
+    survival_s: PositiveFloat = 60.0
+    hits_needed: NonNegativeInt | None = None
+    chances: PositiveInt = 6
+    silence_s: PositiveFloat = 10.0
+    tentative_silence_s: PositiveFloat = 6.0
+    same_within_m: NonNegativeFloat = 10.0
+    same_within_mps: NonNegativeFloat = 2.0
+    most_tracks: PositiveInt = 100
+
+    gate_probability: Probability | None = None  # type: ignore[assignment]
+    sigma_m: PositiveFloat | None = None
+    sigma_across_rad: NonNegativeFloat | None = None
+    lag_s: float | None = None
+    bias_x_m: float | None = None
+    bias_y_m: float | None = None
+    near_range_m: NonNegativeFloat | None = None
+    far_range_m: NonNegativeFloat | None = None
+    far_detection_probability: Probability | None = None
+    clutter_per_m2: PositiveFloat | None = None
+    joined_within_m: NonNegativeFloat | None = None
+    sigma_rad: PositiveFloat | None = None
+    sigma_across_m: NonNegativeFloat | None = None
+    bias_rad: float | None = None
+    clutter_per_rad: PositiveFloat | None = None
+    detection_probability: Probability | None = None
+    blind_from_rad: float | None = None
+    blind_to_rad: float | None = None
+    interval_s: NonNegativeFloat | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _managed(cls, values: Any) -> Any:
+        """Existence is what jipda is about; the others count hits."""
+        by_existence = values.get("association", "jipda") == "jipda"
+        own = {"hits_needed": 0, "birth_existence": 0.05}
+        if not by_existence:
+            own = {"hits_needed": 4, "birth_existence": 0.135}
+        return {**own, **values}
+
+
+# The motion
+
+
+def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
+    """Constant velocity."""
+    x, vx, y, vy = state
+    return x + duration_s * vx, vx, y + duration_s * vy, vy
+
+
+def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    place, mixed, velocity = noise_moments(parameters.acceleration_density, duration_s)
+    return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
+
+
+TARGET = Model(
+    "a target in the plane that keeps its velocity",
+    dict.fromkeys(PLANE_MOTION, "linear"),
+    TrackerParameters,
+    (),
+    Motion(move, acceleration_noise, linear=True),
+    needs_sensor=False,
+)
+
+
+# Sensors
+
+
+def away(state: Components, origin: Any) -> tuple[Any, Any]:
+    """Where a target is from a sensor."""
+    return state[0] - origin[0], state[2] - origin[1]
+
+
+def is_blind(state: Components, origin: Any, parameters: Any) -> bool:
+    """Whether a target is in the sector, anticlockwise from one angle to another, that is not seen."""
+    if np.isnan(parameters.blind_from_rad):
+        return False
+    x, y = away(state, origin)
+    turned = (np.arctan2(y, x) - parameters.blind_from_rad) % (2.0 * np.pi)
+    return turned < (parameters.blind_to_rad - parameters.blind_from_rad) % (2.0 * np.pi)
+
+
+def place_of(state: Components, origin: Any, parameters: Any) -> Components:
+    """Where a target is from the sensor, `lag_s` ago, as a sensor says that is out by its bias."""
+    x, y = away(state, origin)
+    lag_s = parameters.lag_s
+    return x - lag_s * state[1] + parameters.bias_x_m, y - lag_s * state[3] + parameters.bias_y_m
+
+
+def place_noise(state: Components, origin: Any, parameters: Any) -> Components:
+    """The lower triangle of a place's covariance: wider across the line of sight than along it."""
+    x, y = away(state, origin)
+    along, across = parameters.sigma_m**2, parameters.sigma_across_rad**2
+    return along + across * y * y, -across * x * y, along + across * x * x
+
+
+def place_detection(state: Components, origin: Any, parameters: Any) -> Component:
+    """Falls linearly between two ranges."""
+    if is_blind(state, origin, parameters):
+        return 0.0
+    near, far = parameters.detection_probability, parameters.far_detection_probability
+    range_m = np.hypot(*away(state, origin))
+    if range_m <= parameters.near_range_m:
+        return near
+    if range_m >= parameters.far_range_m:
+        return far
+    share = (range_m - parameters.near_range_m) / (parameters.far_range_m - parameters.near_range_m)
+    return near + share * (far - near)
+
+
+def place_clutter(parameters: Any) -> Component:
+    """Per m^2."""
+    return parameters.clutter_per_m2
+
+
+def place_birth(detection: Any, origin: Any, parameters: Any) -> tuple[Components, Components]:
+    """A target where it was detected, of any velocity."""
+    state = detection[0] + origin[0], 0.0, detection[1] + origin[1], 0.0
+    xx, xy, yy = place_noise(state, origin, parameters)
+    velocity = parameters.birth_sigma_mps**2
+    return state, (xx, 0.0, velocity, xy, 0.0, yy, 0.0, 0.0, 0.0, velocity)
+
+
+def bearing_of(state: Components, origin: Any, parameters: Any) -> Components:
+    """Anticlockwise from the x axis, as a sensor says that is turned by its bias."""
+    x, y = away(state, origin)
+    return (np.arctan2(y, x) + parameters.bias_rad,)
+
+
+def bearing_noise(state: Components, origin: Any, parameters: Any) -> Components:
+    """The variance of a bearing; it does not matter much where on a hull it points when that is far."""
+    across = parameters.sigma_across_m / np.hypot(*away(state, origin))
+    return (parameters.sigma_rad**2 + across**2,)
+
+
+def bearing_detection(state: Components, origin: Any, parameters: Any) -> Component:
+    """The same at all ranges."""
+    return 0.0 if is_blind(state, origin, parameters) else parameters.detection_probability
+
+
+def bearing_clutter(parameters: Any) -> Component:
+    """Per rad."""
+    return parameters.clutter_per_rad
+
+
+PLACES = ScanSensor(
+    "detection",
+    schemas.DETECTION,
+    "position_m",
+    dict.fromkeys(PLANE, "linear"),
+    place_of,
+    place_noise,
+    place_detection,
+    place_clutter,
+    place_birth,
+)
+BEARINGS = ScanSensor(
+    "bearing",
+    schemas.SCAN_BEARING,
+    "bearing_rad",
+    {"bearing_rad": "angle"},
+    bearing_of,
+    bearing_noise,
+    bearing_detection,
+    bearing_clutter,
+)
+KINDS = (PLACES, BEARINGS)
+# What a channel need not state, by kind: none of what it does not say is there.
+UNSTATED: dict[str, float] = {
+    "sigma_across_rad": 0.0,
+    "lag_s": 0.0,
+    "bias_x_m": 0.0,
+    "bias_y_m": 0.0,
+    "joined_within_m": 0.0,
+    "sigma_across_m": 0.0,
+    "bias_rad": 0.0,
+    "interval_s": 0.0,
+    "blind_from_rad": np.nan,
+    "blind_to_rad": np.nan,
+    "near_range_m": np.inf,
+    "far_range_m": np.inf,
+    "far_detection_probability": np.nan,
+    "gate_probability": 0.99,
+}
+FOREIGN = {PLACES.leaf: ("sigma_rad", "clutter_per_rad"), BEARINGS.leaf: ("sigma_m", "clutter_per_m2")}
+
+
+def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
+    """The sensors with scans and places or bearings.
+
+    Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
+    """
+    rows = []
+    for scan in topics.values():
+        prefix, _, leaf = scan.name.rpartition("/")
+        if leaf != "scan" or scan.schema_name != schemas.SCAN.full_name:
+            continue
+        if wanted and prefix.strip("/") not in wanted:
+            continue
+        for number, kind in enumerate(KINDS):
+            seen = topics.get(f"{prefix}/{kind.leaf}")
+            if seen is not None and seen.schema_name == kind.schema.full_name:
+                rows.append((number, scan.name, seen.name, scan.metadata.get(ORIGIN, "")))
+    missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
+    if missing:
+        raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
+    found = Found(*zip(*rows, strict=True)) if rows else Found((), (), (), ())
+    for scan_name, origin in zip(found.scans, found.origins, strict=True):
+        if origin and (
+            origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
+        ):
+            raise BadInput(
+                f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
+                "not there; record the sensor's own position"
+            )
+    if rows and 0 not in found.kinds:
+        raise BadInput(
+            "only bearings: they begin no tracks, since they do not say how far a target is; take a "
+            "sensor of places with them"
+        )
+    return found
+
+
+def settings_of(
+    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters
+) -> tuple[tuple[str, ...], Floats]:
+    """What the loop reads, by name, and for every sensor (sensors, names)."""
+    names = number_fields(TrackerParameters)
+    rows = []
+    for kind, scan in zip(found.kinds, found.scans, strict=True):
+        values = {}
+        for name in names:
+            given = getattr(parameters, name)
+            if given is None and name in FOREIGN[KINDS[kind].leaf]:
+                given = np.nan
+            if given is None:
+                needed = name not in UNSTATED
+                given = stated([topics[scan]], name, TrackerParameters, needed=needed)
+            values[name] = UNSTATED.get(name, np.nan) if np.isnan(given) else float(given)
+        gate = float(chi2.ppf(values["gate_probability"], len(KINDS[kind].measured)))
+        rows.append([*values.values(), gate])
+    return (*names, "gate"), np.array(rows)
+
+
+# The estimator
+
+
+class Setup(NamedTuple):
+    """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
+
+    name: str
+    found: Found
+    tracker: Tracker
+    settings: Floats
+    most_tracks: int
+
+    def no_tracks(self, runs: int) -> Tracks:
+        """Runs in which nothing was met yet."""
+        return no_tracks(runs, self.most_tracks, TARGET.size, len(self.found.scans))
+
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+        """The tracks after some scans, and what is said of them."""
+        return track_scans(self.tracker, scans, self.settings, tracks)
+
+
+class State(NamedTuple):
+    """What is carried from block to block: the last own positions, and the tracks.
+
+    Attributes:
+        fixes: by topic and run.
+        tracks: of all runs; where scans may come late those of one run each, see `Rewinding`.
+    """
+
+    fixes: Fixes
+    tracks: Any
+
+
+def start(_: Mapping[str, Ragged]) -> None:
+    """Nothing is known before the first scan, not even how many runs there are."""
+
+
+def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list[Ragged]]:
+    """Track a block; see `replay.engine.estimator.Recursive`."""
+    before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
+    scans, fixes = _scans(before, block, setup)
+    after, said = setup.track(before.tracks, scans)
+    outputs = [_outputs(setup, batch, told) for batch, told in said]
+    return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
+
+
+def _runs(block: Block) -> int:
+    return next(iter(block.streams.values())).runs
+
+
+def _begin(block: Block, setup: Setup, tracks: Any) -> State:
+    unknown: list[Any] = [None] * _runs(block)
+    return State({topic: unknown for topic in setup.found.origins if topic}, tracks)
+
+
+def _scans(state: State, block: Block, setup: Setup) -> tuple[Scans, Fixes]:
+    """A block's scans, and the last own positions after it."""
+    scans = scans_of(block, setup.found, KINDS, state.fixes)
+    fixes = state.fixes.items()
+    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
+
+
+class Rewinding(NamedTuple):
+    """One run whose scans may come late.
+
+    Attributes:
+        base: the tracks after all scans that no late one can precede any more.
+        pending: the scans after those, in time order.
+        head: the tracks after all scans.
+    """
+
+    base: Tracks
+    pending: Scans
+    head: Tracks
+
+
+def run_rewinding(
+    state: State | None, block: Block, *, setup: Setup, back_ns: int
+) -> tuple[State, list[Ragged]]:
+    """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
+
+    A late scan is put in its place and those after it are used again; what was said stays, and is said
+    again at the latest stamp.
+    """
+    nothing = setup.no_tracks(1)
+    scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
+    none = take_scans(scans, np.empty(0, np.int64))
+    runs = [Rewinding(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
+    after, outputs = [], []
+    for number, before in enumerate(runs):
+        rewinding, said = before, list[list[Ragged]]()
+        for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
+            rewinding, told = _take(rewinding, take_scans(scans, rows), setup, back_ns)
+            said += told
+        after.append(rewinding)
+        outputs.append([join(parts) for parts in zip(*said, strict=True)])
+    filled = next((each for each in outputs if each), [])
+    empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
+    by_topic = zip(*(each or empty for each in outputs), strict=True)
+    return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
+
+
+def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+    """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
+    newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
+    late = scans.time_ns[first:end] < newest_ns
+    cuts = np.flatnonzero(late | np.append(False, late[:-1]))
+    return (first + rows for rows in np.split(np.arange(end - first), cuts) if len(rows))
+
+
+def _take(
+    rewinding: Rewinding, arrived: Scans, setup: Setup, back_ns: int
+) -> tuple[Rewinding, list[list[Ragged]]]:
+    """One run after scans that go on in time, or after one that is late; and what is said then."""
+    base, pending, head = rewinding
+    repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
+    pending = in_time(pending, arrived)
+    if repeated:
+        head, said = setup.track(base, pending)
+        outputs = [_outputs(setup, *of_last(*said[-1]), repeated=repeated)]
+    else:
+        head, said = setup.track(head, arrived)
+        outputs = [_outputs(setup, batch, told) for batch, told in said]
+    rows = np.arange(len(pending.time_ns))
+    settled = pending.time_ns < pending.time_ns[-1] - back_ns
+    if settled.any():
+        base, _ = setup.track(base, take_scans(pending, rows[settled]))
+        pending = take_scans(pending, rows[~settled])
+    return Rewinding(base, pending, head), outputs
+
+
+def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[Ragged]:
+    """Of every scan how many tracks there are, which, what was associated, and what was not done.
+
+    `repeated` is how many scans after a late one, the last of which these are of, were used again.
+    """
+    topic, found = f"/estimates/{setup.name}", setup.found
+    used = np.flatnonzero(told.confirmed != NEVER)
+    counts, time_ns = told.confirmed[used], scans.time_ns[used]
+    offsets = np.searchsorted(used, scans.offsets)
+    metadata = state_metadata(PLANE_MOTION)
+
+    def filled(column: NDArray, which: int) -> NDArray:
+        ends = told.end[:, which]
+        return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
+
+    ends = np.concatenate([[0], np.cumsum(told.end, axis=0)[:, 0]])
+    track_ns, rows = np.repeat(time_ns, counts), len(filled(told.number, 0))
+    pair = filled(told.pair, 1)
+    scan = pair[:, 1]
+    pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
+    sensors = ",".join(each.rpartition("/")[0].strip("/") for each in found.scans)
+    approximated = np.flatnonzero(told.approximated)
+    late = told.confirmed == NEVER
+    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
+    streams = (
+        (
+            make_stream(
+                f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=metadata, elements=counts
+            ),
+            offsets,
+        ),
+        (
+            make_stream(
+                f"{topic}/track",
+                schemas.TRACK_ESTIMATE,
+                track_ns,
+                metadata=metadata,
+                track_id=filled(told.number, 0),
+                mean=filled(told.mean, 0),
+                covariance=filled(told.covariance, 0).reshape(rows, TARGET.size**2),
+            ),
+            ends,
+        ),
+        (
+            make_stream(
+                f"{topic}/existence",
+                schemas.EXISTENCE,
+                track_ns,
+                existence=filled(told.existence, 0),
+            ),
+            ends,
+        ),
+        (
+            make_stream(
+                f"{topic}/association",
+                schemas.ASSOCIATION,
+                scans.time_ns[scan],
+                metadata={"sensors": sensors},
+                track_id=pair[:, 0],
+                sensor_id=scans.sensor[scan],
+                scan_id=scans.number[scan],
+                detection=pair[:, 2],
+                probability=filled(told.probability, 1),
+            ),
+            pair_ends,
+        ),
+        (
+            make_stream(
+                f"{topic}/approximation",
+                schemas.APPROXIMATION,
+                scans.time_ns[approximated],
+                tracks=told.approximated[approximated],
+            ),
+            np.searchsorted(approximated, scans.offsets),
+        ),
+        (
+            reason_stream(
+                f"{topic}/unused",
+                schemas.SKIPPED,
+                scans.time_ns[unused],
+                np.where(late[unused], 1, 0),
+                UNUSED,
+            ),
+            np.searchsorted(unused, scans.offsets),
+        ),
+        (
+            make_stream(
+                f"{topic}/rewound",
+                schemas.REWOUND,
+                scans.time_ns[: min(repeated, 1)],
+                repeated=[repeated] * min(repeated, 1),
+            ),
+            np.minimum(scans.offsets, repeated),
+        ),
+    )
+    return [Ragged(stream, bounds) for stream, bounds in streams]
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
+    """One tracker of all sensors."""
+    found = find_sensors(topics, parameters.sensors)
+    if not found.scans:
+        return []
+    names, settings = settings_of(topics, found, parameters)
+    association = parameters.association.replace("jipda", "jpda")
+    tracker = Tracker(TARGET, KINDS, association, names)
+    setup = Setup(name, found, tracker, settings, parameters.most_tracks)
+    seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
+    read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
+
+    def rewinding(back_ns: int) -> Recursive:
+        return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
+
+    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
+
+
+TRACKER = Estimator(
+    "tracks of many targets from the unordered scans of several sensors",
+    "per sensor .../scan and .../detection (places), or .../bearing beside those",
+    TrackerParameters,
+    _bind,
+    variant="association",
+)

@@ -1,0 +1,218 @@
+"""How far tracks are from the trajectories of things: trajectory GOSPA, HOTA and IDF1.
+
+Tracks and trajectories are (things, steps, axes), NaN at the steps at which one is absent.
+
+Sources: Garcia-Fernandez, Rahmathullah, Svensson, "A metric on the space of finite sets of trajectories
+for evaluation of multi-target tracking algorithms", IEEE TSP 68, 2020 (trajectory GOSPA); Luiten et al.,
+"HOTA: a higher order metric for evaluating multi-object tracking", IJCV 129, 2021; Ristani et al.,
+"Performance measures and a data set for multi-target, multi-camera tracking", ECCV 2016 (IDF1).
+"""
+
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.optimize import linear_sum_assignment, linprog
+
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+
+# More assignments of estimates to truths at one step are not gone through one by one.
+MOST_ASSIGNMENTS = 500
+THRESHOLDS = np.arange(1, 20) / 20.0
+
+
+class TrajectoryGospa(NamedTuple):
+    """Trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
+
+    total: float
+    localisation: float
+    missed: float
+    false: float
+    switching: float
+
+
+class Hota(NamedTuple):
+    """HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
+
+    hota: Floats
+    detection: Floats
+    association: Floats
+
+
+def trajectory_gospa(
+    estimates: ArrayLike,
+    truths: ArrayLike,
+    cutoff: float,
+    switch_penalty: float,
+    order: float = 2.0,
+    *,
+    exactly: bool = False,
+) -> TrajectoryGospa:
+    """Trajectory GOSPA of tracks (n, steps, axes) and trajectories (m, steps, axes), and its parts.
+
+    Two estimates that swap their truths cost the switch penalty to the power of the order each, one that
+    begins or ceases to be paired half of that. By default it is the metric's linear programme, in which
+    estimates may be shared out among truths; `exactly` goes through all assignments step by step, which
+    is for small cases.
+
+    Raises BadInput where the shapes do not agree, a cutoff or penalty is not positive, the order is
+    below 1, or there are more than MOST_ASSIGNMENTS to go through.
+    """
+    if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
+        raise BadInput(
+            f"cutoff {cutoff:g}, switch penalty {switch_penalty:g}, order {order:g}: give a positive "
+            "cutoff and penalty, and an order from 1 on"
+        )
+    first, second = _tracks(estimates, truths)
+    distance = _distances(first, second)
+    near = distance < cutoff  # what is as far apart as the cutoff is as good as not paired
+    gain = np.where(near, np.where(near, distance, 0.0) ** order - cutoff**order, 0.0)
+    half_switch = 0.5 * switch_penalty**order
+    pair = _paired_exactly(gain, half_switch) if exactly else _paired(gain, half_switch)
+    alone = 0.5 * cutoff**order
+    paired = float((pair * near).sum())
+    parts = (
+        float((pair * np.where(near, distance, 0.0) ** order).sum()),
+        alone * (_present(second).sum() - paired),
+        alone * (_present(first).sum() - paired),
+        half_switch * float(np.abs(np.diff(pair, axis=0)).sum()),
+    )
+    return TrajectoryGospa(max(sum(parts), 0.0) ** (1.0 / order), *map(float, parts))
+
+
+def _paired(gain: Floats, half_switch: float) -> Floats:
+    """The weights (steps, n, m) of pairs that the linear programme finds.
+
+    Weights w >= 0 whose rows and columns sum up to 1 at most minimise sum w * gain, which is negative,
+    and half_switch for all changes e >= |w[k + 1] - w[k]|.
+    """
+    steps, n, m = gain.shape
+    pairs = n * m
+    if steps * pairs == 0:
+        return np.zeros(gain.shape)
+    one_step = sparse.vstack(
+        [
+            sparse.kron(sparse.eye(n), np.ones((1, m))),
+            sparse.kron(np.ones((1, n)), sparse.eye(m)),
+        ]
+    )
+    sums = sparse.kron(sparse.eye(steps), one_step)
+    changes = sparse.kron(sparse.diags([-1.0, 1.0], [0, 1], (steps - 1, steps)), sparse.eye(pairs))
+    size = sparse.eye((steps - 1) * pairs)
+    bounds = sparse.bmat([[sums, None], [changes, -size], [-changes, -size]], format="csr")
+    limits = np.concatenate([np.ones(sums.shape[0]), np.zeros(2 * (steps - 1) * pairs)])
+    cost = np.concatenate([gain.ravel(), np.full((steps - 1) * pairs, half_switch)])
+    found = linprog(cost, bounds, limits, method="highs")
+    if not found.success:
+        raise BadInput(f"the linear programme of trajectory GOSPA has no solution: {found.message}")
+    return found.x[: steps * pairs].reshape(gain.shape)
+
+
+def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
+    """The best pairs (steps, n, m), 0 or 1: the shortest way through the assignments of all steps."""
+    steps, n, m = gain.shape
+    choices = _assignments(n, m)
+    changes = np.abs(choices[:, None] - choices[None]).sum(axis=(2, 3)) * half_switch
+    costs = np.einsum("sij,aij->sa", gain, choices)
+    total, before = np.zeros(len(choices)), np.zeros((steps, len(choices)), np.int64)
+    for step in range(steps):
+        if step:
+            ways = total[:, None] + changes
+            before[step] = ways.argmin(axis=0)
+            total = ways.min(axis=0)
+        total = total + costs[step]
+    chosen = int(total.argmin())
+    pair = np.zeros(gain.shape)
+    for step in range(steps - 1, -1, -1):
+        pair[step] = choices[chosen]
+        chosen = before[step, chosen]
+    return pair
+
+
+def _assignments(n: int, m: int) -> Floats:
+    """All ways (ways, n, m) to pair some of n with some of m."""
+    found = []
+    for count in range(min(n, m) + 1):
+        for rows in combinations(range(n), count):
+            for columns in permutations(range(m), count):
+                choice = np.zeros((n, m))
+                choice[list(rows), list(columns)] = 1.0
+                found.append(choice)
+                if len(found) > MOST_ASSIGNMENTS:
+                    raise BadInput(
+                        f"{n} estimates and {m} truths have more than {MOST_ASSIGNMENTS} assignments; "
+                        "take the linear programme, exactly=False"
+                    )
+    return np.array(found)
+
+
+def hota(
+    estimates: ArrayLike, truths: ArrayLike, cutoff: float, thresholds: ArrayLike = THRESHOLDS
+) -> Hota:
+    """HOTA of tracks (n, steps, axes) and trajectories (m, steps, axes), at every threshold.
+
+    Two points are similar by 1 - distance / cutoff, and at least by 0; they match from the threshold on.
+    Of a step, those pairs match that are best over the whole span. The usual single figure is the mean
+    over the thresholds .05, .10, ..., .95. Raises BadInput where the shapes do not agree or the cutoff
+    is not positive.
+    """
+    if not 0.0 < cutoff < np.inf:
+        raise BadInput(f"cutoff {cutoff:g}: give a positive one")
+    levels = np.atleast_1d(np.asarray(thresholds, float))
+    first, second = _tracks(estimates, truths)
+    similarity = np.nan_to_num(np.maximum(0.0, 1.0 - _distances(first, second) / cutoff))
+    in_track, in_thing = _present(first).sum(axis=1), _present(second).sum(axis=1)
+    either = similarity.sum(axis=1, keepdims=True) + similarity.sum(axis=2, keepdims=True) - similarity
+    shared = np.divide(similarity, either, out=np.zeros_like(similarity), where=either > 0).sum(axis=0)
+    alignment = shared / np.maximum(in_track[:, None] + in_thing - shared, 1.0)
+    matches = np.zeros((len(levels), *shared.shape))
+    for step in similarity:
+        pair = linear_sum_assignment(alignment * step, maximize=True)
+        matches[:, *pair] += step[pair] >= np.maximum(levels[:, None], np.finfo(float).tiny)
+    true_positive = matches.sum(axis=(1, 2))
+    either_count = in_track.sum() + in_thing.sum() - true_positive
+    detection = true_positive / np.maximum(either_count, 1)
+    jaccard = matches / np.maximum(in_track[:, None] + in_thing - matches, 1)
+    association = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(true_positive, 1)
+    return Hota(np.sqrt(detection * association), detection, association)
+
+
+def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float) -> float:
+    """IDF1 of tracks (n, steps, axes) and trajectories (m, steps, axes): 2 IDTP / (all points of both).
+
+    IDTP is how many points of the trajectories are nearer than the cutoff to the one track that each is
+    assigned to, so that they are most; NaN where there is no point. Raises BadInput as `hota`.
+    """
+    if not 0.0 < cutoff < np.inf:
+        raise BadInput(f"cutoff {cutoff:g}: give a positive one")
+    first, second = _tracks(estimates, truths)
+    together = (_distances(first, second) < cutoff).sum(axis=0)
+    points = int(_present(first).sum() + _present(second).sum())
+    found = together[linear_sum_assignment(together, maximize=True)].sum()
+    return 2.0 * float(found) / points if points else float("nan")
+
+
+def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
+    first, second = np.asarray(estimates, float), np.asarray(truths, float)
+    if first.ndim != 3 or second.ndim != 3 or first.shape[1:] != second.shape[1:]:
+        raise BadInput(
+            f"tracks {first.shape} and trajectories {second.shape}: give (things, steps, axes) of the "
+            "same steps and axes, NaN where one is absent"
+        )
+    return first, second
+
+
+def _present(tracks: Floats) -> NDArray[np.bool_]:
+    """At which steps each thing is there, (things, steps)."""
+    return np.asarray(np.isfinite(tracks).all(axis=2))
+
+
+def _distances(first: Floats, second: Floats) -> Floats:
+    """(steps, n, m), infinity where one is absent."""
+    difference = first[:, None] - second[None]
+    distance = np.sqrt((difference**2).sum(axis=3))
+    return np.where(np.isnan(distance), np.inf, distance).transpose(2, 0, 1)

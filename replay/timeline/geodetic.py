@@ -1,0 +1,80 @@
+"""Places on the earth: points by latitude and longitude on a map.
+
+The map's tiles come from the network; without it the points are still in their places.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from recorders.log import Stream
+from replay.judging.evaluation import Floats
+from replay.timeline.canvas import Canvas, Colour, escaped, thin
+from replay.timeline.plane import TRAIL_S, trail_of
+
+SHOWN_SHARE = 0.9
+# So many times the shown extent beyond it is far off.
+FAR = 10.0
+# How wide the map is drawn, about, and its tiles.
+MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
+
+
+def degrees_of(stream: Stream) -> Floats:
+    """Latitude and longitude (n, 2) of geodetic fixes."""
+    return np.stack([stream["latitude_deg"], stream["longitude_deg"]], axis=1)
+
+
+def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
+    """Geodetic fixes as points, and the whole way past them as a thin line; none that are far off."""
+    degrees = degrees_of(stream)
+    rows = np.flatnonzero(are_near(degrees))
+    rows = rows[thin(stream.publish_time_ns[rows])]
+    points = rr.GeoPoints.columns(positions=degrees[rows])
+    canvas.send(entity, stream.publish_time_ns[rows], points)
+    canvas.fix(entity, rr.GeoPoints.from_fields(colors=[colour], radii=rr.Radius.ui_points(4.0)))
+    way = rr.GeoLineStrings(
+        lat_lon=[degrees[rows]], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0)
+    )
+    canvas.fix(f"{entity}/way", way)
+
+
+def map_view(
+    canvas: Canvas, root: str, degrees: Floats, paths: Sequence[str] = (), trail_s: float = TRAIL_S
+) -> rrb.MapView:
+    """A map of all below `root` that shows at least the places (n, 2) that are not far off.
+
+    Of the `paths` it shows what lies up to `trail_s` before the cursor.
+    """
+    near = are_near(degrees)
+    left_out = "" if near.all() else f", {(~near).sum()} far off left out"
+    trail = trail_of(canvas, trail_s)
+    return rrb.MapView(
+        origin=escaped(root),
+        name=f"OpenStreetMap{left_out}",
+        zoom=_zoom(degrees[near]),
+        overrides={escaped(path): [trail] for path in paths},
+    )
+
+
+def usual(places: Floats) -> Floats:
+    """The corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
+    tail = 0.5 * (1.0 - SHOWN_SHARE)
+    return np.nanquantile(places, [tail, 1.0 - tail], axis=0)
+
+
+def are_near(places: Floats) -> NDArray[np.bool_]:
+    """Which places are not far off: the map's view centres on all that it has."""
+    low, high = usual(places)
+    margin = FAR * (high - low).max()
+    return ((places >= low - margin) & (places <= high + margin)).all(axis=1)
+
+
+def _zoom(degrees: Floats) -> float:
+    """The zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
+    low, high = degrees.min(axis=0), degrees.max(axis=0)
+    latitude = np.radians(0.5 * (low[0] + high[0]))
+    width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)
+    return float(np.clip(np.log2(360.0 / width * MAP_PIXELS / TILE_PIXELS), 1.0, 19.0))

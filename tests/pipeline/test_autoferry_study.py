@@ -1,0 +1,51 @@
+"""The Autoferry experiment as it ships, and what its claims stand on."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pipeline.experiment import load_experiment, run_experiment
+from pipeline.studies.autoferry import mean_interval
+from recorders.errors import BadInput
+
+
+@pytest.mark.paper
+def test_as_shipped(autoferry: Path, tmp_path: Path):
+    """The reference rows of the sheet, within its tolerances or better; bearings add nothing."""
+    name, experiment = load_experiment("autoferry", {}, {})
+    result = run_experiment(name, experiment, tmp_path / "out", data=autoferry, logs=1)
+    verdicts = [claim.verdict for claim in result.claims]
+    assert verdicts == ["confirmed"] * 6 + ["refuted"] * 2
+    rows = {
+        "jipda-radar-lidar": 9.16,
+        "jipda-all": 9.76,
+        "jipda-radar": 9.30,
+        "jipda-lidar": 11.89,
+        "jipda-radar-no-lag": 12.05,
+        "hungarian-radar-lidar": 9.32,
+        "hungarian-all": 9.62,
+        "hungarian-radar": 9.07,
+        "hungarian-lidar": 11.81,
+    }
+    for label, theirs_m in rows.items():
+        assert result.metrics[f"{label}.gospa_m"] < theirs_m + 1.0, label
+    table = pd.read_csv(tmp_path / "out" / "tables" / "scenarios.csv")
+    assert len(table) == 6 * len(experiment.estimators)
+    assert (tmp_path / "out" / "timeline.rrd").exists()
+
+
+def test_other_estimators_are_refused(autoferry: Path, tmp_path: Path):
+    over = {"estimators": {"gm-phd": {"sensor": "radar", "variance_m2": 25.0}}}
+    name, experiment = load_experiment("autoferry", {}, over)
+    with pytest.raises(BadInput, match="gm-phd tells no tracks"):
+        run_experiment(name, experiment, tmp_path / "out", data=autoferry / "scenario2")
+
+
+def test_an_interval_of_a_mean():
+    """As in a table of Student's distribution: 2.776 for five values."""
+    mean, low, high = mean_interval([1, 2, 3, 4, 5])
+    assert (mean, high - mean, mean - low) == pytest.approx(
+        (3, 2.776 * 0.7071, 2.776 * 0.7071), abs=1e-3
+    )
+    assert mean_interval([2.0])[0] == 2

@@ -1,0 +1,290 @@
+"""Campaigns: the same bytes from any workers and after any stop, and nothing worked off twice."""
+
+import json
+import pickle
+import shutil
+import subprocess
+import sys
+import time
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import campaigns
+from pipeline.command_line import main
+from pipeline.executors import Here, Team, crew_of, version_of_code
+from pipeline.experiment import load_experiment, run_experiment
+from pipeline.kept import kept_cells
+from recorders.errors import BadInput
+from replay.judging.sums import BinnedSums
+
+# Three cells, of which the last is small.
+RUNS = 260
+SETTINGS = {"duration_s": 3}
+
+
+def run(folder: Path, crew=None, runs: int = RUNS, **options) -> dict[str, bytes]:
+    """Run the experiment; returns the bytes of all files of its result but for the timeline."""
+    name, experiment = load_experiment("landmarks", SETTINGS, {"runs": runs})
+    run_experiment(name, experiment, folder, logs=2, crew=crew, **options)
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".rrd"
+    }
+
+
+def unfinished(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.unfinished")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> tuple[Path, dict[str, bytes]]:
+    """The result of one process, and its folder."""
+    folder = tmp_path_factory.mktemp("campaign") / "result"
+    return folder, run(folder, errors=True)
+
+
+@pytest.fixture
+def worked_off(monkeypatch) -> list[int]:
+    """The first runs of all cells that are worked off, as it goes."""
+    cells: list[int] = []
+    work = campaigns.Cell.packed
+
+    def packed(cell, folder):
+        cells.append(cell.first)
+        return work(cell, folder)
+
+    monkeypatch.setattr(campaigns.Cell, "packed", packed)
+    return cells
+
+
+def test_cells_are_merged_into_what_one_pass_gives(whole):
+    folder, files = whole
+    errors = pytest.importorskip("pandas").read_parquet(folder / "tables/errors/ekf-robot1.parquet")
+    runs = errors.groupby("run").size()
+    assert len(runs) == RUNS
+    assert runs.nunique() == 1
+    assert (folder / "timeline.rrd").is_file()
+    assert sum(name.startswith("logs/") for name in files) == 2
+    assert not unfinished(folder).exists()
+
+
+def test_another_way_of_working_gives_the_same_bytes(whole, tmp_path, worked_off):
+    place = whole[0]  # the same place, since estimates state where their logs are
+    kept = tmp_path / "first"
+    place.rename(kept)
+    try:
+
+        @contextmanager
+        def backwards():
+            """Works on all cells at once, and the last one is done first."""
+            yield Team(Backwards(), 3)
+
+        assert run(place, backwards, errors=True) == whole[1]
+        assert worked_off == [256, 128, 0]
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+        kept.rename(place)
+
+
+class Backwards(Here):
+    """Begins when three are there, with the last."""
+
+    def __init__(self) -> None:
+        self.waiting: list = []
+
+    def submit(self, work, /, *args):
+        """Keep the work, and do all of it when there is enough."""
+        future: Future = Future()
+        self.waiting.append((future, work, args))
+        if len(self.waiting) == 3:
+            for each, work, args in reversed(self.waiting):
+                each.set_result(work(*args))
+        return future
+
+
+def test_a_stopped_campaign_goes_on_where_it_was(tmp_path, worked_off, monkeypatch, caplog):
+    place = tmp_path / "result"
+    files = run(place)
+    shutil.rmtree(place)
+    worked_off.clear()
+    counted = campaigns.Cell.packed
+
+    def stopped(cell, folder):
+        if cell.first == 128:
+            raise KeyboardInterrupt
+        return counted(cell, folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(campaigns.Cell, "packed", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run(place)
+    assert not place.exists()
+    assert "keeps 1 finished cells; the same command goes on from there" in caplog.text
+    assert run(place) == files
+    assert "has 1 of 3 cells" in caplog.text
+    assert worked_off == [0, 128, 256]
+    assert not unfinished(place).exists()
+
+
+@pytest.mark.parametrize("what", ["settings", "code", "damaged", "a file is gone"])
+def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkeypatch):
+    place = tmp_path / "result"
+    with monkeypatch.context() as patch:
+        patch.setattr(campaigns.Kept, "hand_over", lambda *_: 1 / 0)
+        with pytest.raises(BadInput, match="division by zero"):
+            run(place, runs=130)
+    worked_off.clear()
+    if what == "code":
+        monkeypatch.setattr(campaigns, "version_of_code", lambda: "another")
+    elif what == "damaged":
+        for path in unfinished(place).glob("*.bin"):
+            path.write_bytes(path.read_bytes()[:-1])
+    elif what == "a file is gone":
+        next(unfinished(place).glob("*/logs/run-0001.mcap")).unlink()
+    run(place, runs=131 if what == "settings" else 130)
+    assert worked_off == ([0] if what == "a file is gone" else [0, 128])
+    assert not unfinished(place).exists()
+
+
+def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off):
+    teams = []
+
+    @contextmanager
+    def dying():
+        teams.append(Dying(deaths=len(teams) < 2))
+        yield Team(teams[-1], 2)
+
+    files = run(tmp_path / "result", dying)
+    assert len(teams) == 3
+    assert worked_off == [128, 256, 0]  # the first cell died beside 128, then beside 256
+    assert json.loads(files["result.json"])["settings"]["runs"] == RUNS
+
+    @contextmanager
+    def hopeless():
+        yield Team(Dying(deaths=True), 1)
+
+    with pytest.raises(BadInput, match="runs 0 to 127: the process that worked on them died 3 times"):
+        run(tmp_path / "other", hopeless)
+
+
+class Dying(Here):
+    """The process of the first cell dies, as in a pool, which is then of no use."""
+
+    def __init__(self, *, deaths: bool) -> None:
+        self.deaths = deaths
+
+    def submit(self, work, /, *args, **kwargs):
+        """Die at the first work."""
+        if self.deaths:
+            self.deaths = False
+            future: Future = Future()
+            future.set_exception(BrokenExecutor("it was killed"))
+            return future
+        return super().submit(work, *args, **kwargs)
+
+
+def test_what_is_not_ours_stays(tmp_path):
+    place = tmp_path / "result"
+    unfinished(place).mkdir()
+    note = unfinished(place) / "thesis.txt"
+    note.write_text("years of work")
+    with pytest.raises(BadInput, match=r"holds thesis\.txt, which is not fuselog's; move it away"):
+        run(place, runs=130)
+    assert note.read_text() == "years of work"
+    note.unlink()
+    with kept_cells(place) as kept:
+        kept.begin()
+        with pytest.raises(BadInput, match="another fuselog is at work on this"):
+            run(place, runs=130)
+
+
+def test_a_metric_that_cannot_be_pickled_is_bad_input(monkeypatch, tmp_path):
+    work = campaigns.Cell.work_off
+
+    def unpicklable(cell, folder):
+        done = work(cell, folder)
+        done.judge._names[0] = lambda: 0
+        return done
+
+    monkeypatch.setattr(campaigns.Cell, "work_off", unpicklable)
+    with pytest.raises(BadInput, match="what a metric keeps cannot go to another process"):
+        run(tmp_path / "result", runs=130)
+
+
+def test_bins_of_very_many_runs_are_wider():
+    whole, parts = (BinnedSums(1, width=1, limit=8, cells=32) for _ in range(2))
+    rng = np.random.default_rng(5)
+    for first in range(0, 12, 2):
+        part = BinnedSums(1, width=1, limit=8, cells=32)
+        position, values = rng.integers(0, 8, 40), rng.normal(size=(40, 1))
+        part.add(position, values, rng.integers(first, first + 2, 40))
+        parts.merge(pickle.loads(pickle.dumps(part)))
+        whole.merge(part)
+    cells, count, sums = parts.filled()
+    assert parts.width == 4
+    assert len(cells) <= 32
+    assert count.sum() == 240
+    assert np.array_equal(sums, whole.filled()[2])
+
+
+def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
+    out = ["--out", str(tmp_path / "result")]
+    begin = ["run", "landmarks", "--runs", "130", *out]
+    assert main([*begin, "--workers", "2", "--scheduler", "local:2"]) == 2
+    assert "the scheduler has its own; give one" in capsys.readouterr().err
+    assert main([*begin, "--workers", "0"]) == 2
+    pytest.importorskip("distributed")
+    assert main([*begin, "--scheduler", "local:many"]) == 2
+    assert "give local:N with a number of workers" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_version_of_the_code_is_of_all_sources():
+    assert version_of_code() == version_of_code.__wrapped__()
+    assert len(version_of_code()) == 64
+
+
+@pytest.mark.paper
+def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
+    place = tmp_path / "result"
+    files = run(place)
+    shutil.rmtree(place)
+    assert run(place, crew_of(2, None, RUNS)) == files
+    shutil.rmtree(place)
+    command = [
+        "run",
+        "landmarks",
+        "--runs",
+        str(RUNS),
+        "--logs",
+        "2",
+        "--out",
+        str(place),
+        "--set",
+        "duration_s=3",
+    ]
+    fuselog = Path(sys.executable).with_name("fuselog")
+    begun = subprocess.Popen([fuselog, *command, "--workers", "2"], stderr=subprocess.PIPE)
+    while not list(unfinished(place).glob("*.bin")):
+        assert begun.poll() is None, begun.communicate()
+        time.sleep(0.01)
+    begun.kill()
+    begun.communicate()
+    assert not place.exists()
+    assert main([*command, "--workers", "2"]) == 0
+    assert (place / "result.json").read_bytes() == files["result.json"]
+    assert not unfinished(place).exists()
+
+
+@pytest.mark.paper
+def test_dask_workers_give_the_same_bytes(tmp_path):
+    pytest.importorskip("distributed")
+    place = tmp_path / "result"
+    files = run(place)
+    shutil.rmtree(place)
+    assert run(place, crew_of(None, "local:2", RUNS)) == files

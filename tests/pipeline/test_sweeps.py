@@ -1,0 +1,94 @@
+"""Sweeps: the points that are asked for, and at each what a run of its own gives."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import fuselog as fl
+from pipeline.command_line import main
+from pipeline.sweeps import parse_over, points_of
+from recorders.errors import BadInput
+
+SHORT = ["--runs", "4", "--set", "duration_s=3"]
+
+
+def test_points_are_all_of_the_grid_the_last_parameter_first():
+    over = [parse_over("ekf.sigma_range_m=0.1:0.4:log3"), parse_over("robots=1,2")]
+    points = points_of(over)
+    assert [point["robots"] for point in points] == [1, 2] * 3
+    assert [point["ekf.sigma_range_m"] for point in points[::2]] == [0.1, 0.2, 0.4]
+
+
+@pytest.mark.parametrize("sampling", ["sobol", "random"])
+def test_samples_fill_the_ranges_and_follow_from_the_seed(sampling):
+    over = [parse_over("a=1:100:log2"), parse_over("b=-1:1:2"), parse_over("c=x,y")]
+    points = points_of(over, 64, sampling, seed=3)
+    assert points == points_of(over, 64, sampling, seed=3)
+    assert points != points_of(over, 64, sampling, seed=4)
+    table = pd.DataFrame(points)
+    assert table["a"].between(1, 100).all()
+    assert table["b"].between(-1, 1).all()
+    assert set(table["c"]) == {"x", "y"}
+    assert np.log10(table["a"]).mean() == pytest.approx(1.0, abs=0.02 if sampling == "sobol" else 0.3)
+
+
+def test_a_sweep_gives_at_every_point_what_a_run_gives(tmp_path, capsys):
+    swept = ["--over", "ekf.sigma_range_m=0.05,0.4", "--over", "ekf.gate_probability=0.9,1.0"]
+    assert main(["sweep", "landmarks", *swept, *SHORT, "--out", str(tmp_path / "sweep"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    point = result["settings"]["sweep"][1]
+    assert point == {"ekf.sigma_range_m": 0.05, "ekf.gate_probability": 1.0}
+    single = [f"--set={key}={value}" for key, value in point.items()]
+    assert main(["run", "landmarks", *SHORT, *single, "--out", str(tmp_path / "one"), "--json"]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    for key, value in alone["metrics"].items():
+        assert result["metrics"][key][1] == value, key
+    table = pd.read_parquet(tmp_path / "sweep" / "tables" / "sweep.parquet")
+    rmse = table[(table["estimator"] == "ekf") & (table["quantity"] == "position_rmse_m")]
+    assert (rmse["low"] <= rmse["value"]).all()
+    assert (rmse["value"] <= rmse["high"]).all()
+    assert len(rmse) == 4
+    assert (tmp_path / "sweep" / "figures" / "position_rmse_m-robot1.svg").is_file()
+    assert not (tmp_path / "sweep.unfinished").exists()
+    assert main(["report", str(tmp_path / "sweep"), "--out", str(tmp_path / "sweep.html")]) == 0
+
+
+def test_the_door_sweeps_as_the_command_does(tmp_path):
+    over = {"ekf.sigma_range_m": np.geomspace(0.1, 0.4, 3)}
+    out = tmp_path / "sweep"
+    folder = fl.sweep("landmarks", over, runs=2, out=out, set={"duration_s": 3})
+    assert [each["ekf.sigma_range_m"] for each in folder.result.settings["sweep"]] == [
+        pytest.approx(value) for value in (0.1, 0.2, 0.4)
+    ]
+    values = folder.result.metrics["ekf.position_rmse_m.robot1"]
+    assert len(values) == 3
+    assert all(math.isfinite(value) for value in values)
+
+
+@pytest.mark.parametrize(
+    ("over", "sentence"),
+    [
+        ("ekf.sigma=1:2:3", "no such"),
+        ("robots", "expected KEY=LOW:HIGH:N"),
+        ("robots=", "expected KEY=LOW:HIGH:N"),
+        ("robots=2:1:3", "LOW below HIGH"),
+        ("robots=0:1:log3", "LOW above 0"),
+        ("robots=1:2:x", "N from 2 on"),
+        ("robots=1,1", "each once"),
+        ("duration_s=1:2:200000", "100000 are the most"),
+    ],
+)
+def test_what_cannot_be_swept_is_bad_input(over, sentence, tmp_path, capsys):
+    assert main(["sweep", "landmarks", "--over", over, "--out", str(tmp_path / "sweep")]) == 2
+    said = capsys.readouterr().err
+    assert sentence in said or (sentence == "no such" and "sigma" in said)
+    assert "Traceback" not in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_study_of_its_own_is_not_swept(tmp_path):
+    with pytest.raises(BadInput, match="does more than judge"):
+        fl.sweep("torus-filter", {"seed": [1, 2]}, out=tmp_path / "sweep")

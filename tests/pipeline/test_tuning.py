@@ -1,0 +1,227 @@
+"""Tuning: the reference sheet's numbers, what logs cannot tell, and what is refused."""
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.tuning.objective import Best
+from tests.replay.inference.scalar import EPOCH_NS, SCALAR, source
+from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
+
+Fuselog = Callable[..., Any]
+NILE = (
+    "1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 "
+    "1100 1210 1150 1250 1260 1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 "
+    "831 726 456 824 702 1120 1100 832 764 821 768 845 864 862 698 845 744 796 1040 759 "
+    "781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801 1040 860 874 848 890 "
+    "744 749 838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740 "
+)
+
+
+def test_the_local_level_of_the_nile() -> None:
+    """Durbin and Koopman, 2.10: annual flow in 1e8 m^3; a prior of variance p costs 1/2 log p."""
+    flow = np.array(NILE.split(), float)
+    variance = 1e10
+    log = source(flow)
+    prior = {"mean": flow[:1, None], "covariance": np.array([[variance]])}
+    streams = {
+        **log.streams,
+        "/prior": fl.make_stream(
+            "/prior",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            [EPOCH_NS],
+            metadata=log.streams["/prior"].metadata,
+            **prior,
+        ),
+    }
+    log = replace(log, streams=streams)
+    start = {"kept": 1.0, "sigma_moved": 100.0, "sigma_measured": 50.0}
+    free = {"sigma_measured": (1.0, 1e4), "sigma_moved": (0.1, 1e3)}  # positive, unlike the model's
+    found = fl.tune(log, {"level": fl.modelled(SCALAR, "ekf")}, [*free], set=start, bounds=free)
+    variances = found.parameters["value"] ** 2
+    assert variances.tolist() == pytest.approx([15098.518, 1469.176], rel=1e-5)
+    assert 0.5 * np.log(variance) - found.costs[1] == pytest.approx(-633.464563636, abs=1e-6)
+    told = found.found.told
+    assert told is not None
+    assert (2.0 * told.errors).tolist() == pytest.approx([0.2083, 0.8715], abs=5e-5)
+    eigenvalues = np.linalg.eigvalsh(told.curvature)
+    assert eigenvalues.tolist() == pytest.approx([5.15, 150.0], rel=1e-3)
+    assert eigenvalues[1] / eigenvalues[0] == pytest.approx(29.1, abs=0.05)
+    assert not found.notes
+
+
+def test_the_robot_of_the_sheet() -> None:
+    start = of_sigmas(0.3, 0.02, 0.6, 0.1)
+    found = fl.tune(recorded(500, 100.0), "ekf", FREE, set={**start, "gate_probability": 1.0})
+    sigmas = found.parameters["value"] / [DENSITY, DENSITY, 1.0, 1.0]
+    assert sigmas.tolist() == pytest.approx([0.07487878, 0.04285785, 0.18738070, 0.02942065], rel=1e-4)
+    assert -found.costs[1] == pytest.approx(425.88893017, abs=1e-7)
+    told = found.found.told
+    assert told is not None
+    assert told.errors.tolist() == pytest.approx([0.442, 0.1724, 0.0526, 0.0598], rel=2e-3)
+    assert np.linalg.eigvalsh(told.curvature).tolist() == pytest.approx(
+        [5.094, 34.43, 297.4, 365.3], rel=1e-3
+    )
+    low, high = found.parameters[["low", "high"]].to_numpy().T
+    np.testing.assert_allclose(np.log(high / low), 2 * 1.96 * told.errors, rtol=1e-4)
+    nis = found.metrics.query("quantity == 'nis_per_component'")["value"]
+    assert (400 * nis).tolist() == pytest.approx([63.3, 398.5], abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def short() -> fl.MemorySource:
+    """Twenty seconds of the sheet's robot, which tell little of its odometry."""
+    return recorded(500, 20.0)
+
+
+def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
+    """Short logs leave the speed's noise open; a value at a bound has no interval."""
+    given = {**of_sigmas(0.1, 0.05, 0.2, 0.03), "gate_probability": 1.0}
+    found = fl.tune(short, "ekf", FREE, set=given)
+    assert any(
+        re.match("forward_noise_density: .*(not at all|factor|bound)", each) for each in found.notes
+    )
+    bounds = {"sigma_range_m": (0.1, 0.15)}
+    with pytest.raises(fl.BadInput, match=r"--bound sigma_range_m=0.1:0.15: the search starts from 0.2"):
+        fl.tune(short, "ekf", ["sigma_range_m"], set=given, bounds=bounds)
+    given["sigma_range_m"] = 0.12
+    bounded = fl.tune(short, "ekf", ["sigma_range_m", "sigma_bearing_rad"], set=given, bounds=bounds)
+    assert bounded.notes[0].startswith("sigma_range_m: is best at its upper bound 0.15")
+    intervals = bounded.parameters.set_index("parameter")["low"]
+    assert np.isnan(intervals["sigma_range_m"])
+    assert intervals["sigma_bearing_rad"] > 0
+    assert list(bounded.correlation) == ["sigma_bearing_rad"]
+
+
+@pytest.mark.parametrize(
+    ("free", "options", "sentence"),
+    [
+        (
+            "sigma_rnge_m",
+            {},
+            "--free sigma_rnge_m: no parameter 'sigma_rnge_m'; did you mean 'sigma_range_m'",
+        ),
+        ("gate_probability", {}, "--free gate_probability: "),
+        ("mode", {}, "--free mode: parameter 'mode' is no number"),
+        ([], {}, "--free: name at least one"),
+        (["sigma_range_m"] * 2, {}, "--free sigma_range_m: is named twice"),
+        (
+            "turn_noise_density",
+            {"set": {"turn_noise_density": 0.0}},
+            "starts from 0; give a start above zero",
+        ),
+        ("sigma_range_m", {"by": "rmse"}, "gives no truth to judge its estimates by"),
+        ("sigma_range_m", {"by": "luck"}, "--by luck: there are: likelihood, nis"),
+        (
+            "sigma_range_m",
+            {"bounds": {"sigma_bearing_rad": (0.1, 1)}},
+            "--bound sigma_bearing_rad: is not",
+        ),
+        ("sigma_range_m", {"folds": 2}, "--folds 2: 1 logs can be cut into 2 to 1 parts"),
+        ("bias_range_m", {"grid": 3}, "bias_range_m: a grid goes from bound to bound"),
+        ("sigma_range_m", {"grid": 10_001}, "--grid 10001: that is 10001 points of 1 parameters"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(
+    short: fl.MemorySource, free: str, options: dict[str, Any], sentence: str
+) -> None:
+    given = {"set": of_sigmas(0.1, 0.05, 0.2, 0.03), **options}
+    given["set"] = {**of_sigmas(0.1, 0.05, 0.2, 0.03), **given["set"]}
+    with pytest.raises(fl.BadInput, match=re.escape(sentence)):
+        fl.tune(short, "ekf", free, **given)
+
+
+def test_a_parameter_that_no_message_depends_on_is_refused(short: fl.MemorySource) -> None:
+    given = of_sigmas(0.1, 0.05, 0.2, 0.03)
+    sights = short.streams["/robot/range_bearing"]
+    blind = {**short.streams, "/robot/range_bearing": sights.take(slice(0, 0))}
+    with pytest.raises(fl.BadInput, match="gives no innovations with a likelihood"):
+        fl.tune(replace(short, streams=blind), "ekf", "sigma_range_m", set=given)
+    with pytest.raises(fl.BadInput, match="every_s: nothing in the logs depends on it"):
+        fl.tune(short, "ekf", ["sigma_range_m", "every_s"], set={**given, "every_s": 1e6})
+
+
+def test_ctrl_c_ends_with_the_best_so_far(short: fl.MemorySource) -> None:
+    told: list[Best] = []
+
+    def stop(best: Best) -> None:
+        told.append(best)
+        if len(told) == 12:
+            raise KeyboardInterrupt
+
+    found = fl.tune(short, "ekf", FREE, set=of_sigmas(0.5, 0.5, 0.5, 0.5), on_best=stop)
+    assert found.notes[0].startswith("stopped after ")
+    assert found.parameters["value"].tolist() == told[-1].point.tolist()
+    assert found.costs[1] == told[-1].cost < found.costs[0]
+    assert [each.cost for each in told] == sorted((each.cost for each in told), reverse=True)
+
+
+def test_the_command_tunes_and_its_settings_replay(
+    fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for run in ("0", "1"):
+        told = fuselog(
+            "record", "landmarks", "--run", run, "--set", "duration_s=15", "-o", f"{run}.mcap"
+        )
+        assert told.code == 0
+    off = ("--set", "sigma_range_m=0.5", "--set", "sigma_bearing_rad=0.1")
+    free = ("--free", "sigma_range_m", "--free", "sigma_bearing_rad")
+    told = fuselog("tune", "0.mcap", "-e", "ekf", *free, *off, "--validate", "1.mcap", "--json")
+    assert (told.code, told.err) == (0, "")
+    rows = {row["parameter"]: row for row in told.json["parameters"]}
+    for name, sigma in (("sigma_range_m", 0.1), ("sigma_bearing_rad", 0.02)):
+        assert rows[name]["value"] == pytest.approx(sigma, rel=0.1)
+        assert rows[name]["low"] < rows[name]["value"] < rows[name]["high"]
+    assert any(re.match("logs held out: .*: better", note) for note in told.json["notes"])
+    metrics = told.json["metrics"]
+    for label in ("tuned", "tuned-held-out"):
+        assert metrics[f"{label}.nis_per_component.robot1"] == pytest.approx(1.0, abs=0.2)
+        start = label.replace("tuned", "start")
+        key = "position_rmse_m.robot1"
+        assert metrics[f"{label}.{key}"] < metrics[f"{start}.{key}"]
+    names = {path.name for path in Path("out/tune").rglob("*")}
+    assert names >= {
+        "settings.toml",
+        "timeline.rrd",
+        "profiles.svg",
+        "errors-robot1.svg",
+        "whiteness.csv",
+    }
+    tuned = tomllib.loads(Path("out/tune/settings.toml").read_text())
+    assert tuned == {"ekf": {name: row["value"] for name, row in rows.items()}}
+    settings = ("--settings", "out/tune/settings.toml")
+    again = fuselog("replay", "0.mcap", "-e", "ekf", *settings, "--json")
+    assert again.json["metrics"]["ekf.log_likelihood.robot1"] == metrics["tuned.log_likelihood.robot1"]
+    run = fuselog(
+        "run",
+        "0.mcap",
+        "-e",
+        "ekf",
+        *settings,
+        "--set",
+        "ekf.sigma_range_m=0.3",
+        "--out",
+        "run",
+        "--json",
+    )
+    parameters = run.json["settings"]["parameters"]["ekf"]
+    assert parameters["sigma_range_m"] == 0.3
+    assert parameters["sigma_bearing_rad"] == tuned["ekf"]["sigma_bearing_rad"]
+    refused = fuselog("replay", "0.mcap", "-e", "ukf", *settings)
+    assert (refused.code, refused.err) == (
+        2,
+        "fuselog: out/tune/settings.toml: has settings of ekf, and a settings file has a table for each "
+        "estimator that is replayed: ukf\n",
+    )
+    bounds = fuselog("tune", "0.mcap", "-e", "ekf", *free, "--bound", "sigma_range_m=1")
+    assert bounds.err == (
+        "fuselog: --bound sigma_range_m=1: expected NAME=LOW:HIGH, as sigma_range_m=0.01:1\n"
+    )

@@ -1,0 +1,549 @@
+"""Tables of others become logs by mappings: columns, units, times and axes are what the mapping says."""
+
+import gzip
+import json
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.importers.tables import files
+from recorders.importers.tables.mapping import read_mapping, shipped
+from recorders.log import Stream, open_log, read_streams
+from recorders.recording import import_log, import_run
+
+GRAVITY = 9.80665
+INERTIAL = """
+[[tables]]
+time = { column = "time" }
+[[tables.streams]]
+topic = "/inertial"
+becomes = "InertialSample"
+fields = { specific_force_mps2 = ["ax", "ay", "az"], turn_rate_radps = ["gx", "gy", "gz"] }
+units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }
+"""
+ROWS = (
+    "time,ax,ay,az,gx,gy,gz,note\n1756402240.961,.1,.2,1,10,20,30,a\n1756402240.9670007,0,0,1,-5,0,5,b\n"
+)
+FIX = """
+[[tables]]
+time = { column = "t" }
+geodetic = { latitude = "lat", longitude = "lon", altitude = "h" }
+[[tables.streams]]
+topic = "/fix"
+becomes = "GeodeticFix"
+fields = { latitude_deg = "lat", longitude_deg = "lon", altitude_m = "h" }
+[[tables.streams]]
+topic = "/truth"
+becomes = "TruthState"
+fields = { state = ["east_m", "north_m", "up_m"] }
+components = "x_m,y_m,z_m"
+"""
+
+
+@pytest.fixture
+def imported(tmp_path: Path) -> Callable[..., tuple[dict[str, Stream], dict[str, str]]]:
+    """Imports a table by a mapping, which may be text: its streams and notes."""
+
+    def run(path: Path | str, mapping: str, *more: Path) -> tuple[dict[str, Stream], dict[str, str]]:
+        if isinstance(path, str):
+            (tmp_path / "table.csv").write_text(path)
+            path = tmp_path / "table.csv"
+        if "\n" in mapping:
+            (tmp_path / "mapping.toml").write_text(mapping)
+            mapping = str(tmp_path / "mapping.toml")
+        values = {"mapping": mapping, "more": [str(each) for each in more]}
+        recording, run = import_run("table", path, values)
+        return {stream.topic: stream for stream in recording.streams}, run.notes
+
+    return run
+
+
+@pytest.fixture
+def refusal(tmp_path: Path, imported: Callable[..., Any]) -> Callable[..., str]:
+    """Why a table is refused, of which nothing is written."""
+
+    def run(path: Path | str, mapping: str) -> str:
+        with pytest.raises(BadInput) as refused:
+            imported(path, mapping)
+        values = {"mapping": str(tmp_path / "mapping.toml")}
+        with pytest.raises(BadInput):
+            import_log("table", tmp_path / "table.csv", values, tmp_path / "log.mcap")
+        assert not list(tmp_path.glob("*log*"))
+        sentence = str(refused.value)
+        assert "\n" not in sentence
+        return sentence.replace(f"{tmp_path}/", "")
+
+    return run
+
+
+def test_units_stamps_and_columns(imported: Callable[..., Any]) -> None:
+    """Numbers in fuselog's units, stamps to the last digit written; what is not taken is told."""
+    streams, notes = imported(ROWS, INERTIAL)
+    inertial = streams["/inertial"]
+    assert_allclose(inertial["specific_force_mps2"], np.array([[0.1, 0.2, 1], [0, 0, 1]]) * GRAVITY)
+    assert_allclose(inertial["turn_rate_radps"], np.radians([[10, 20, 30], [-5, 0, 5]]))
+    assert inertial.publish_time_ns.tolist() == [1756402240_961000000, 1756402240_967000700]
+    assert notes["table.csv"] == "2 rows as /inertial"
+    assert notes["table.csv: columns not taken"] == "note"
+    by_number = INERTIAL.replace('["ax", "ay", "az"]', '["2", "3", "4"]')
+    assert_array_equal(
+        imported(ROWS, by_number)[0]["/inertial"]["specific_force_mps2"], inertial["specific_force_mps2"]
+    )
+
+
+@pytest.mark.parametrize(
+    "form", ["tsv", "semicolon", "spaces", "comment", "headless", "gz", "parquet", "jsonl", "npz"]
+)
+def test_one_table_in_many_formats(form: str, imported: Callable[..., Any], tmp_path: Path) -> None:
+    """The same numbers and stamps, however they are written."""
+    plain = ROWS.replace(",note", "").replace(",a\n", "\n").replace(",b\n", "\n")
+    expected = imported(plain, INERTIAL)[0]["/inertial"]
+    mapping, path = INERTIAL, tmp_path / f"rows.{form}"
+    frame = pd.read_csv(tmp_path / "table.csv")
+    if form == "parquet":
+        frame.to_parquet(path)
+    elif form == "jsonl":
+        lines = [
+            {"time": t, "imu": {"ax": ax, "ay": ay, "az": az}, "rate": [gx, gy, gz]}
+            for t, ax, ay, az, gx, gy, gz in frame.itertuples(index=False)
+        ]
+        path.write_text("\n".join(map(json.dumps, lines)))
+        for name in ("ax", "ay", "az"):
+            mapping = mapping.replace(f'"{name}"', f'"imu.{name}"')
+        for index, name in enumerate(("gx", "gy", "gz")):
+            mapping = mapping.replace(f'"{name}"', f'"rate.{index}"')
+    elif form == "npz":
+        rates = frame[["gx", "gy", "gz"]].to_numpy()
+        np.savez(path, rate=rates, **{name: frame[name] for name in ("time", "ax", "ay", "az")})
+        for index, name in enumerate(("gx", "gy", "gz")):
+            mapping = mapping.replace(f'"{name}"', f'"rate.{index}"')
+    elif form == "gz":
+        path = tmp_path / "rows.csv.gz"
+        path.write_bytes(gzip.compress(plain.encode()))
+    else:
+        text = {
+            "tsv": plain.replace(",", "\t"),
+            "semicolon": plain.replace(",", ";").replace(".", ","),
+            "spaces": plain.replace(",", "   "),
+            "comment": f"# recorded by hand\n#{plain}",
+            "headless": plain.partition("\n")[2],
+        }[form]
+        path.write_text(text)
+        further = {
+            "semicolon": 'decimal = ","',
+            "headless": 'columns = ["time", "ax", "ay", "az", "gx", "gy", "gz"]',
+        }
+        mapping = mapping.replace("[[tables]]", f"[[tables]]\n{further.get(form, '')}", 1)
+    found = imported(path, mapping)[0]["/inertial"]
+    for name in ("specific_force_mps2", "turn_rate_radps"):
+        assert_array_equal(found[name], expected[name])
+    apart_ns = np.abs(found.publish_time_ns - expected.publish_time_ns)
+    assert apart_ns.max() <= (200 if form in ("parquet", "jsonl", "npz") else 0)
+
+
+@pytest.mark.parametrize(
+    ("cells", "told", "expected"),
+    [
+        (["1.7345014855003267e+18"], 'column = "t", unit = "ns"', 1734501485_500326700),
+        (["1734501485317395687"], 'column = "t", unit = "ns"', 1734501485_317395687),
+        (["0.09999999999999432"], 'column = "t", zero = "2026-01-01"', 1767225600_100000000),
+        (["8333"], 'column = "t", unit = "us", zero = "2026-01-01"', 1767225600_008333000),
+        (
+            ["2022-08-15 9:37:27.039"],
+            'column = "t", unit = "date", utc_offset_h = 8',
+            1660527447_039000000,
+        ),
+        (["2022-08-15T01:37:27.039Z"], 'column = "t", unit = "date"', 1660527447_039000000),
+        (["2025/08/28", "17:30:39.749"], 'column = ["t", "u"], unit = "date"', 1756402239_749000000),
+        (
+            ["28.08.2025 17:30"],
+            'column = "t", unit = "date", format = "%d.%m.%Y %H:%M"',
+            1756402200_000000000,
+        ),
+        (["408639.749", "2381"], 'column = "t", week = "u"', 1756402239_749000000),
+        (["408639.749", "2381"], 'column = "t", week = "u", leap_seconds = 18', 1756402221_749000000),
+    ],
+)
+def test_times(cells: list[str], told: str, expected: int, imported: Callable[..., Any]) -> None:
+    """Every way to write a time comes to the nanosecond; GPS time stays as it is written."""
+    text = f"{','.join('tuvw'[: len(cells)])},x\n{','.join(cells)},1\n"
+    mapping = f"""
+[[tables]]
+time = {{ {told} }}
+[[tables.streams]]
+topic = "/x"
+becomes = "VectorMeasurement"
+fields = {{ value = ["x"] }}
+"""
+    assert imported(text, mapping)[0]["/x"].publish_time_ns.tolist() == [expected]
+
+
+def test_rates_delays_arrival_and_time_tags(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """Stamps of a rate, stamps that come late by a stated delay, and those of RTKLIB's time tag."""
+    mapping = """
+[[tables]]
+time = { rate_hz = 8, zero = "2026-01-01" }
+[[tables.streams]]
+topic = "/x"
+becomes = "VectorMeasurement"
+fields = { value = ["x"] }
+delay_s = 0.5
+"""
+    found = imported("x,tick\n1,5000\n2,5500\n3,7000\n", mapping)[0]["/x"]
+    since = found.publish_time_ns - 1767225600_000000000
+    assert since.tolist() == [-500000000, -375000000, -250000000]
+    assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 3
+    head = b"TIMETAG RTKLIB demo5".ljust(64, b"\0") + struct.pack("<Id", 1756402240, 0.25)
+    (tmp_path / "raw.csv.tag").write_bytes(head + struct.pack("<6I", 0, 0, 500, 10, 2002, 20))
+    (tmp_path / "raw.csv").write_text("80\n1,5000\n2,5500\n3,7000\n4,70")  # both ends are cut
+    tagged = mapping.replace(
+        'rate_hz = 8, zero = "2026-01-01"', 'column = "tick", unit = "ms", tag = ".tag"'
+    ).replace("[[tables]]", '[[tables]]\ncolumns = ["x", "tick"]', 1)
+    streams, notes = imported(tmp_path / "raw.csv", tagged.replace("0.5", "0.0"))
+    since = streams["/x"].publish_time_ns - 1756402240_250000000
+    assert since.tolist() == [0, 500_500_000, 2_002_000_000]  # 2000 ms of the counter are 2002
+    assert notes["raw.csv: rows left out, of another number of cells than 2"] == "1"
+    assert notes["raw.csv: rows without a time are left out"] == "1"
+    (tmp_path / "raw.csv.tag").write_bytes(b"no tag")
+    with pytest.raises(BadInput, match="is no time tag of RTKLIB"):
+        imported(tmp_path / "raw.csv", tagged)
+
+
+def test_many_messages_of_a_row_and_what_is_missing(imported: Callable[..., Any]) -> None:
+    """A row of ranges is a message for each; empty cells and such as stand for none are left out."""
+    mapping = """
+[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/ranges"
+becomes = "AnchorRange"
+units = { range_m = "cm" }
+missing = [0]
+each = [
+  { anchor_id = 0, tag_id = 0, range_m = "a" },
+  { anchor_id = 0, tag_id = 1, range_m = "b" },
+  { anchor_id = 1, tag_id = 0, range_m = "c" },
+]
+[[constants]]
+topic = "/anchors"
+becomes = "Landmark"
+rows = [{ landmark_id = 0, position_m = [0, 0, 1] }, { landmark_id = 1, position_m = [3, 0, 1] }]
+"""
+    streams, notes = imported("t,a,b,c\n1,100,200,300\n2,,0,310\n,1,1,1\n", mapping)
+    ranges, anchors = streams["/ranges"], streams["/anchors"]
+    assert ranges["range_m"].tolist() == [1, 2, 3, 3.1]
+    assert ranges["anchor_id"].tolist() == [0, 0, 1, 1]
+    assert ranges["tag_id"].tolist() == [0, 1, 0, 0]
+    assert ranges.publish_time_ns.tolist() == [10**9, 10**9, 10**9, 2 * 10**9]
+    assert anchors["position_m"].tolist() == [[0, 0, 1], [3, 0, 1]]
+    assert anchors.publish_time_ns.tolist() == [10**9, 10**9]
+    assert notes["/ranges: messages left out: NaN or infinite"] == "2"
+    assert notes["table.csv: rows without a time are left out"] == "1"
+
+
+def test_axes_and_attitudes(imported: Callable[..., Any]) -> None:
+    """A mounting turns vectors, covariances and orientations; a heading east is the identity."""
+    mapping = """
+[[tables]]
+time = { column = "t" }
+attitude = { heading = "heading", pitch = "pitch", roll = "roll" }
+[[tables.streams]]
+topic = "/twist"
+becomes = "Twist"
+fields = { velocity_mps = ["vx", "vy", 0], turn_rate_radps = [0, 0, 0] }
+deviations = { covariance = [1, 2, 3, 4, 5, 6] }
+mounting_deg = [0, 0, 90]
+[[tables.streams]]
+topic = "/orientation"
+becomes = "Orientation"
+fields = { quaternion = ["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"] }
+[[tables.streams]]
+topic = "/turned"
+becomes = "Orientation"
+fields = { quaternion = ["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"] }
+mounting_deg = [180, 0, 0]
+"""
+    text = "t,vx,vy,heading,pitch,roll\n1,1,0,90,0,0\n2,0,1,0,30,0\n3,0,1,90,0,20\n"
+    streams, _ = imported(text, mapping)
+    assert_allclose(streams["/twist"]["velocity_mps"], [[0, 1, 0], [-1, 0, 0], [-1, 0, 0]], atol=1e-15)
+    covariance = np.diag(streams["/twist"]["covariance"][0].reshape(6, 6))
+    assert_allclose(covariance, [4, 1, 9, 25, 16, 36])
+    turn = Rotation.from_quat(streams["/orientation"]["quaternion"], scalar_first=True)
+    forward, left = turn.apply([1, 0, 0]), turn.apply([0, 1, 0])
+    half = np.sqrt(0.75)
+    assert_allclose(forward, [[1, 0, 0], [0, half, 0.5], [1, 0, 0]], atol=1e-15)
+    assert_allclose(left[0], [0, 1, 0], atol=1e-15)
+    assert left[2, 2] == pytest.approx(np.sin(np.radians(20)))  # the right side is down
+    turned = Rotation.from_quat(streams["/turned"]["quaternion"], scalar_first=True)
+    assert_allclose(turned.apply([0, 1, 1]), turn.apply([0, -1, -1]), atol=1e-15)
+
+
+def test_planes_priors_and_angles(imported: Callable[..., Any], refusal: Callable[..., str]) -> None:
+    """Places in rad on a stated plane or a map; a prior of the first row, the truth of some."""
+    text = "t,lat,lon,h,head,mode\n" + "".join(
+        f"{row},{np.radians(50 + row / 1000)},{np.radians(9)},110,{10 * row},{mode}\n"
+        for row, mode in enumerate(["fixed", "float", "fixed "])
+    )
+    mapping = FIX.replace('altitude = "h"', 'altitude = "h", unit = "rad"').replace(
+        '"h" }\n[[', '"h" }\nunits = { latitude_deg = "rad", longitude_deg = "rad" }\n[['
+    )
+    mapping += """where = { mode = "fixed" }
+[[tables.streams]]
+topic = "/prior"
+becomes = "GaussianEstimate"
+fields = { mean = ["east_m", "north_m", "head"] }
+deviations = { covariance = [1, 2, 90] }
+factors = { mean = [1, 1, -1] }
+offsets = { mean = [0, 0, 90] }
+units = { mean = ["m", "m", "deg"], covariance = ["m", "m", "deg"] }
+components = "x_m,y_m,heading_rad"
+kinds = "linear,linear,angle"
+only_first = true
+"""
+    origin = "origin = { latitude_deg = 50, longitude_deg = 9, altitude_m = 100 }\n"
+    streams, notes = imported(text, origin + mapping)
+    assert notes["origin"] == "50, 9 deg, 100 m"
+    assert_allclose(streams["/fix"]["latitude_deg"], [50, 50.001, 50.002])
+    truth, prior = streams["/truth"], streams["/prior"]
+    assert_allclose(truth["state"], [[0, 0, 10], [0, 222.459, 10 - 0.004]], atol=1e-2)
+    assert truth.metadata["origin_altitude_m"] == "100.0"
+    assert_allclose(prior["mean"], [[0, 0, np.pi / 2]], atol=1e-8)
+    assert_allclose(prior["covariance"][0, [0, 4, 8]], [1, 4, np.pi**2 / 4])
+    on_map, _ = imported(text, origin + 'projection = "EPSG:25832"\n' + mapping)
+    # UTM's scale at its middle meridian, and the heights as they are
+    assert_allclose(on_map["/truth"]["state"], [[0, 0, 10], [0, 0.9996 * 222.456, 10]], atol=1e-2)
+    assert on_map["/truth"].metadata["projection"] == "EPSG:25832"
+    assert "no projection 'EPSG:1'" in refusal(text, origin + 'projection = "EPSG:1"\n' + mapping)
+
+
+def test_the_walk(imported: Callable[..., Any], navigation: Path) -> None:
+    """RTKLIB's solution and an inertial file, of which float rows are worth less and are no truth."""
+    streams, notes = imported(navigation / "gnss_imu_rtk" / "walk_0827", "walk")
+    rows = np.genfromtxt(
+        navigation / "gnss_imu_rtk/walk_0827/gnss_1730_sf.pos", comments="%", skip_header=1
+    )
+    fix, velocity, truth = streams["/fix"], streams["/velocity"], streams["/truth"]
+    assert_array_equal(fix["latitude_deg"], rows[:, 2])
+    scale = np.where(rows[:, 5] == 2, 10, 1)
+    assert_allclose(fix["covariance_m2"][:, 0], (scale * rows[:, 8]) ** 2)
+    assert_allclose(fix["covariance_m2"][:, 4], (scale * rows[:, 7]) ** 2)
+    assert_array_equal(velocity["velocity_mps"], rows[:, [16, 15, 17]])
+    assert set((velocity.log_time_ns - velocity.publish_time_ns).tolist()) == {125_000_000}
+    assert_allclose(
+        velocity["covariance_m2ps2"][:, 8], (np.where(rows[:, 5] == 2, 2, 1) * rows[:, 20]) ** 2
+    )
+    assert len(truth) == 349
+    assert_array_equal(truth["state"][0], [0, 0, 0])
+    # against the radii of curvature at the origin, good to the mm over 100 m
+    latitude, place = np.radians(rows[0, 2]), np.radians(rows[rows[:, 5] == 1, 2:4] - rows[0, 2:4])
+    shape = 1 - 0.00669437999014 * np.sin(latitude) ** 2
+    meridian, prime = 6378137 * (1 - 0.00669437999014) / shape**1.5, 6378137 / np.sqrt(shape)
+    height = rows[0, 4]
+    north, east = place[:, 0] * (meridian + height), place[:, 1] * (prime + height) * np.cos(latitude)
+    assert_allclose(truth["state"][:, :2], np.stack([east, north], axis=1), atol=2e-3)
+    assert np.ptp(truth["state"][:, 1]) > 10
+    inertial = streams["/inertial"]
+    assert inertial.publish_time_ns[0] == 1756402240_961000000
+    assert_allclose(inertial["specific_force_mps2"][0] / GRAVITY, [0.0070006, -0.0170050, 1.0109805])
+    assert_allclose(inertial["turn_rate_radps"][0], [0.0028012, 0.0006601, 0.0027935], rtol=1e-12)
+    assert float(fix.metadata["origin_latitude_deg"]) == rows[0, 2]
+    assert notes["gnss_1730_sf.pos"] == "536 rows as /fix, /velocity, /quality, /truth"
+
+
+def test_the_other_navigation_data(imported: Callable[..., Any], navigation: Path) -> None:
+    """Quadrotor, UWB indoors and outdoors: residuals of ranges are as the data sheet measures them."""
+    streams, notes = imported(navigation / "quad_mimu" / "path_9", "quadrotor")
+    assert {f"/imu{unit}/inertial" for unit in range(1, 5)} < set(streams)
+    assert streams["/truth"]["state"][1, :3].tolist() == [
+        -0.25996192441084676,
+        0.591234406176474,
+        -0.10000003381003134,
+    ]
+    assert notes["IMU_2.csv: stamps repeat, and are kept"] == "3"
+
+    streams, notes = imported(navigation / "uwb_lias", "uwb-lias")
+    ranges, truth = streams["/ranges"], streams["/truth"]
+    assert notes["/ranges: messages left out: NaN or infinite"] == "7"
+    assert notes["motion_capture_dynamic_exp_mid.csv: stamps repeat, and are kept"] == "198"
+    residual = _residual(ranges, truth, streams["/anchors"], streams["/tags"])
+    assert residual.std() == pytest.approx(0.096, abs=5e-4)
+    assert residual.mean() == pytest.approx(0.179, abs=5e-4)
+
+    streams, notes = imported(navigation / "uwb_outdoor/LOS/Trajectory_A/Case_1", "uwb-outdoor")
+    assert notes["ESKF.csv: stamps repeat, and are kept"] == "19"
+    truth, published = streams["/truth"], streams["/published/LS"]
+    assert truth.publish_time_ns[0] == 1734501485_500326700
+    inside = np.flatnonzero((truth["state"][:, 0] > 49.3) & (truth["state"][:, 1] > -5))
+    ends = np.flatnonzero((truth["state"][:, 0] <= 12) & (truth["state"][:, 1] > 3.4))
+    begin, end = inside[0], ends[ends > inside[0]][0]
+    flat = np.abs(truth["state"][:, 2] - 1) < 0.5
+    rows = (published.publish_time_ns >= truth.publish_time_ns[begin]) & (
+        published.publish_time_ns <= truth.publish_time_ns[end]
+    )
+    error = [
+        published["state"][rows, axis]
+        - np.interp(
+            published.publish_time_ns[rows], truth.publish_time_ns[flat], truth["state"][flat, axis]
+        )
+        for axis in range(2)
+    ]
+    assert np.sqrt(np.mean(np.sum(np.square(error), axis=0))) == pytest.approx(1.0384, abs=5e-5)
+    assert streams["/ranges"].log_time_ns[0] == 1734501485_315630136
+
+
+def _residual(ranges: Stream, truth: Stream, anchors: Stream, tags: Stream) -> np.ndarray:
+    """Measured less true ranges, at those within the truth."""
+    inside = (ranges.publish_time_ns >= truth.publish_time_ns[0]) & (
+        ranges.publish_time_ns <= truth.publish_time_ns[-1]
+    )
+    ranges = ranges.take(inside)
+    nearest = np.searchsorted(truth.publish_time_ns, ranges.publish_time_ns).clip(0, len(truth) - 1)
+    state = truth["state"][nearest]
+    turn = Rotation.from_quat(state[:, 3:], scalar_first=True)
+    tag = state[:, :3] + turn.apply(tags["position_m"][ranges["tag_id"]])
+    distance = np.linalg.norm(tag - anchors["position_m"][ranges["anchor_id"]], axis=1)
+    return ranges["range_m"] - distance
+
+
+def test_trajectories(imported: Callable[..., Any], trajectories: Path) -> None:
+    """A TUM file as poses; KITTI's have the rate that the mapping states."""
+    streams, _ = imported(trajectories / "freiburg1_xyz-groundtruth.txt", "tum")
+    poses = streams["/truth"]
+    first = np.loadtxt(trajectories / "freiburg1_xyz-groundtruth.txt")[0]
+    assert_allclose(poses["state"][0], first[[1, 2, 3, 7, 4, 5, 6]], atol=1e-4)
+    streams, _ = imported(trajectories / "KITTI_00_gt.txt", "kitti")
+    assert set(np.diff(streams["/truth"].publish_time_ns[:100]).tolist()) == {100_000_000}
+
+
+def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """What repeats or goes back is kept, told, and in order where a log is read; a cut row is told."""
+    mapping = FIX.replace('time = { column = "t" }', 'time = { column = "t", zero = "2026-01-01" }')
+    text = "t,lat,lon,h\n1,50,8,100\n3,50,8.001,100\n2,50.001,8,110\n3,,8,100\n4,50\n"
+    _, notes = imported(text, mapping)
+    assert notes["table.csv: stamps go back, and are sorted"] == "1"
+    assert notes["/fix: messages left out: NaN or infinite"] == "1"
+    assert notes["table.csv: rows left out, of another number of cells than 4"] == "1"
+    import_log(
+        "table",
+        tmp_path / "table.csv",
+        {"mapping": str(tmp_path / "mapping.toml")},
+        tmp_path / "log.mcap",
+    )
+    read = read_streams(open_log(tmp_path / "log.mcap"), ["/truth"])["/truth"]
+    assert np.all(np.diff(read.publish_time_ns) > 0)
+    assert_allclose(read["state"][0], [0, 0, 0], atol=1e-9)
+    assert read["state"][1, 2] == pytest.approx(10, abs=1e-3)  # 111 m away the ellipsoid is 1 mm lower
+
+
+def test_blocks_make_no_difference(
+    imported: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of many blocks, whose first fix comes in a later one and whose stamps go back."""
+    rows = [
+        f"{1000 + row - 5 * (row == 70)},{50 + row / 1e4 if row > 40 else ''},8,100"
+        for row in range(100)
+    ]
+    text = "t,lat,lon,h\n" + "\n".join(rows)
+    whole, notes = imported(text, FIX)
+    monkeypatch.setattr(files, "_BLOCK_BYTES", 100)
+    parts, notes_of_parts = imported(text, FIX)
+    assert notes_of_parts == notes
+    assert notes["origin"] == "50.0041, 8 deg, 100 m, the first fix"
+    for topic, stream in whole.items():
+        assert_array_equal(parts[topic].publish_time_ns, stream.publish_time_ns)
+    assert_array_equal(parts["/truth"]["state"], whole["/truth"]["state"])
+
+
+@pytest.mark.paper
+def test_a_million_rows_in_five_seconds(tmp_path: Path) -> None:
+    """Of CPU time, all threads together, the log included."""
+    count = 1_000_000
+    numbers = np.random.default_rng(0).normal(size=(count, 6)).round(6)
+    columns = {
+        "time": 1756402240 + np.arange(count) / 200,
+        **dict(zip(("ax", "ay", "az", "gx", "gy", "gz"), numbers.T, strict=True)),
+    }
+    pyarrow.csv.write_csv(pa.table(columns), tmp_path / "million.csv")
+    (tmp_path / "mapping.toml").write_text(INERTIAL)
+    begin = time.process_time()
+    values = {"mapping": str(tmp_path / "mapping.toml")}
+    _, messages = import_log("table", tmp_path / "million.csv", values, tmp_path / "log.mcap")
+    assert messages == count
+    assert time.process_time() - begin < 5
+
+
+BAD = [
+    (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; there are: time, ax"),
+    (ROWS, INERTIAL, '"g"', '"m/s"', "the unit 'm/s' does not fit: specific_force_mps2 is in m/s^2"),
+    (ROWS, INERTIAL, '"g"', '"gee"', "no unit 'gee'; there are: m, mm"),
+    (ROWS, INERTIAL, '"time"', '"note"', "column note holds no numbers"),
+    (ROWS, INERTIAL, '"ax"', '"note"', "table.csv: column note holds 'a'; expected numbers"),
+    (ROWS, INERTIAL, "InertialSample", "Inertial", "did you mean 'InertialSample'?"),
+    (ROWS, INERTIAL, "turn_rate_radps = [", "turn_rate = [", "InertialSample has no field 'turn_rate'"),
+    (ROWS, INERTIAL, ', "gz"]', "]", "field turn_rate_radps is given 2 numbers; expected 3"),
+    ("t,lat,lon,h\n1,90.5,8,0\n", FIX, "", "", "a latitude is 90.5 deg, beyond 90"),
+    ("t,lat,lon,h\n1,x,8,0\n", FIX, "", "", "column lat holds 'x'; expected numbers"),
+    ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row of it has a time"),
+    ("t,lat,lon,h\n1,,8,0\n", FIX, "", "", "nothing of it could be imported"),
+    ("t,lat,lon,h\n-1,1,8,0\n", FIX, "", "", "column t: a stamp is before 1970 or beyond"),
+    ("t,lat,lon,h\n", FIX, "", "", "table.csv: has a header line but no rows"),
+    ("", FIX, "", "", "table.csv: holds no rows"),
+    ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
+[[tables.streams]]
+topic = "/o"
+becomes = "Orientation"
+fields = { quaternion = ["w", "x", "y", "z"] }
+""", "table.csv: /o: its quaternions: the vector at (0,) has length 1.41421356"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "mapping", "old", "new", "sentence"), BAD)
+def test_bad_input_is_one_sentence_and_nothing_is_written(
+    text: str, mapping: str, old: str, new: str, sentence: str, refusal: Callable[..., str]
+) -> None:
+    """Columns, units, times and values that cannot be used."""
+    assert sentence in refusal(text, mapping.replace(old, new) if old else mapping)
+
+
+def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """Several files by their names; one that is missing, one too many, and clocks years apart."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for name, since in (("imu_left", 1756402240), ("imu_right", 1756402241)):
+        (folder / f"{name}.csv").write_text(ROWS.replace("1756402240", str(since)))
+    (folder / "readme.txt").write_text("x")
+    mapping = INERTIAL.replace("[[tables]]", '[[tables]]\nfiles = "imu_{side}.csv"')
+    mapping = mapping.replace('"/inertial"', '"/{side}/inertial"')
+    streams, notes = imported(folder, mapping)
+    assert list(streams) == ["/left/inertial", "/right/inertial"]
+    assert notes["files not taken"] == "readme.txt"
+    again, _ = imported(folder / "imu_left.csv", mapping, folder / "imu_right.csv")
+    assert list(again) == list(streams)
+    with pytest.raises(BadInput, match="is none of the mapping's files"):
+        imported(folder / "imu_left.csv", mapping, folder / "readme.txt")
+    with pytest.raises(BadInput, match="has no file"):
+        imported(tmp_path, mapping.replace("imu_{side}", "gnss_{side}"))
+    (folder / "imu_right.csv").write_text(ROWS.replace("1756402240", "12"))
+    with pytest.raises(BadInput, match=r"mixed time bases: .*imu_right.csv begins 1.7564e"):
+        imported(folder, mapping)
+    with pytest.raises(BadInput, match="say what its columns are with --mapping"):
+        imported(folder, "")
+    with pytest.raises(BadInput, match="no mapping 'wlak'; did you mean 'walk'"):
+        imported(folder, "wlak")
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_mappings_that_ship(name: str) -> None:
+    """Each can be read and says what it is for."""
+    assert read_mapping(name).summary

@@ -1,0 +1,314 @@
+"""The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from pipeline.ensemble import replay_in_memory
+from recorders.errors import BadInput
+from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
+from replay.engine import replaying
+from replay.engine.estimator import bind
+from replay.engine.late import parse_late
+from replay.engine.replaying import collect
+from replay.engine.sources import MemorySource, memory_source
+from replay.inference import tracking
+from replay.inference.association import existence_after, marginals
+from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
+
+SECOND = 1_000_000_000
+RADAR = {"sigma_m": "2.0", "detection_probability": "0.9", "clutter_per_m2": "1e-5"}
+CAMERA = {"sigma_rad": "0.02", "detection_probability": "0.6", "clutter_per_rad": "0.5"}
+Places = list[list[tuple[float, float]]]
+
+
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Loops in plain Python, of which none is left to the next test."""
+    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    tracking._compiled.cache_clear()
+    yield
+    tracking._compiled.cache_clear()
+
+
+def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]]) -> list[Stream]:
+    """Scans of a sensor at times in s, of places or of bearings."""
+    stamps = SIMULATION_EPOCH_NS + np.rint(np.array(times_s) * SECOND).astype(np.int64)
+    counts = [len(each) for each in seen]
+    ids = np.arange(len(seen))
+    told = [one for each in seen for one in each]
+    scan = make_stream(
+        f"/{name}/scan", schemas.SCAN, stamps, metadata=stated, scan_id=ids, detections=counts
+    )
+    own = {"publish_time_ns": np.repeat(stamps, counts), "scan_id": np.repeat(ids, counts)}
+    if "sigma_rad" in stated:
+        seen_by: Any = make_stream
+        bearing = seen_by(f"/{name}/bearing", schemas.SCAN_BEARING, **own, bearing_rad=told)
+        return [scan, bearing]
+    place: Any = np.array(told).reshape(-1, 2)
+    made: Any = make_stream
+    return [scan, made(f"/{name}/detection", schemas.DETECTION, **own, position_m=place)]
+
+
+def log(*streams: list[Stream]) -> MemorySource:
+    run = RunMetadata("scene", {}, None, 0, SIMULATION_EPOCH_NS, {})
+    return memory_source(Recording([each for of in streams for each in of]), run)
+
+
+def replay(source: MemorySource, label: str = "tracker:jipda", **settings: Any) -> dict[str, Any]:
+    """The columns of each output."""
+    outputs = replay_in_memory([source], {label: settings})
+    return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
+
+
+def replay_late(source: MemorySource, late: str | None, **settings: Any) -> dict[str, Any]:
+    """The same of messages as they arrive."""
+    [bound] = bind("tracker:jipda", [source], settings)
+    policy = None if late is None else parse_late(late, arrival_order=True)
+    outputs = collect(replaying.replay([source], [bound], order="log_time", late=policy))
+    return {topic.rpartition("/")[2]: ragged.stream for topic, ragged in outputs.items()}
+
+
+def passing(seconds: int, y_m: float = 100.0) -> Places:
+    """One target that goes along x at 2 m/s."""
+    return [[(2.0 * second, y_m)] for second in range(seconds)]
+
+
+def test_an_update_is_that_of_the_formula(uncompiled: None):
+    """A track and two detections in its gate: Bar-Shalom and Fortmann, 6.4, with matrices."""
+    seen = [*passing(8), [(15.0, 101.0), (18.0, 98.0)]]
+    found = replay(log(sensor("radar", RADAR, range(9), seen)))
+    rows = found["track"].publish_time_ns
+    before, after = (np.flatnonzero(rows == SIMULATION_EPOCH_NS + at * SECOND)[0] for at in (7, 8))
+    mean = found["track"]["mean"][before]
+    covariance = found["track"]["covariance"][before].reshape(4, 4)
+    move = np.kron(np.eye(2), [[1, 1], [0, 1]])
+    noise = 0.1 * np.kron(np.eye(2), [[1 / 3, 1 / 2], [1 / 2, 1]])
+    mean, covariance = move @ mean, move @ covariance @ move.T + noise
+    rows_h = np.eye(4)[[0, 2]]
+    spread = rows_h @ covariance @ rows_h.T + 4 * np.eye(2)
+    innovation = np.array(seen[-1]) - rows_h @ mean
+    squared = np.einsum("di,ij,dj->d", innovation, np.linalg.inv(spread), innovation)
+    assert (squared < chi2.ppf(0.99, 2)).all()
+    density = np.exp(-0.5 * squared) / (2 * np.pi * np.sqrt(np.linalg.det(spread)))
+    existence = found["existence"]["existence"][before] * np.exp(-1 / 60)
+    weights = 0.9 * existence * density / 1e-5
+    [beta] = marginals([weights], [1 - 0.9 * 0.99 * existence])
+    gain = covariance @ rows_h.T @ np.linalg.inv(spread)
+    mixed = beta[1:] @ innovation
+    outer = np.einsum("d,di,dj->ij", beta[1:], innovation, innovation) - np.outer(mixed, mixed)
+    expected = covariance - (1 - beta[0]) * gain @ spread @ gain.T + gain @ outer @ gain.T
+    np.testing.assert_allclose(found["track"]["mean"][after], mean + gain @ mixed, rtol=1e-12)
+    np.testing.assert_allclose(
+        found["track"]["covariance"][after].reshape(4, 4), expected, rtol=1e-9, atol=1e-12
+    )
+    told = found["existence"]["existence"][after]
+    assert told == pytest.approx(existence_after(existence, beta[0], 0.9 * 0.99), rel=1e-12)
+    last = found["association"].publish_time_ns == SIMULATION_EPOCH_NS + 8 * SECOND
+    assert found["association"]["probability"][last] == pytest.approx(beta[1:], rel=1e-9)
+
+
+def test_tracks_begin_and_end_by_their_existence(uncompiled: None):
+    """Clutter that comes once begins none; a target that is not seen any more is one no more."""
+    seen = [*passing(8), *[[] for _ in range(12)]]
+    seen[3].append((500.0, 500.0))
+    found = replay(log(sensor("radar", RADAR, range(20), seen)))
+    sizes = found["set"]["elements"].tolist()
+    assert sizes[0] == 0
+    assert max(sizes) == 1
+    assert sizes[7] == 1
+    assert sizes[-1] == 0
+    assert set(found["track"]["track_id"]) == {1}
+    existence = found["existence"]["existence"]
+    assert existence[0] >= 0.97
+    missed = existence[found["track"].publish_time_ns > SIMULATION_EPOCH_NS + 7 * SECOND]
+    assert (np.diff(missed) < 0).all()
+
+
+def test_tracks_begin_by_four_hits_in_six_chances(uncompiled: None):
+    seen = passing(8)
+    steady = replay(log(sensor("radar", RADAR, range(8), seen)), "tracker:hungarian")
+    assert steady["set"]["elements"].tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+    for gone in (1, 2, 4):
+        seen[gone] = []
+    seldom = replay(log(sensor("radar", RADAR, range(8), seen)), "tracker:hungarian")
+    assert seldom["set"]["elements"].tolist() == [0] * 8
+
+
+def test_a_second_target_needs_distance_and_room(uncompiled: None):
+    """Within `birth_distance_m` of a confirmed track none begins; without room that is said."""
+    both = [[*near, *far] for near, far in zip(passing(30), passing(30, 125.0), strict=True)]
+    for second in range(9):
+        both[second] = both[second][:1]
+    source = log(sensor("radar", RADAR, range(30), both))
+    assert replay(source)["set"]["elements"].max() == 1
+    assert replay(source, birth_distance_m=20.0)["set"]["elements"].max() == 2
+    crowded = replay(source, birth_distance_m=20.0, most_tracks=1)
+    assert crowded["set"]["elements"].max() == 1
+    assert len(crowded["unused"]) == 21
+    assert "most_tracks" in crowded["unused"].metadata["reasons"]
+
+
+def test_detections_of_one_hull_are_joined(uncompiled: None):
+    """Chains of those within a distance are one detection at their mean."""
+    seen: Places = [[(x, 96.0), (x, 104.0), (x + 8.0, 104.0)] for [(x, _)] in passing(10)]
+    joined = replay(log(sensor("radar", {**RADAR, "joined_within_m": "9"}, range(10), seen)))
+    assert joined["set"]["elements"].max() == 1
+    state = joined["track"]["mean"][-1]
+    assert state == pytest.approx([18 + 8 / 3, 2, (96 + 104 + 104) / 3, 0], abs=0.3)
+
+
+def test_bearings_sharpen_confirmed_tracks_alone(uncompiled: None):
+    """They begin none, and a track takes one in every interval."""
+    seconds = np.arange(20)
+    bearings = [[np.arctan2(100.0, 2.0 * (second + 0.5))] for second in seconds]
+    radar = sensor("radar", RADAR, seconds, passing(20))
+    alone = replay(log(radar))
+    often = replay(log(radar, sensor("camera", CAMERA, seconds + 0.5, bearings)))
+    seldom = replay(
+        log(radar, sensor("camera", {**CAMERA, "interval_s": "4.5"}, seconds + 0.5, bearings))
+    )
+    assert set(often["track"]["track_id"]) == {1}
+    last_ns = SIMULATION_EPOCH_NS + 19 * SECOND
+    variance = [
+        float(found["track"]["covariance"][found["track"].publish_time_ns == last_ns][0, 0])
+        for found in (often, seldom, alone)
+    ]
+    assert variance == sorted(variance)
+    assert len(set(variance)) == 3
+    assert often["association"].metadata["sensors"] == "radar,camera"
+
+
+def test_a_miss_in_a_blind_sector_says_nothing(uncompiled: None):
+    seen = [*passing(8), [], []]
+    blind = {"blind_from_rad": 1.0, "blind_to_rad": 2.0}
+    source = log(
+        sensor("radar", RADAR, range(8), seen[:8]), sensor("lidar", RADAR, [8.5, 9.5], seen[8:])
+    )
+    told = replay(source)["existence"]["existence"]
+    assert told[-1] < 0.5
+    stated = {**RADAR, **{name: repr(value) for name, value in blind.items()}}
+    turned = log(
+        sensor("radar", RADAR, range(8), seen[:8]), sensor("lidar", stated, [8.5, 9.5], seen[8:])
+    )
+    assert replay(turned)["existence"]["existence"][-1] > 0.9
+
+
+def test_a_lag_is_of_the_measurement(uncompiled: None):
+    """Detections that are where a target was 2 s ago lead to where it is now."""
+    late: Places = [[(2.0 * second - 4.0, 100.0)] for second in range(20)]
+    found = replay(log(sensor("radar", {**RADAR, "lag_s": "2"}, range(20), late)))
+    assert found["track"]["mean"][-1] == pytest.approx([38, 2, 100, 0], abs=1.0)
+
+
+def late_log() -> MemorySource:
+    """A radar, and a lidar every other scan of which comes 1.2 s late; it is one radar scan behind."""
+    radar = sensor("radar", RADAR, range(16), passing(16))
+    times = np.arange(15) + 0.5
+    lidar = sensor("lidar", RADAR, times, [[(2.0 * time, 100.5)] for time in times])
+    delayed = []
+    for stream in lidar:
+        late_ns = np.where(np.arange(len(stream)) % 2 == 0, 1_200_000_000, 0)
+        delayed.append(replace(stream, log_time_ns=stream.publish_time_ns + late_ns))
+    return log(radar, delayed)
+
+
+@pytest.mark.parametrize("late", ["wait:2", "rewind:2"])
+def test_late_scans_in_their_place(uncompiled: None, late: str):
+    """What is known after the last one is what is known in order, to the last bit."""
+    source = late_log()
+    in_order = replay(source)
+    found = replay_late(source, late)
+    state = [each["track"]["mean"][-1] for each in (found, in_order)]
+    np.testing.assert_array_equal(*state)
+    assert not len(found["skipped"])
+    rewound = found.get("rewound")
+    if late == "rewind:2":
+        assert rewound is not None
+        assert rewound["repeated"].tolist() == [2] * 7 + [1]
+        assert len(found["set"]) == len(in_order["set"])
+    else:
+        assert found["set"]["elements"].tolist() == in_order["set"]["elements"].tolist()
+
+
+def test_late_scans_are_left_out_and_counted(uncompiled: None):
+    source = late_log()
+    dropped = replay_late(source, "drop")
+    assert len(dropped["skipped"]) == 16  # scans, and their detections
+    plain = replay_late(source, None)
+    assert len(plain["unused"]) == 8
+    assert "rewind" in plain["unused"].metadata["reasons"]
+    np.testing.assert_array_equal(dropped["track"]["mean"], plain["track"]["mean"])
+
+
+def _without(streams: list[Stream], *topics: str) -> list[Stream]:
+    return [each for each in streams if each.topic not in topics]
+
+
+def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
+    scan, detection = streams
+    columns = {**scan.columns, "scan_id": np.array(number, np.uint32)}
+    made: Any = make_stream
+    again = made(scan.topic, scan.schema, scan.publish_time_ns, metadata=scan.metadata, **columns)
+    return [again, detection]
+
+
+@pytest.mark.parametrize(
+    ("streams", "settings", "said"),
+    [
+        (sensor("camera", CAMERA, [0], [[0.5]]), {}, "only bearings: they begin no tracks"),
+        (
+            sensor("radar", {**RADAR, "origin": "/own/fix"}, [0], [[(1, 2)]]),
+            {},
+            r"where /own/fix \(fuselog.PositionFix\) says, which is not there",
+        ),
+        (_numbered(sensor("radar", RADAR, [0, 1], [[], []]), [4, 4]), {}, "two scans have the number 4"),
+        (_numbered(sensor("radar", RADAR, [0], [[(1, 2)]]), [7]), {}, "says 1 detections, there are 0"),
+        (_without(sensor("radar", RADAR, [0], [[(1, 2)]]), "/radar/scan"), {}, "does not fit this log"),
+        (sensor("radar", {"sigma_m": "1"}, [0], [[]]), {}, "does not state clutter_per_m2.*--set"),
+        (sensor("radar", RADAR, [0], [[]]), {"sensors": ["lidar"]}, "no scans of sensor lidar"),
+    ],
+)
+def test_bad_input_is_named(uncompiled: None, streams, settings, said: str):
+    with pytest.raises(BadInput, match=said):
+        replay(log(streams), **settings)
+
+
+def test_the_sheets_reference_trackers(autoferry: Path):
+    """Radar and lidar over all scenarios, within the sheet's tolerances of its row, or better."""
+    sources = [
+        memory_source(*import_run("autoferry", autoferry / f"scenario{number}", {}))
+        for number in (2, 3, 5, 13, 16, 22)
+    ]
+    label = "tracker:jipda"
+    outputs = replay_in_memory(sources, {label: {"sensors": ["radar", "lidar"]}})
+    figures = []
+    for run, source in enumerate(sources):
+        at_ns, true = instants_of(source)
+        sizes, tracks = (outputs[f"/estimates/{label}/{leaf}"].of_run(run) for leaf in ("set", "track"))
+        figures.append(track_figures(track_errors(tracks_at(sizes, tracks, at_ns), true)))
+    mean = {name: np.mean([each[name] for each in figures]) for name in figures[0]}
+    assert mean["gospa_m"] < 9.16
+    theirs = [5.86, 11.30, 10.28, 8.70, 5.56, 13.28]
+    assert all(each["gospa_m"] < one + 0.2 for each, one in zip(figures, theirs, strict=True))
+    assert mean["thing1_rmse_m"] == pytest.approx(4.89, abs=0.7)
+    assert mean["thing2_rmse_m"] == pytest.approx(3.92, abs=0.7)
+    assert mean["thing1_coverage"] == pytest.approx(0.92, abs=0.02)
+    assert mean["thing2_coverage"] == pytest.approx(0.81, abs=0.02)
+    rewound = replay_late(sources[5], "rewind:1", sensors=["radar", "lidar"])
+    assert len(rewound["rewound"]) == 5
+    last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
+    np.testing.assert_array_equal(rewound["track"]["mean"][-1], last)
+    late = track_figures(track_errors(tracks_at(rewound["set"], rewound["track"], at_ns), true))
+    assert late["gospa_m"] == pytest.approx(figures[5]["gospa_m"], abs=0.05)
+    one = replay_in_memory(sources[2:3], {label: {"sensors": ["radar", "lidar"]}})
+    for leaf in ("set", "track", "association"):
+        both = outputs[f"/estimates/{label}/{leaf}"].of_run(2), one[f"/estimates/{label}/{leaf}"].stream
+        for name, column in both[0].columns.items():
+            np.testing.assert_array_equal(column, both[1][name])

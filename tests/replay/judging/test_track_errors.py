@@ -1,0 +1,95 @@
+"""Tracks judged at instants: the sheet's check without a tracker; what is followed, switched, broken."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorders.log import Stream
+from recorders.recording import import_run
+from replay.engine.sources import memory_source
+from replay.judging.track_errors import (
+    TracksAt,
+    as_trajectories,
+    instants_of,
+    track_errors,
+    track_figures,
+)
+
+# By scenario: instants; of the radar GOSPA of all, G50, unreferenced; of the lidar the first two.
+SHEET = {
+    2: (216, 29.485838, 12.099938, 4.370370, 13.726466, 13.496173),
+    3: (241, 30.867881, 17.607442, 3.406639, 17.970020, 17.865041),
+    5: (258, 31.278400, 18.981872, 3.325581, 17.527516, 17.278602),
+    13: (214, 17.283432, 11.700544, 0.864486, 11.506414, 11.293939),
+    16: (218, 22.524523, 10.789246, 1.977064, 12.290916, 12.199762),
+    22: (149, 29.536414, 15.465166, 3.422819, 15.312036, 13.764257),
+}
+
+
+def last_scans(streams: Mapping[str, Stream], sensor: str, at_ns: np.ndarray) -> list[TracksAt]:
+    """The world's places of the last scan of a sensor at each instant, numbered as they come."""
+    scan, seen = streams[f"/{sensor}/scan"], streams[f"/{sensor}/detection"]
+    fix = streams["/ownship/fix"]
+    own = dict(zip(fix.publish_time_ns.tolist(), fix["position_m"], strict=True))
+    found = []
+    for time_ns in at_ns:
+        before = np.where(scan.publish_time_ns <= time_ns, scan.publish_time_ns, -1)
+        row = int(before.argmax())
+        place = seen["position_m"][seen["scan_id"] == scan["scan_id"][row]]
+        found.append(TracksAt(np.arange(len(place)), place + own[int(scan.publish_time_ns[row])]))
+    return found
+
+
+@pytest.mark.parametrize("scenario", SHEET)
+def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
+    source = memory_source(*import_run("autoferry", autoferry / f"scenario{scenario}", {}))
+    at_ns, true = instants_of(source)
+    radar, lidar = (
+        track_errors(last_scans(source.streams, sensor, at_ns), true) for sensor in ("radar", "lidar")
+    )
+    found = track_figures(radar)
+    assert SHEET[scenario] == pytest.approx(
+        (
+            len(at_ns),
+            found["gospa_all_m"],
+            found["gospa_m"],
+            found["unreferenced_things"],
+            track_figures(lidar)["gospa_all_m"],
+            track_figures(lidar)["gospa_m"],
+        ),
+        abs=1e-6,
+    )
+    if scenario == 2:
+        names = "missed_things", "false_things", "thing1_rmse_m", "thing2_rmse_m"
+        parts = [0.087963, 0.087963, 7.006923, 9.090370]
+        assert [found[name] for name in names] == pytest.approx(parts, abs=1e-6)
+        # the sheet reckons with stamps of 1e9 s as doubles, which are good to 2e-7 s
+        assert found["localisation_m2"] == pytest.approx(126.947289, abs=5e-6)
+
+
+def test_switches_breaks_and_what_has_no_reference():
+    """A thing stands at the origin, another is there at the end; track 7 is lost and comes back as 8."""
+    still = np.zeros((1, 5, 2))
+    late = np.full((1, 5, 2), np.nan)
+    late[0, 4] = (100, 0)
+    tracks = [
+        TracksAt(np.array([7, 9]), np.array([[3.0, 4.0], [0.0, 60.0]])),
+        TracksAt(np.empty(0, np.int64), np.empty((0, 2))),
+        TracksAt(np.array([7]), np.array([[0.0, 25.0]])),
+        TracksAt(np.array([8]), np.array([[0.0, 0.0]])),
+        TracksAt(np.array([8, 7]), np.array([[100.0, 3.0], [0.0, 0.0]])),
+    ]
+    errors = track_errors(tracks, np.concatenate([still, late]))
+    assert errors.track.tolist() == [[7, -1, -1, 8, 7], [-1, -1, -1, -1, 8]]
+    assert errors.unreferenced.tolist() == [1, 0, 0, 0, 0]
+    assert errors.gospa_all[0] == pytest.approx(np.sqrt(25 + 200))
+    assert errors.gospa.tolist() == pytest.approx([5, np.sqrt(200), 20, 0, 3])
+    figures = track_figures(errors)
+    assert (figures["switches"], figures["breaks"]) == (2, 1)
+    assert figures["thing1_coverage"] == 0.6
+    assert figures["thing1_rmse_m"] == pytest.approx(np.sqrt(25 / 3))
+    assert (figures["thing2_coverage"], figures["thing2_rmse_m"]) == (1, 3)
+    assert (figures["missed_things"], figures["false_things"]) == (0.4, 0.2)
+    assert np.isfinite(as_trajectories(tracks)[:, :, 0]).sum(axis=1).tolist() == [3, 2, 1]
