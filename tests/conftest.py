@@ -27,7 +27,18 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
     """
     from replay.engine import blocks, supervision
+<<<<<<< HEAD
     from replay.inference import estimators, gauss_newton, imm, observability, rewinding, smoothers
+=======
+    from replay.inference import (
+        estimators,
+        gauss_newton,
+        imm,
+        observability,
+        rewinding,
+        smoothers,
+    )
+>>>>>>> navigation
 
     loops = (
         blocks._merge,
