@@ -29,8 +29,8 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     from replay.engine import blocks, supervision
     from replay.inference import (
         estimators,
+        gauss_newton,
         imm,
-        iterated,
         observability,
         rewinding,
         smoothers,
@@ -42,6 +42,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         supervision._over_runs,
         estimators._compiled,
         rewinding._compiled,
+        gauss_newton.searching,
         smoothers._way_back,
         smoothers._sliding,
         imm._smoothing,

@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.commands import read_settings, settings_of_estimators
 from pipeline.outputs import check_folder
+from pipeline.results import plain
 from pipeline.terminal import print_json, print_metrics, print_table, say, status
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
@@ -75,9 +76,13 @@ def tune_logs(
         return
     columns = ("parameter", "start", "value", "95 % from", "to")
     print_table(columns, [list(row.values()) for row in parameters])
+    if len(found.correlation) > 1:
+        rows = found.correlation.reset_index().to_numpy().tolist()
+        print_table(("correlation", *found.correlation), rows)
     for sentence in found.notes:
         say(sentence)
-    print_metrics(saved.result.metrics, saved.result.bounds)
+    for each in found.replays:
+        print_metrics(plain(each.judge.metrics), each.judge.bounds)
     say(f"{out / SETTINGS}: for --settings; {out}: tables, figures, timeline, result.json")
 
 

@@ -58,15 +58,6 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     return Confidence(places, curvature, covariance)
 
 
-def interval(told: Confidence | None, coordinates: Coordinates, values: Floats) -> tuple[Floats, Floats]:
-    """The 95 % intervals (k,), (k,) of values (k,); NaN where nothing is told."""
-    errors = np.full(len(values), np.nan)
-    if told is not None:
-        errors[list(told.places)] = told.errors
-    point, reach = coordinates.of(values), QUANTILE * errors
-    return coordinates.unbounded(point - reach), coordinates.unbounded(point + reach)
-
-
 def doubts(told: Confidence, free: Sequence[Free]) -> Iterator[str]:
     """A sentence for every direction of the parameters (k,) of which the logs tell little."""
     own = [free[place] for place in told.places]

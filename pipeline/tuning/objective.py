@@ -4,8 +4,9 @@ Every log is replayed by itself; a point costs what the sums over all logs do, i
 points are shared among threads, whose kernels run side by side.
 """
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, Literal, NamedTuple
@@ -117,13 +118,13 @@ class Criterion(NamedTuple):
     Attributes:
         sums: what is summed over logs, of one log's outputs.
         cost: what the sums cost; nothing of a run that told nothing.
-        opens_gate: whether measurements must not be left out by a gate.
+        is_smooth: whether it is of innovations; then no gate may leave any out, else that may change.
         lacks: what a log lacks that has no such sums.
     """
 
     sums: Callable[[Run, Mapping[str, Ragged], float], Sums]
     cost: Callable[[Sums], float]
-    opens_gate: bool
+    is_smooth: bool
     lacks: str
 
 
@@ -153,7 +154,6 @@ class Objective:
         runs: the logs.
         by: what it goes by.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        executor: what logs and points are shared among.
         on_best: is told of the best point after every batch.
         best: of all points until now.
     """
@@ -164,7 +164,6 @@ class Objective:
     runs: Sequence[Run]
     by: By
     gap_limit_s: float
-    executor: Executor
     on_best: Callable[[Best], None]
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
     _told: dict[str, int] = field(default_factory=dict)
@@ -172,7 +171,8 @@ class Objective:
     def __call__(self, points: Floats) -> Floats:
         """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements."""
         tried = [(point, run) for point in points for run in self.runs]
-        sums = iter(list(self.executor.map(self._sums, *zip(*tried, strict=True))))
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            sums = iter(list(threads.map(self._sums, *zip(*tried, strict=True))))
         costs = np.array([self._cost([next(sums) for _ in self.runs]) for _ in points])
         least = int(np.argmin(costs))
         best = Best(self.best.evaluations + len(points), points[least], float(costs[least]))

@@ -19,12 +19,14 @@ from pipeline.outputs import check_folder
 from pipeline.replays import Replay, replay
 from pipeline.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.studies.localization import summarise, summary_table
-from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, interval
-from pipeline.tuning.objective import By
+from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, profiles
+from pipeline.tuning.objective import Objective, innovations_in
 from pipeline.tuning.search import Coordinates
 from replay.engine.sources import LogSource, MemorySource
+from replay.judging.evaluation import split_topic
 from replay.judging.judge import joined
 from replay.judging.metrics import metric_key
+from replay.judging.whiteness import whitened, whiteness
 
 Floats = NDArray[np.float64]
 Source = LogSource | MemorySource
@@ -41,14 +43,14 @@ class Found(NamedTuple):
         optimum: (k,) the values of that at which the cost is least.
         told: how well the logs tell them; None where the search was no maximum likelihood, was
             stopped, or ended at bounds alone.
-        profiles: the log-likelihood along each parameter.
+        evaluations: how many values were tried.
         has_converged, was_stopped: how it ended.
     """
 
     coordinates: Coordinates
     optimum: Floats
+    evaluations: int
     told: Confidence | None = None
-    profiles: Sequence[Profile] = ()
     has_converged: bool = True
     was_stopped: bool = False
 
@@ -60,43 +62,36 @@ class Tuning:
     Attributes:
         label: the estimator's.
         logs, held_out_logs: what the search went by, and other logs to judge it by.
-        by: what was best.
-        found: where the search ended.
         settings: of the estimator with the values it started from, and with those that were found.
+        objective: what was minimised.
+        found: where the search ended.
         costs: (2,) of the logs with either values; minus the log-likelihood where that is what was best.
         held_out_costs: (2,) the same of the logs held out, if any.
         folds: a row per fold: the values by all other logs, and what its own logs cost with them.
-        whiteness: a row per measured component with either values: how many innovations, the mean square
-            of the normalised ones, their correlation with the next, Ljung and Box's Q, and how probable
-            a larger one is if they are white.
         gate: the probability of the gate that was open in the search.
-        evaluations: how many values were tried.
-        gap_limit_s: the truth is not interpolated over longer gaps.
     """
 
     label: str
     logs: Sequence[Source]
     held_out_logs: Sequence[Source]
-    by: By
-    found: Found
     settings: Mapping[str, Mapping[str, Any]]
+    objective: Objective
+    found: Found
     costs: Floats
     held_out_costs: Floats | None
     folds: pd.DataFrame
-    whiteness: pd.DataFrame
     gate: float
-    evaluations: int
-    gap_limit_s: float
 
     def __repr__(self) -> str:
-        title = f"{self.label} tuned by {self.by} over {_named(self.logs)}"
+        title = f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}"
         return "\n".join([title, self.parameters.to_string(index=False), *self.notes])
 
     @property
     def parameters(self) -> pd.DataFrame:
         """A row per parameter: its start, its value, its 95 % interval (NaN where there is none)."""
         free = self.found.coordinates.free
-        low, high = interval(self.found.told, self.found.coordinates, self.found.optimum)
+        point, reach = self.found.coordinates.of(self.found.optimum), QUANTILE * self.standard_errors
+        low, high = map(self.found.coordinates.unbounded, (point - reach, point + reach))
         return pd.DataFrame(
             {
                 "parameter": [each.name for each in free],
@@ -106,6 +101,14 @@ class Tuning:
                 "high": high,
             }
         )
+
+    @property
+    def standard_errors(self) -> Floats:
+        """(k,) of the logarithms of what is positive, of others in units of their own; else NaN."""
+        errors = np.full(len(self.found.optimum), np.nan)
+        if self.found.told is not None:
+            errors[list(self.found.told.places)] = self.found.told.errors
+        return errors
 
     @property
     def correlation(self) -> pd.DataFrame:
@@ -125,14 +128,54 @@ class Tuning:
                 "log_likelihood": -each.rise,
                 "by_curvature": -each.parabola,
             }
-            for each in self.found.profiles
+            for each in self._profiles
         ]
         return joined(map(pd.DataFrame, tables))
 
     @cached_property
+    def _profiles(self) -> list[Profile]:
+        found = self.found
+        if found.told is None:
+            return []
+        coordinates = found.coordinates
+        return profiles(self.objective, coordinates, coordinates.of(found.optimum), found.told)
+
+    @cached_property
+    def whiteness(self) -> pd.DataFrame:
+        """A row per measured component with either values.
+
+        How many innovations there are, the mean square of the normalised ones, their correlation with
+        the next, Ljung and Box's Q, and how probable a larger one is if they are white.
+        """
+        rows = []
+        start = np.array([each.start for each in self.found.coordinates.free])
+        for label, values in ((START, start), (TUNED, self.found.optimum)):
+            series: dict[tuple[str, str], list[Floats]] = {}
+            for run in self.objective.runs:
+                for topic, innovations in innovations_in(self.objective.outputs(values, run)):
+                    columns = zip(innovations.components, whitened(innovations).T, strict=True)
+                    for name, column in columns:
+                        series.setdefault((split_topic(topic)[1], name), []).append(column)
+            for (case, name), found in series.items():
+                told = whiteness(found)
+                rows.append(
+                    {
+                        "estimator": label,
+                        "case": case,
+                        "component": name,
+                        "innovations": told.size,
+                        "mean_square": told.mean_square,
+                        "next_correlation": told.correlation[0],
+                        "ljung_box": told.ljung_box,
+                        "probability": told.probability,
+                    }
+                )
+        return pd.DataFrame(rows)
+
+    @cached_property
     def replay(self) -> Replay:
         """The logs replayed with either values: the estimators `start` and `tuned`."""
-        return replay(self.logs, self.settings, gap_limit_s=self.gap_limit_s)
+        return replay(self.logs, self.settings, gap_limit_s=self.objective.gap_limit_s)
 
     @cached_property
     def held_out(self) -> Replay | None:
@@ -140,7 +183,7 @@ class Tuning:
         if not self.held_out_logs:
             return None
         named = {f"{label}-held-out": values for label, values in self.settings.items()}
-        return replay(self.held_out_logs, named, gap_limit_s=self.gap_limit_s)
+        return replay(self.held_out_logs, named, gap_limit_s=self.objective.gap_limit_s)
 
     @property
     def replays(self) -> list[Replay]:
@@ -156,17 +199,22 @@ class Tuning:
     def notes(self) -> list[str]:
         """A sentence for everything that one has to know of the values."""
         return [
-            *self._notes_of_search(),
+            *self.notes_of_search,
             *self._notes_of_innovations(),
             *self._notes_of_truth(),
             *self._notes_of_others(),
         ]
 
+    @property
+    def notes_of_search(self) -> list[str]:
+        """Those of the search alone, which need no replay."""
+        return list(self._notes_of_search())
+
     def _notes_of_search(self) -> Iterator[str]:
         found, free = self.found, self.found.coordinates.free
         if found.was_stopped:
             yield (
-                f"stopped after {self.evaluations} evaluations: these are the best values so far, "
+                f"stopped after {found.evaluations} evaluations: these are the best values so far, "
                 "and nothing is known of how well the logs tell them"
             )
         elif not found.has_converged:
@@ -176,8 +224,8 @@ class Tuning:
                 f"the gate (gate_probability = {self.gate:g}) was open in the search: what it keeps out "
                 "costs nothing, so that the best values would keep out as much as they can"
             )
-        if self.by != "likelihood":
-            yield f"by {self.by} there are no intervals, and other values may do as well"
+        if self.objective.by != "likelihood":
+            yield f"by {self.objective.by} there are no intervals, and other values may do as well"
         beyond = found.coordinates.at_bounds(found.coordinates.of(found.optimum))
         for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
             if is_beyond:
@@ -204,22 +252,29 @@ class Tuning:
 
     def _notes_of_truth(self) -> Iterator[str]:
         """What innovations do not see: errors that the state follows."""
-        metrics, bounds = self.replay.judge.metrics, self.replay.judge.bounds
-        for key, (_, high) in bounds.items():
-            estimator, quantity, case = split_metric(key)
-            nis = metrics.get(metric_key(estimator, "nis_per_component", case), math.nan)
-            if (estimator, quantity) == (TUNED, "nees") and metrics[key] > high and abs(nis - 1.0) < 0.1:
+        for replayed in self.replays:
+            metrics = replayed.judge.metrics
+            for key, (_, high) in replayed.judge.bounds.items():
+                label, quantity, case = split_metric(key)
+                nis = metrics.get(metric_key(label, "nis_per_component", case), math.inf)
+                if (
+                    quantity != "nees"
+                    or label.startswith(START)
+                    or metrics[key] < max(1, 2 * nis) * high
+                ):
+                    continue
+                what = " ".join(filter(None, (label, case)))
                 yield (
-                    f"{case or self.label}: NEES is {metrics[key]:.3g}, if consistent up to {high:.3g}, "
-                    f"while NIS is {nis:.3g} per component: innovations do not see errors that change "
-                    "slowly, a sensor's bias say; let these be estimated"
+                    f"{what}: NEES is {metrics[key]:.3g}, if consistent up to {high:.3g}, and NIS only "
+                    f"{nis:.3g} per component: innovations do not see errors that change slowly, as a "
+                    "sensor's bias; let these be estimated"
                 )
 
     def _notes_of_others(self) -> Iterator[str]:
         """Whether logs that were not searched by are explained better too."""
         if self.held_out_costs is not None:
             before, after = self.held_out_costs
-            what, sign = ("log-likelihood", -1.0) if self.by == "likelihood" else ("cost", 1.0)
+            what, sign = ("log-likelihood", -1.0) if self.objective.by == "likelihood" else ("cost", 1.0)
             yield (
                 f"logs held out: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
                 f"{'better' if after < before else 'no better'}"
@@ -262,16 +317,16 @@ class Tuning:
             }.items()
             if len(table)
         }
-        if self.found.profiles:
+        if self._profiles:
             outcome.figures["profiles"] = self.profile_chart
         settings = {
-            "title": f"{self.label} tuned by {self.by} over {_named(self.logs)}",
+            "title": f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}",
             "logs": [log.name for log in self.logs],
             "held_out": [log.name for log in self.held_out_logs],
-            "by": self.by,
+            "by": self.objective.by,
             "estimators": json.loads(json.dumps(self.settings, default=str)),
             "notes": list(self.notes),
-            "gap_limit_s": self.gap_limit_s,
+            "gap_limit_s": self.objective.gap_limit_s,
         }
         with result_folder(place) as part:
             (part / SETTINGS).write_text(self.toml, encoding="utf-8")
@@ -292,7 +347,7 @@ class Tuning:
                     curve("log-likelihood", each.along, -each.rise, "line+markers"),
                 ],
             )
-            for each in self.found.profiles
+            for each in self._profiles
         ]
         title = "along each parameter, all others following"
         return Chart(title=title, panels=panels, columns=min(2, len(panels)))

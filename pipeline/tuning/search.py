@@ -7,7 +7,7 @@ own. Gradient and curvature are central differences, whose points are handed ove
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ Cost = Callable[[Floats], Floats]
 
 STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
+FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches
 UNIT = 10.0  # standard errors that it has alone
 
@@ -141,27 +142,51 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     return tried[np.argmin(cost(coordinates.values(tried)))]
 
 
-def minimum(cost: Cost, coordinates: Coordinates, start: Floats) -> tuple[Floats, bool]:
+def minimum(
+    cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
+) -> tuple[Floats, bool]:
     """Where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
 
-    By L-BFGS-B, in coordinates.
+    In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """
     low, high = coordinates.bounds
-    # what cannot be used is a wall that a line search turns back from
+    # what cannot be used is a wall that a search turns back from
     wall = 10.0 * abs(float(cost(coordinates.values(start[None]))[0])) + 1e6
+
+    def costs(points: Floats) -> Floats:
+        return np.minimum(cost(coordinates.values(points)), wall)
 
     def with_gradient(point: Floats) -> tuple[float, Floats]:
         steps = STEP * np.eye(len(point))
         points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
-        costs = np.minimum(cost(coordinates.values(points)), wall)
+        (here, *_), ahead, behind = np.split(costs(points), [1, 1 + len(point)])
         above, below = np.split(points[1:], 2)
-        ahead, behind = np.split(costs[1:], 2)
-        return float(costs[0]), (ahead - behind) / np.diagonal(above - below)
+        return float(here), (ahead - behind) / np.diagonal(above - below)
 
     bounds = list(zip(low, high, strict=True))
-    options = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-5}
-    found = minimize(with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return found.x, bool(found.nit < ITERATIONS)
+    if is_smooth:
+        options: dict[str, Any] = {"maxiter": ITERATIONS, "ftol": 1e-13, "gtol": 1e-5}
+        found = minimize(
+            with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        )
+        return found.x, bool(found.nit < ITERATIONS)
+    simplex = np.clip(
+        np.concatenate([start[None], start + FIRST_SIMPLEX * np.eye(len(start))]), low, high
+    )
+    options = {
+        "initial_simplex": simplex,
+        "xatol": 1e-3,
+        "fatol": 1e-9,
+        "maxiter": ITERATIONS * len(start),
+    }
+    found = minimize(
+        lambda point: float(costs(point[None])[0]),
+        start,
+        method="Nelder-Mead",
+        bounds=bounds,
+        options=options,
+    )
+    return found.x, bool(found.success)
 
 
 def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:

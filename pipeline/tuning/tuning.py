@@ -4,9 +4,7 @@ By maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space M
 chapter 7.
 """
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.replays import Kind, Log, settings_of, sources_of
-from pipeline.tuning.confidence import confidence, profiles
+from pipeline.tuning.confidence import confidence
 from pipeline.tuning.objective import (
     CRITERIA,
     Best,
@@ -22,7 +20,6 @@ from pipeline.tuning.objective import (
     Objective,
     Run,
     in_memory,
-    innovations_in,
     with_values,
 )
 from pipeline.tuning.outcome import START, TUNED, Found, Source, Tuning
@@ -37,8 +34,6 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, bind
-from replay.judging.evaluation import split_topic
-from replay.judging.whiteness import whitened, whiteness
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
@@ -103,44 +98,37 @@ def tune(
     start = np.array([each.start for each in searched])
     runs = [in_memory(source, bound) for source in sources]
     others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
-    opened = merge(settings, OPEN) if CRITERIA[by].opens_gate and _gate(bound) < 1.0 else settings
-    with ThreadPoolExecutor(os.cpu_count()) as executor:
+    opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
+    names = [each.name for each in searched]
 
-        def objective(runs: Sequence[Run]) -> Objective:
-            names = [each.name for each in searched]
-            made = Objective(label, opened, names, runs, by, gap_limit_s, executor, on_best)
-            made.begin(start)
-            return made
+    def objective(runs: Sequence[Run]) -> Objective:
+        made = Objective(label, opened, names, runs, by, gap_limit_s, on_best)
+        made.begin(start)
+        return made
 
-        whole, beyond = objective(runs), objective(others) if others else None
-        found = _search(whole, searched, grid)
-        compared = np.array([start, found.optimum])
-        parts = [
-            (runs[fold::folds], [run for run in runs if run not in runs[fold::folds]])
-            for fold in range(folds)
-        ]
-        rows = [
-            _row_of_fold(number, objective(left_out), objective(rest), searched, grid)
-            for number, (left_out, rest) in enumerate(parts)
-        ]
-        return Tuning(
-            label,
-            sources,
-            held_out,
-            by,
-            found,
-            {
-                name: with_values(settings, whole.names, values)
-                for name, values in zip((START, TUNED), compared, strict=True)
-            },
-            costs=whole(compared),
-            held_out_costs=beyond(compared) if beyond else None,
-            folds=pd.DataFrame(rows),
-            whiteness=_whiteness_table(whole, compared),
-            gate=_gate(bound) if opened is not settings else 1.0,
-            evaluations=whole.best.evaluations,
-            gap_limit_s=gap_limit_s,
-        )
+    whole, beyond = objective(runs), objective(others) if others else None
+    found = _search(whole, searched, grid)
+    compared = np.array([start, found.optimum])
+    rows = []
+    for fold in range(folds):
+        left_out = runs[fold::folds]
+        rest = [run for number, run in enumerate(runs) if number % folds != fold]
+        rows.append(_row_of_fold(fold, objective(left_out), objective(rest), searched, grid))
+    return Tuning(
+        label,
+        sources,
+        held_out,
+        {
+            name: with_values(settings, names, values)
+            for name, values in zip((START, TUNED), compared, strict=True)
+        },
+        whole,
+        found,
+        costs=whole(compared),
+        held_out_costs=beyond(compared) if beyond else None,
+        folds=pd.DataFrame(rows),
+        gate=_gate(bound) if opened is not settings else 1.0,
+    )
 
 
 def _gate(bound: Sequence[Bound]) -> float:
@@ -167,7 +155,7 @@ def _searched(
     for number, name in enumerate(names):
         if name in names[:number]:
             raise BadInput(f"--free {name}: is named twice; once is enough")
-        if name in OPEN and CRITERIA[by].opens_gate:
+        if name in OPEN and CRITERIA[by].is_smooth:
             raise BadInput(
                 f"--free {name}: more innovations are kept out than explained; tune it --by nees"
             )
@@ -212,17 +200,19 @@ def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
         point = coordinates.of(np.array([each.start for each in free]))
         if grid > 1:
             point = least_of_grid(objective, coordinates, grid)
-        point, has_converged = minimum(objective, coordinates, point)
-        found = Found(coordinates, coordinates.values(point), has_converged=has_converged)
+        is_smooth = CRITERIA[objective.by].is_smooth
+        point, has_converged = minimum(objective, coordinates, point, is_smooth=is_smooth)
         inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
-        if objective.by != "likelihood" or not inner:
-            return found
-        told = confidence(inner, curvature(objective, coordinates, point, inner))
-        return found._replace(told=told, profiles=profiles(objective, coordinates, point, told))
+        told = None
+        if objective.by == "likelihood" and inner:
+            told = confidence(inner, curvature(objective, coordinates, point, inner))
+        optimum, evaluations = coordinates.values(point), objective.best.evaluations
+        return Found(coordinates, optimum, evaluations, told, has_converged=has_converged)
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
             raise
-        return Found(coordinates, objective.best.point, was_stopped=True)
+        best = objective.best
+        return Found(coordinates, best.point, best.evaluations, was_stopped=True)
 
 
 def _row_of_fold(
@@ -239,30 +229,3 @@ def _row_of_fold(
         f"cost_{START}": costs[0],
         f"cost_{TUNED}": costs[1],
     }
-
-
-def _whiteness_table(objective: Objective, points: Floats) -> pd.DataFrame:
-    """A row per measured component at each of the points: those of start and tuned values."""
-    rows = []
-    for label, values in zip((START, TUNED), points, strict=True):
-        series: dict[tuple[str, str], list[Floats]] = {}
-        for run in objective.runs:
-            for topic, innovations in innovations_in(objective.outputs(values, run)):
-                columns = zip(innovations.components, whitened(innovations).T, strict=True)
-                for name, column in columns:
-                    series.setdefault((split_topic(topic)[1], name), []).append(column)
-        for (case, name), found in series.items():
-            told = whiteness(found)
-            rows.append(
-                {
-                    "estimator": label,
-                    "case": case,
-                    "component": name,
-                    "count": told.size,
-                    "mean_square": told.mean_square,
-                    "next_correlation": told.correlation[0],
-                    "ljung_box": told.ljung_box,
-                    "probability": told.probability,
-                }
-            )
-    return pd.DataFrame(rows)

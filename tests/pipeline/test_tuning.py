@@ -1,6 +1,8 @@
 """Tuning: the reference sheet's numbers, what logs cannot tell, and what is refused."""
 
+import os
 import re
+import shlex
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.results import read_result
 from pipeline.tuning.objective import Best
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
@@ -163,30 +166,25 @@ def test_ctrl_c_ends_with_the_best_so_far(short: fl.MemorySource) -> None:
     assert [each.cost for each in told] == sorted((each.cost for each in told), reverse=True)
 
 
-def test_the_command_tunes_and_its_settings_replay(
+def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Its commands give its table, a result folder, and settings that replay, run and tune take."""
+    page = (Path(__file__).parents[2] / "docs" / "tuning.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    for run in ("0", "1"):
-        told = fuselog(
-            "record", "landmarks", "--run", run, "--set", "duration_s=15", "-o", f"{run}.mcap"
-        )
-        assert told.code == 0
-    off = ("--set", "sigma_range_m=0.5", "--set", "sigma_bearing_rad=0.1")
-    free = ("--free", "sigma_range_m", "--free", "sigma_bearing_rad")
-    told = fuselog("tune", "0.mcap", "-e", "ekf", *free, *off, "--validate", "1.mcap", "--json")
-    assert (told.code, told.err) == (0, "")
-    rows = {row["parameter"]: row for row in told.json["parameters"]}
-    for name, sigma in (("sigma_range_m", 0.1), ("sigma_bearing_rad", 0.02)):
-        assert rows[name]["value"] == pytest.approx(sigma, rel=0.1)
-        assert rows[name]["low"] < rows[name]["value"] < rows[name]["high"]
-    assert any(re.match("logs held out: .*: better", note) for note in told.json["notes"])
-    metrics = told.json["metrics"]
+    commands = re.findall(r"^fuselog (.*)$", page, re.MULTILINE)
+    told = [fuselog(*shlex.split(command)) for command in commands]
+    assert [(each.code, each.err) for each in told] == [(0, "")] * 4
+    shown, printed = (
+        re.findall(r"^ (\w+)((?: +[\d.]+){4}) *$", text, re.MULTILINE) for text in (page, told[2].out)
+    )
+    assert [name for name, _ in printed] == [name for name, _ in shown]
+    for (_, expected), (_, values) in zip(shown, printed, strict=True):
+        assert [*map(float, values.split())] == pytest.approx([*map(float, expected.split())], rel=2e-3)
+    assert re.search("logs held out: .*: better", told[2].out)
+    result = read_result(Path("out/tune"))
     for label in ("tuned", "tuned-held-out"):
-        assert metrics[f"{label}.nis_per_component.robot1"] == pytest.approx(1.0, abs=0.2)
-        start = label.replace("tuned", "start")
-        key = "position_rmse_m.robot1"
-        assert metrics[f"{label}.{key}"] < metrics[f"{start}.{key}"]
+        assert result.metrics[f"{label}.nis_per_component.robot1"] == pytest.approx(1.0, abs=0.1)
     names = {path.name for path in Path("out/tune").rglob("*")}
     assert names >= {
         "settings.toml",
@@ -196,32 +194,111 @@ def test_the_command_tunes_and_its_settings_replay(
         "whiteness.csv",
     }
     tuned = tomllib.loads(Path("out/tune/settings.toml").read_text())
-    assert tuned == {"ekf": {name: row["value"] for name, row in rows.items()}}
-    settings = ("--settings", "out/tune/settings.toml")
-    again = fuselog("replay", "0.mcap", "-e", "ekf", *settings, "--json")
-    assert again.json["metrics"]["ekf.log_likelihood.robot1"] == metrics["tuned.log_likelihood.robot1"]
-    run = fuselog(
-        "run",
-        "0.mcap",
-        "-e",
-        "ekf",
-        *settings,
-        "--set",
-        "ekf.sigma_range_m=0.3",
-        "--out",
-        "run",
-        "--json",
-    )
-    parameters = run.json["settings"]["parameters"]["ekf"]
-    assert parameters["sigma_range_m"] == 0.3
-    assert parameters["sigma_bearing_rad"] == tuned["ekf"]["sigma_bearing_rad"]
-    refused = fuselog("replay", "0.mcap", "-e", "ukf", *settings)
+    assert list(tuned["ekf"]) == [name for name, _ in shown]
+    settings = ("--settings", "out/tune/settings.toml", "--json")
+    again = fuselog("replay", "run.mcap", "-e", "ekf", *settings).json["metrics"]
+    assert again["ekf.log_likelihood.robot1"] == result.metrics["tuned.log_likelihood.robot1"]
+    over = ("--set", "ekf.sigma_range_m=0.3")
+    run = fuselog("run", "run.mcap", "-e", "ekf", *settings, *over, "--out", "run").json
+    expected = {**tuned["ekf"], "sigma_range_m": 0.3}
+    assert expected.items() <= run["settings"]["parameters"]["ekf"].items()
+    further = fuselog("tune", "run.mcap", "-e", "ekf", "--free", "sigma_range_m", *settings).json
+    [row] = further["parameters"]
+    assert row["start"] == tuned["ekf"]["sigma_range_m"] == pytest.approx(row["value"], rel=1e-4)
+    report = fuselog("report", "out/tune", "-o", "tune.html")
+    assert report.code == 0
+    assert "log-likelihood less its greatest" in Path("tune.html").read_text(encoding="utf-8")
+
+
+def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    tuned = tmp_path / "settings.toml"
+    tuned.write_text("[ekf]\nsigma_range_m = 0.1\n")
+    refused = fuselog("replay", world / "log.mcap", "-e", "ukf", "--settings", tuned, "-o", tmp_path)
     assert (refused.code, refused.err) == (
         2,
-        "fuselog: out/tune/settings.toml: has settings of ekf, and a settings file has a table for each "
-        "estimator that is replayed: ukf\n",
+        f"fuselog: {tuned}: has settings of ekf, and a settings file has a table for each estimator "
+        "that is replayed: ukf\n",
     )
-    bounds = fuselog("tune", "0.mcap", "-e", "ekf", *free, "--bound", "sigma_range_m=1")
-    assert bounds.err == (
-        "fuselog: --bound sigma_range_m=1: expected NAME=LOW:HIGH, as sigma_range_m=0.01:1\n"
+    tune = (
+        "tune",
+        world / "log.mcap",
+        "-e",
+        "ekf",
+        "--free",
+        "sigma_range_m",
+        "--out",
+        tmp_path / "out",
     )
+    for options, sentence in (
+        (("--bound", "sigma_range_m=1"), "--bound sigma_range_m=1: expected NAME=LOW:HIGH"),
+        (("--by", "luck"), "Invalid value for '--by'"),
+        (("--settings", world / "garbled.toml"), "is not readable as TOML"),
+    ):
+        refused = fuselog(*tune, *options)
+        assert (refused.code, len(refused.err.splitlines())) == (2, 1)
+        assert sentence in refused.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def seen() -> list[fl.MemorySource]:
+    """Two short runs with truth, in which ranges are told by a single sighting a second."""
+    rate = {"range_bearing": {"rate_hz": 2.0}}
+    return [fl.record("landmarks", seed=2, run=run, duration_s=20.0, **rate) for run in range(2)]
+
+
+@pytest.mark.parametrize(
+    ("by", "begin", "quantity", "best"),
+    [
+        ("nis", 1.0, "nis_per_component", 1.0),
+        ("nees", 0.03, "nees", 3.0),
+        ("rmse", 1.0, "position_rmse_m", 0.0),
+    ],
+)
+def test_other_things_can_be_best(
+    seen: list[fl.MemorySource], by: Any, begin: float, quantity: str, best: float
+) -> None:
+    """Of NIS and NEES what they should be, of RMSE the least; without intervals, as is said."""
+    found = fl.tune(seen, "ekf", "sigma_range_m", by=by, set={"sigma_range_m": begin})
+    start, tuned = found.metrics.query("quantity == @quantity")["value"]
+    assert abs(tuned - best) < abs(start - best)
+    assert tuned == pytest.approx(best, abs=0.1)
+    assert found.parameters[["low", "high"]].isna().all(axis=None)
+    assert f"by {by} there are no intervals, and other values may do as well" in found.notes
+
+
+def test_folds_and_a_grid(seen: list[fl.MemorySource]) -> None:
+    """Each run judges what the other gives; a grid leads to where the search ends in any case."""
+    free = ["sigma_range_m", "sigma_bearing_rad"]
+    far = {"sigma_range_m": 1.0, "sigma_bearing_rad": 0.2}
+    bounds = {"sigma_range_m": (0.01, 2.0), "sigma_bearing_rad": (0.001, 0.4)}
+    found = fl.tune(seen, "ekf", free, set=far, bounds=bounds, grid=4, folds=2)
+    for fold, other in enumerate(reversed(seen)):
+        alone = fl.tune(other, "ekf", free, set=far, bounds=bounds)
+        np.testing.assert_allclose(found.folds[free].iloc[fold], alone.found.optimum, rtol=1e-4)
+    assert (found.folds["cost_tuned"] < found.folds["cost_start"]).all()
+    assert "2 of 2 folds are explained better by what the others give" in found.notes
+    again = fl.tune(seen, "ekf", free, set=far)
+    np.testing.assert_allclose(again.found.optimum, found.found.optimum, rtol=1e-4)
+
+
+def test_any_number_of_cores_finds_the_same(
+    seen: list[fl.MemorySource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for cores in (1, 5):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        tuned = fl.tune(seen, "ekf", ["sigma_range_m", "bias_range_m"], set={"sigma_range_m": 0.5})
+        found.append((tuned.found.optimum.tobytes(), tuned.standard_errors.tobytes()))
+    assert found[0] == found[1]
+
+
+def test_what_need_not_be_positive_is_found_too() -> None:
+    """Biases and a scale, with the noise ten times off; what was put in lies in the intervals."""
+    sensor = {"rate_hz": 2.0, "bias_range_m": 0.2, "bias_bearing_rad": -0.05}
+    log = fl.record("landmarks", seed=3, duration_s=30.0, range_bearing=sensor, forward_scale_error=0.1)
+    true = {"bias_range_m": 0.2, "bias_bearing_rad": -0.05, "forward_scale": 1.1, "sigma_range_m": 0.1}
+    found = fl.tune(log, "ekf", [*true], set={"sigma_range_m": 1.0})
+    for row in found.parameters.to_dict("records"):
+        assert row["low"] < true[row["parameter"]] < row["high"], row
+        assert row["high"] - row["low"] < 0.2

@@ -1,0 +1,112 @@
+"""The study of tuning: how well maximum likelihood finds what a scenario was recorded with.
+
+Every run is tuned by itself, at several lengths, from the settings of the experiment's one estimator;
+the tuning is not told what is true. How often 95 % intervals hold the truth, how far values are from
+it, and how often the logs are said to tell too little.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pydantic import PositiveFloat
+
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.ensemble import hash_streams
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Outcome
+from pipeline.runner import Runner
+from pipeline.tuning.tuning import tune
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.sources import MemorySource
+
+COVERAGE = 0.95
+
+
+class TuningOptions(Parameters):
+    """How long logs are, and what is searched for, by name, with the value that it was recorded with."""
+
+    durations_s: tuple[PositiveFloat, ...] = (20.0, 60.0, 300.0)
+    true: dict[str, PositiveFloat] = {}
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    options: TuningOptions = setting.options
+    if not options.true or len(experiment.estimators) != 1:
+        raise BadInput(f"experiment '{experiment.title}': give one estimator, and [options.true]")
+    [(label, settings)] = experiment.estimators.items()
+    runner, sources = Runner(experiment, setting), []
+    rows: list[dict[str, Any]] = []
+    for duration_s in options.durations_s:
+        recorded = runner.obtain({"duration_s": duration_s})
+        title = f"tuning over {duration_s:g} s"
+        for run, source in enumerate(setting.progress(recorded, title, len(recorded))):
+            found = _rows(source, label, settings, options.true)
+            rows += [{"duration_s": duration_s, "run": run, **row} for row in found]
+        sources += recorded
+    tuned = pd.DataFrame(rows)
+    summary = tuned.groupby(["duration_s", "parameter"], sort=False).apply(_summary).reset_index()
+    outcome = Outcome(tables={"tuned": tuned, "lengths": summary}, figures={"lengths": _chart(summary)})
+    for row in summary.to_dict("records"):
+        case = f"{row['parameter']}-{row['duration_s']:g}s"
+        for quantity in ("covered_share", "ratio_spread", "standard_error", "doubtful_share"):
+            outcome.metrics[f"{label}.{quantity}.{case}"] = row[quantity]
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
+
+
+def _rows(
+    source: MemorySource, label: str, settings: Mapping[str, Any], true: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """A row per parameter of one log: true and tuned value, interval, standard error, doubt."""
+    found = tune(source, {label: settings}, list(true))
+    tables, errors = found.parameters.to_dict("records"), found.standard_errors
+    return [
+        {
+            "parameter": row["parameter"],
+            "true": true[row["parameter"]],
+            "value": row["value"],
+            "low": row["low"],
+            "high": row["high"],
+            "standard_error": error,
+            "is_covered": row["low"] <= true[row["parameter"]] <= row["high"],
+            "is_doubtful": any(row["parameter"] in note for note in found.notes_of_search),
+        }
+        for row, error in zip(tables, errors, strict=True)
+    ]
+
+
+def _summary(rows: pd.DataFrame) -> pd.Series:
+    """Over the runs: coverage, the spread of log(value / true), its standard error, doubts."""
+    ratios = np.log(rows["value"] / rows["true"])
+    return pd.Series(
+        {
+            "covered_share": rows["is_covered"].mean(),
+            "ratio_spread": np.sqrt(np.mean(ratios**2)),
+            "standard_error": rows["standard_error"].median(),
+            "doubtful_share": rows["is_doubtful"].mean(),
+        }
+    )
+
+
+def _chart(summary: pd.DataFrame) -> Chart:
+    """Coverage, and the spread of the values beside their standard errors, over the logs' length."""
+    x = Axis(label="length of the log (s)", log=True)
+    covered = Panel(x=x, y=Axis(label="95 % intervals that hold the truth", limits=(0.0, 1.05)))
+    spread = Panel(x=x, y=Axis(label="spread of log(value / true)", log=True))
+    for name, rows in summary.groupby("parameter", sort=False):
+        length_s = rows["duration_s"]
+        covered.series.append(curve(str(name), length_s, rows["covered_share"], "line+markers"))
+        spread.series.append(curve(str(name), length_s, rows["ratio_spread"], "line+markers"))
+        said = rows["standard_error"]
+        spread.series.append(curve(f"{name}, as intervals say", length_s, said, "dashed"))
+    covered.series.append(level("95 %", summary["duration_s"], COVERAGE))
+    return Chart(title="tuned values over the length of the log", panels=[covered, spread])
+
+
+TUNING = Study(
+    "how well maximum likelihood finds the noise that logs were recorded with", study, TuningOptions
+)
