@@ -28,8 +28,11 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """
     from replay.engine import blocks, supervision
 <<<<<<< HEAD
+<<<<<<< HEAD
     from replay.inference import estimators, gauss_newton, imm, observability, rewinding, smoothers
 =======
+=======
+>>>>>>> tracking
     from replay.inference import (
         estimators,
         gauss_newton,
@@ -37,8 +40,13 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         observability,
         rewinding,
         smoothers,
+<<<<<<< HEAD
     )
 >>>>>>> navigation
+=======
+        tracking,
+    )
+>>>>>>> tracking
 
     loops = (
         blocks._merge,
@@ -50,6 +58,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         smoothers._sliding,
         imm._smoothing,
         observability._summing,
+        tracking._compiled,
     )
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
     for each in loops:
