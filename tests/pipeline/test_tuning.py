@@ -127,7 +127,11 @@ def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
             {"bounds": {"sigma_bearing_rad": (0.1, 1)}},
             "--bound sigma_bearing_rad: is not",
         ),
-        ("sigma_range_m", {"folds": 2}, "--folds 2: 1 logs can be cut into 2 to 1 parts"),
+        (
+            "sigma_range_m",
+            {"folds": 2},
+            "--folds 2: give two or more, and a log for each at least; there are 1",
+        ),
         ("bias_range_m", {"grid": 3}, "bias_range_m: a grid goes from bound to bound"),
         ("sigma_range_m", {"grid": 10_001}, "--grid 10001: that is 10001 points of 1 parameters"),
     ],
@@ -244,7 +248,7 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
 def seen() -> list[fl.MemorySource]:
     """Two short runs with truth, in which ranges are told by a single sighting a second."""
     rate = {"range_bearing": {"rate_hz": 2.0}}
-    return [fl.record("landmarks", seed=2, run=run, duration_s=20.0, **rate) for run in range(2)]
+    return [fl.record("landmarks", seed=seed, duration_s=20.0, **rate) for seed in (2, 3)]
 
 
 @pytest.mark.parametrize(
