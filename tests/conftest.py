@@ -27,26 +27,16 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
     """
     from replay.engine import blocks, supervision
-<<<<<<< HEAD
-<<<<<<< HEAD
-    from replay.inference import estimators, gauss_newton, imm, observability, rewinding, smoothers
-=======
-=======
->>>>>>> tracking
     from replay.inference import (
         estimators,
+        fixed_lag,
         gauss_newton,
         imm,
         observability,
         rewinding,
-        smoothers,
-<<<<<<< HEAD
-    )
->>>>>>> navigation
-=======
+        smoothing,
         tracking,
     )
->>>>>>> tracking
 
     loops = (
         blocks._merge,
@@ -54,8 +44,8 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         estimators._compiled,
         rewinding._compiled,
         gauss_newton.searching,
-        smoothers._way_back,
-        smoothers._sliding,
+        smoothing.going_back,
+        fixed_lag.sliding_over_runs,
         imm._smoothing,
         observability._summing,
         tracking._compiled,
