@@ -6,7 +6,7 @@ BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # --no-compile: Python compiles the modules that are imported, which are few of them
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
-.PHONY: demo test test-fast fast-lane studies-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast fast-lane studies-lane inference-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -20,7 +20,7 @@ demo: .venv/with-fuselog
 
 # the fast tests, the long reproductions of papers and the linters, side by side
 test: .venv/with-test
-	$(MAKE) -j4 fast-lane studies-lane papers-lane lint
+	$(MAKE) -j5 papers-lane fast-lane studies-lane inference-lane lint
 
 test-fast: lint fast-lane
 
@@ -30,8 +30,11 @@ fast-lane: .venv/with-test
 studies-lane: .venv/with-test
 	$(BIN)/pytest -m paper tests/pipeline
 
+inference-lane: .venv/with-test
+	$(BIN)/pytest -m paper tests/replay/inference
+
 papers-lane: .venv/with-test
-	$(BIN)/pytest -m paper --ignore=tests/pipeline
+	$(BIN)/pytest -m paper --ignore=tests/pipeline --ignore=tests/replay/inference
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .

@@ -120,9 +120,15 @@ def start_from(
 ) -> Bound:
     """The estimator, begun from each run's origin where that run's span begins after its prior.
 
-    Raises BadInput where an origin has no state for a prior at the beginning of the span.
+    Raises BadInput where an origin has no state for a prior at the beginning of the span, or the log no
+    prior that it stands for.
     """
     label = bound.name.partition("/")[0]
+    for topic in bound.priors.keys() - sources[0].topics.keys():
+        raise BadInput(
+            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) that another "
+            "state could stand for; leave out --start-from: it begins at the span's first measurements"
+        )
     priors = {
         topic: gather(
             [

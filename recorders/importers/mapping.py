@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput, choices
 from recorders.importers.units import conversion
 from recorders.log import Schema, schemas
-from recorders.models.orientation import require_unit
+from recorders.models.orientation import compose, require_unit
 from recorders.parameters import Parameters
 
 Floats = NDArray[np.float64]
@@ -209,21 +209,26 @@ class _Maker(NamedTuple):
         if width not in lengths:
             wanted = " or ".join(map(str, lengths))
             raise BadInput(f"{self.where}: field {name} is given {width} numbers; expected {wanted}")
-        if name not in {**mapping.factors, **mapping.offsets, **mapping.units}:
-            return values
-        factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
-        offsets = self._spread(mapping.offsets.get(name, 0.0), width, f"offsets of {name}")
-        return (values * factors + offsets) * self._conversions(name, width)
+        if name in {**mapping.factors, **mapping.offsets, **mapping.units}:
+            factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
+            offsets = self._spread(mapping.offsets.get(name, 0.0), width, f"offsets of {name}")
+            values = (values * factors + offsets) * self._conversions(name, width)
+        which = _quaternion_of(mapping) if name in _STATED else []
+        if which:
+            values = values.astype(float)
+            known = np.isfinite(values[:, which]).all(axis=1)
+            values[np.ix_(known, which)] = require_unit(
+                values[np.ix_(known, which)], f"{self.where}: the quaternions of {name}", _UNIT_TOLERANCE
+            )
+        return values
 
     def _covariance(self, name: str, stretch: Floats) -> Floats:
         """A covariance (n, width * width) of standard deviations."""
         mapping = self.mapping
         deviations = self._numbers(mapping.deviations[name])
         width = deviations.shape[1]
-        size = (
-            stretch * self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")[:, None]
-        )
-        size = size.T * self._conversions(name, width)
+        factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
+        size = np.outer(stretch, factors * self._conversions(name, width))
         covariance = np.zeros((self.size, width, width))
         covariance[:, range(width), range(width)] = (deviations * size) ** 2
         if name in mapping.cross_deviations:
@@ -254,8 +259,9 @@ class _Maker(NamedTuple):
         """By what each entry of a field is multiplied."""
         if name not in self.mapping.units:
             return np.ones(width)
-        stated = name in (*_STATED, "covariance") and self.mapping.components
-        names = self.mapping.components.split(",") if stated else [name] * width
+        names = self.mapping.components.split(",")
+        if name not in (*_STATED, "covariance") or len(names) != width:
+            names = [name] * width
         given = self._spread(self.mapping.units[name], width, f"units of {name}")
         try:
             return np.array([conversion(*pair) for pair in zip(given, names, strict=True)])
@@ -282,31 +288,31 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
     turn = Rotation.from_euler("xyz", mapping.mounting_deg, degrees=True)
     vectors, covariance = _IN_BODY.get(schema.name, ((), ""))
     for name in vectors:
-        if columns[name].shape[1] == 3:
-            columns[name] = columns[name] @ turn.as_matrix().T
-    if covariance:
-        parts = columns[covariance].shape[1] and len(vectors)
-        whole = np.kron(np.eye(parts), turn.as_matrix())
-        square = columns[covariance].reshape(-1, 3 * parts, 3 * parts)
+        if columns[name].shape[1] != 3:
+            raise BadInput(f"{where}: field {name} is given 2 numbers; mounting_deg turns 3")
+        columns[name] = columns[name] @ turn.as_matrix().T
+    width = 3 * len(vectors)
+    if covariance and columns[covariance].shape[1] == width**2:
+        whole = np.kron(np.eye(len(vectors)), turn.as_matrix())
+        square = columns[covariance].reshape(-1, width, width)
         columns[covariance] = (whole @ square @ whole.T).reshape(len(square), -1)
-    kinds = mapping.kinds.split(",")
+    which = _quaternion_of(mapping)
     if "quaternion" in columns:
         columns["quaternion"] = _turned_back(columns["quaternion"], turn)
-    elif "quaternion" in kinds:
-        which = [index for index, kind in enumerate(kinds) if kind == "quaternion"]
-        state = columns["state"] = columns["state"].astype(float)
-        state[:, which] = _turned_back(state[:, which], turn)
+    elif "state" in columns and which:
+        columns["state"][:, which] = _turned_back(columns["state"][:, which], turn)
     elif not vectors:
         raise BadInput(f"{where}: {schema.name} has nothing in the body's axes; leave mounting_deg out")
 
 
+def _quaternion_of(mapping: StreamMapping) -> list[int]:
+    """Where a vector has the parts of a quaternion, if it has one."""
+    return [index for index, kind in enumerate(mapping.kinds.split(",")) if kind == "quaternion"]
+
+
 def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
-    """Orientations (n, 4) of the body where `quaternion` has the sensor's; NaN stays."""
-    known = np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
-    turned = quaternion.astype(float)
-    sensor = Rotation.from_quat(quaternion[known], scalar_first=True)
-    turned[known] = (sensor * turn.inv()).as_quat(scalar_first=True)
-    return turned
+    """Orientations (n, 4) of the body where `quaternion` has the sensor's, each as long as it was."""
+    return compose(quaternion, turn.inv().as_quat(scalar_first=True))
 
 
 def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:

@@ -454,7 +454,8 @@ EXISTENCE = _declare(
 )
 ASSOCIATION = _declare(
     "Association",
-    "How probable it is that a detection is a track's; the metadata lists the sensors by number.",
+    "How probable it is that a detection is a track's; the metadata lists the sensors by number. Those "
+    "of a scan that were joined, being of one hull, count as one.",
     _identifier("track_id"),
     _identifier("sensor_id"),
     _identifier("scan_id"),

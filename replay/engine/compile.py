@@ -118,7 +118,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
 
 
 class _InlinedLibrary(JITCodeLibrary):
-    """The code of one function that is inlined where it is called.
+    """The code of one function that only other compiled code calls, and of which that gets a copy.
 
     It is optimised there, once; numba would optimise it at every level of calls above it, which takes
     half of the time that a kernel of many small functions needs to compile. Nor is machine code made of
@@ -154,7 +154,7 @@ class _InlinedLowering(NativeLowering):
 
 
 class Inlined(Compiler):
-    """The compiler of functions that end up within another one, see `numba.njit(pipeline_class=...)`."""
+    """The compiler of functions that end up in another kernel, see `numba.njit(pipeline_class=...)`."""
 
     def define_pipelines(self) -> Any:
         """The usual passes, but for the last, into a library of another kind."""
@@ -259,9 +259,10 @@ class _Bundle:
         bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
         self.options = f"_nrt={allocates}{bounds}"
         self.imports = {"import numba", "import numpy"}
+        inner += ", pipeline_class=Inlined"
+        self.imports.add("from replay.engine.compile import Inlined")
         if not allocates:  # one piece is faster where no counting of references stands in the way
-            inner += ", forceinline=True, pipeline_class=Inlined"
-            self.imports.add("from replay.engine.compile import Inlined")
+            inner += ", forceinline=True"
         self._decorator = f"@numba.njit({inner}, {self.options})"
         self.definitions: list[str] = []
         # where the lines of the module come from, in words

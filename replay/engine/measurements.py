@@ -17,6 +17,8 @@ PLANE: Components = {"x_m": "linear", "y_m": "linear"}
 _IMPLIED = {
     ("position_m", 2): "x_m,y_m",
     ("position_m", 3): "x_m,y_m,z_m",
+    ("velocity_mps", 2): "vx_mps,vy_mps",
+    ("velocity_mps", 3): "vx_mps,vy_mps,vz_mps",
 }
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from recorders.errors import BadInput
 from recorders.log import Clock
 from replay.engine.blocks import Block, Ragged, gather, join, merge_events
-from replay.engine.estimator import Batch, Bound, Opened, Recursive, code_of
+from replay.engine.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.late import Late, taking_late
 from replay.engine.priors import start_of_runs
 from replay.engine.sources import Ensemble, Source, ensemble_of
@@ -71,22 +71,19 @@ def replay(
         estimators = [taking_late(bound, late) for bound in estimators]
     ensemble = ensemble_of(sources)
     read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
-    stamps: Clock = order if late is None else "publish_time"
-    opened = [_open(bound, ensemble, order, stamps) for bound in estimators]
-    wholes = [
-        {topic: read[topic] for topic in bound.whole} | dict(bound.given) | found.whole
-        for bound, found in zip(estimators, opened, strict=True)
-    ]
+    wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
     for bound, whole in zip(estimators, wholes, strict=True):
         _refuse_old_priors(bound, ensemble, whole, order)
+    stamps: Clock = order if late is None else "publish_time"
     watches = [
         Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
-    states, refused = _start(estimators, watches, wholes)
+    told: list[Ragged] = []
+    opening = partial(_open, ensemble, order, stamps, told)
+    states, refused = _start(estimators, watches, wholes, opening)
     if refused and not is_part:
         raise next(iter(refused.values()))
-    told = [ragged for found in opened for ragged in found.told]
     if told:
         yield told
     for bound, watch, given in zip(estimators, watches, states, strict=True):
@@ -116,19 +113,26 @@ def replay(
             report.coverage += watch.coverage()
 
 
-def _open(bound: Bound, ensemble: Ensemble[Source], order: Clock, stamps: Clock) -> Opened:
-    """What an estimator takes from the first messages of the runs."""
+def _open(
+    ensemble: Ensemble[Source], order: Clock, stamps: Clock, told: list[Ragged], bound: Bound
+) -> dict[str, Ragged]:
+    """What an estimator starts from that is found in the first messages; `told` gets what it says."""
     if not isinstance(bound, Recursive) or bound.opening is None:
-        return Opened({}, [])
+        return {}
     topics = bound.opening.topics
     nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
     first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
     with code_of(bound.name):
-        return bound.opening.find(first, stamps)
+        found = bound.opening.find(first, stamps)
+    told += found.told
+    return found.whole
 
 
 def _start(
-    estimators: Sequence[Bound], watches: Sequence[Watch], wholes: Sequence[Mapping[str, Ragged]]
+    estimators: Sequence[Bound],
+    watches: Sequence[Watch],
+    wholes: Sequence[Mapping[str, Ragged]],
+    opening: Callable[[Bound], dict[str, Ragged]],
 ) -> tuple[list[Any], dict[str, BadInput]]:
     """The states of recursions and what batches are given; _REFUSED where there is none.
 
@@ -140,7 +144,7 @@ def _start(
     for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
         told = told_of.setdefault(bound.name.partition("/")[0], [])
         try:
-            given, unable = start_of_runs(whole, bound.priors)
+            given, unable = start_of_runs({**whole, **opening(bound)}, bound.priors)
             watch.exclude(unable)
             with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
@@ -187,7 +191,7 @@ def _refuse_old_priors(
     bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
-    for topic in bound.priors.keys() - bound.given.keys():
+    for topic in (bound.priors.keys() & whole.keys()) - bound.given.keys():
         for run, start_ns in ensemble.starts_ns.items():
             times_ns = whole[topic].of_run(run).times(order)[:1]
             if len(times_ns) and times_ns[0] < start_ns:

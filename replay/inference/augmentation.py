@@ -179,7 +179,7 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     if sensor.noises:
         arguments, passed = "state, noise", "first(state), noise"
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    recorder, about = _recorder(model), (1.0,) * (sensor.about.size if sensor.about else 0)
+    recorder, about = _recorder(model), (1.0,) * sensor.about_size
     sensor.measure(trial_state(model.kinds), *entering, about, recorder)
     measured = _entries(len(sensor.measured))
     measure = _reading(model, names, sensor.measure, f"{arguments}, about", f"{passed}, about", measured)

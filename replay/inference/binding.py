@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.log import Schema, Topic, schemas
+from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.channels import resolved, stated
 from replay.engine.geodetic import GEODETIC
@@ -115,8 +116,8 @@ def topics_of(
 def _found(model: Model, here: _Here) -> Found | None:
     """What there is of a model under one prefix; None where it does not fit.
 
-    A log without the prior fits a model that can start without, and one without sensors does if it has
-    nothing of them: no sightings whose map is missing, say.
+    A log without the prior fits a model that can start without, if a sensor measures the state itself.
+    One without sensors does if it has nothing of them: no sightings whose map is missing, say.
     """
     prior = here.topic(model.prior, schemas.GAUSSIAN_ESTIMATE)
     has_prior = prior is not None
@@ -137,8 +138,11 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     parts = {each.topic for each in model.all_sensors}
     parts |= {each.about.topic for each in model.all_sensors if each.about}
-    is_alone = model.start is not None and control is not None and not any(map(here.has, parts))
+    starts_alone = model.start is not None and model.start.find is None
+    is_alone = starts_alone and control is not None and not any(map(here.has, parts))
     if not sensors and model.needs_sensor and not is_alone:
+        return None
+    if not has_prior and sensors and not any(measures_state(model, sensor) for sensor, _ in sensors):
         return None
     instead = tuple(
         (each, topic)
@@ -147,6 +151,11 @@ def _found(model: Model, here: _Here) -> Found | None:
     )
     truth = here.place(model.truth)
     return Found(here.prefix, prior, truth, control, sensors, has_prior, instead)
+
+
+def measures_state(model: Model, sensor: Sensor) -> bool:
+    """Whether a sensor measures components of the state by their names, with their covariance."""
+    return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
 
 
 def needs_of(model: Model) -> str:
@@ -199,7 +208,9 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
         return Part(words, is_here=is_of)
 
     parts = []
-    if model.start is None or here.has(model.prior):
+    sensing = [sensor for sensor in model.all_sensors if here.has(sensor.topic)]
+    starts = not sensing or any(measures_state(model, sensor) for sensor in sensing)
+    if model.start is None or here.has(model.prior) or not starts:
         words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
         if is_here:
             is_here = names_state(here.topics[here.place(model.prior)], model)
@@ -218,13 +229,14 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
     return parts
 
 
-def names_state(prior: Topic, model: Model) -> bool:
-    """Whether a prior's channel names all components of a model's state."""
-    return set(model.state) <= set(prior.metadata.get("components", "").split(","))
+def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
+    """Whether a prior's channel names all components of a model's state, and no others if `exactly`."""
+    named = set(prior.metadata.get("components", "").split(","))
+    return named == set(model.state) if exactly else named >= set(model.state)
 
 
 @cache
-def number_fields(parameters: type[ModelParameters]) -> tuple[str, ...]:
+def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
     """The parameters that model functions may read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")

@@ -30,13 +30,14 @@ from replay.inference.gaussian import (
     kalman_step,
     keep_measured,
     moved_covariance,
+    multiply_into,
     reduce_covariance,
     whiten,
 )
 from replay.inference.generate import tuple_of
 from replay.inference.methods import FILTERS, Method, MethodParameters
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations
-from replay.inference.smoothers import solve_semidefinite
+from replay.inference.smoothing import solve_semidefinite
 from replay.inference.steps import (
     NO_TRUTH,
     NOT_POSITIVE_DEFINITE,
@@ -117,7 +118,7 @@ def bound_steps(stage: Stage) -> Steps:
         mean, work = along.mean[run], memory.work
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
-        premultiply(work.transition, along.transition[run], work.product)
+        multiply_into(work.transition, along.transition[run], work.product)
         moved_covariance(along.noise[run], work.transition, work.product)
         add_noise(state, along.noise[run], duration_s, parameters, work)
         moved_covariance(along.covariance[run], work.transition, work.product)
@@ -191,20 +192,6 @@ def _update(stage: Stage, number: int) -> Function:
         return NOTHING_MEASURED  # there is no innovation to tell of
 
     return update
-
-
-def premultiply(left: Floats, matrix: Floats, product: Floats) -> None:
-    """Make F A of A, by way of `product`."""
-    size = len(matrix)
-    for row in range(size):
-        for column in range(size):
-            entry = 0.0
-            for k in range(size):
-                entry += left[row, k] * matrix[k, column]
-            product[row, column] = entry
-    for row in range(size):
-        for column in range(size):
-            matrix[row, column] = product[row, column]
 
 
 def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:

@@ -144,7 +144,7 @@ def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
 
 
 def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
-    about = tuple(rng.normal(size=sensor.about.size)) if sensor.about else ()
+    about = tuple(rng.normal(size=sensor.about_size))
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
     rest = (about, numbers)
     return _Call(_place(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)

@@ -46,13 +46,17 @@ from replay.inference.binding import (
 )
 from replay.inference.happenings import (
     World,
+    as_measured,
     data_columns,
+    delays_of,
     happenings_of,
     held,
     interpolated,
     joined,
+    of_rows,
     points_of,
     times_alone,
+    with_control,
     with_ticks,
 )
 from replay.inference.methods import Method
@@ -179,13 +183,14 @@ def _bind_fitting(
         for name, model in models.items()
     }
     fitting = [name for name in models if found[name]]
-    if len(fitting) > 1:  # then the prior's components tell
-        named_alike = [
-            name
-            for name in fitting
-            if any(names_state(each.prior, models[name]) for each in found[name])
-        ]
-        fitting = named_alike or fitting
+    for exactly in (False, True):  # the prior's components tell
+        if len(fitting) > 1:
+            named_alike = [
+                name
+                for name in fitting
+                if any(names_state(each.prior, models[name], exactly=exactly) for each in found[name])
+            ]
+            fitting = named_alike or fitting
     if len(fitting) > 1:
         raise BadInput(
             f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"
@@ -331,6 +336,7 @@ class State(NamedTuple):
         world: what messages are read against.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
+        unsettled: events that wait for others which were measured before them and come later.
         kept: what a smoother keeps for its way back, or a filter for late messages.
         tick: (runs,) the number of the next extra estimate.
     """
@@ -340,6 +346,7 @@ class State(NamedTuple):
     generators: tuple[Any, ...]
     waiting: Happenings | None
     tick: Integers
+    unsettled: Happenings | None = None
     kept: Any = None
 
 
@@ -392,7 +399,8 @@ class Filter:
         time_ns, mean, covariance = gaussians(whole[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
-        carried = Carried(Gaussian(mean, covariance), control, time_ns, started)
+        accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
+        carried = Carried(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
         maps = {each.about.topic: each.about for each in self.stage.sensors if each.about}
         points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
         waiting = None
@@ -412,7 +420,19 @@ class Filter:
         """Filter a block."""
         happenings, lacking = happenings_of(self.stage, self.found, block, state.world, self.settings)
         passed_over = self.passed_over(block, lacking)
-        tick, waiting = state.tick, None
+        after, made = self.through(state, happenings, is_end=False)
+        return after, [*made, *passed_over]
+
+    def through(
+        self, state: State, happenings: Happenings, *, is_end: bool
+    ) -> tuple[State, list[Ragged]]:
+        """Filter the events that need not wait for others."""
+        tick, waiting, unsettled = state.tick, None, None
+        if self.delays_ns.any():
+            if state.unsettled is not None:
+                happenings = joined(state.unsettled, happenings)
+            delays = self.delays_ns
+            happenings, unsettled = as_measured(self.stage, happenings, delays, is_end=is_end)
         if self.parameters.every_s is not None:
             every_ns = round(self.parameters.every_s * 1e9)
             happenings, tick = with_ticks(happenings, state.carried.time_ns, tick, every_ns)
@@ -420,17 +440,22 @@ class Filter:
             happenings = joined(state.waiting, happenings)
         control = self.stage.model.control
         if control is not None and control.interpolated:
-            happenings, waiting = interpolated(happenings, len(control.components))
-        after, made = self.follow(state._replace(waiting=waiting, tick=tick), happenings)
-        return after, [*made, *passed_over]
+            happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
+            happenings = with_control(self.stage, happenings)
+        state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
+        return self.follow(state, happenings)
 
     def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""
-        if not any(sensor.covariance for sensor in self.stage.sensors):
+        control = self.stage.model.control
+        drops_controls = control is not None and control.interpolated
+        if not drops_controls and not any(sensor.covariance for sensor in self.stage.sensors):
             return []
         sensors = {topic.name: sensor for sensor, topic in self.found.sensors}
         reasons = [
-            complaint_of(self.stage.model, sensors[topic], topic) if topic in sensors else ""
+            complaint_of(self.stage.model, sensors[topic], topic)
+            if topic in sensors
+            else f"topic {topic}: it is not finite"
             for topic in block.streams
         ]
         events = block.events
@@ -444,14 +469,34 @@ class Filter:
         return [Ragged(stream, ragged_rows(lacking, events.offsets))]
 
     def finish(self, state: State) -> list[Ragged]:
-        """What still waits for a control that does not come any more."""
+        """What still waits for messages that do not come any more."""
         return self.ended(state)[1]
 
     def ended(self, state: State) -> tuple[State, list[Ragged]]:
-        """The state after what waits for a control that does not come any more, and its outputs."""
+        """The state after what waits for messages that do not come any more, and its outputs."""
+        made: list[Ragged] = []
+        if state.unsettled is not None:
+            no_more = of_rows(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
+            state, made = self.through(state, no_more, is_end=True)
         if state.waiting is None:
-            return state, []
-        return self.follow(state, held(state.waiting, self.initial))
+            return state, made
+        tail = with_control(self.stage, held(state.waiting, self.initial, self.gap_ns))
+        state, last = self.follow(state, tail)
+        return state, [*made, *last]
+
+    @property
+    def gap_ns(self) -> float:
+        """How long an interpolated control may be silent."""
+        control = self.stage.model.control
+        if control is None or not control.gap:
+            return np.inf
+        names = number_fields(self.stage.model.parameters)
+        return 1e9 * float(self.settings[0, names.index(control.gap)])
+
+    @cached_property
+    def delays_ns(self) -> Integers:
+        """See `delays_of`."""
+        return delays_of(self.stage, self.settings)
 
     @property
     def initial(self) -> tuple[float, ...]:
@@ -467,6 +512,8 @@ class Filter:
             return "there are no estimates between messages (every_s, --every) then"
         if control is not None and control.interpolated:
             return f"{control.topic} is interpolated, so that messages wait for the next one of it"
+        if self.delays_ns.any():
+            return "its messages are put where they were measured, and wait for each other"
         if any(each.redrawn for each in self.samplers):
             return "its samples are random, so that a message that is used again gets others"
         return ""
@@ -525,10 +572,15 @@ class Filter:
 
     @cached_property
     def gates(self) -> Floats:
-        """Bounds of the NIS (sensors, largest measurement + 1), by the number of components."""
+        """Bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
+
+        The last row is that of a gate that is open.
+        """
         largest = max((len(sensor.measured) for sensor in self.stage.sensors), default=0)
         bounds = _nis_bounds(self.parameters.gate_probability, largest)
-        return np.repeat(bounds[None], max(len(self.stage.sensors), 1), axis=0)
+        gates = np.repeat(bounds[None], len(self.stage.sensors) + 1, axis=0)
+        gates[-1] = np.inf
+        return gates
 
     @property
     def truth(self) -> str:

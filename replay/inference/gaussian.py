@@ -159,15 +159,28 @@ def scalar_update(
             covariance[column, row] = covariance[row, column]
 
 
+def multiply(left: Floats, right: Floats, product: Floats) -> None:
+    """Fill `product` with that of two square matrices."""
+    for row in range(len(product)):
+        for column in range(len(product)):
+            entry = 0.0
+            for k in range(len(product)):
+                entry += left[row, k] * right[k, column]
+            product[row, column] = entry
+
+
+def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
+    """Make F A of A, by way of `product`."""
+    multiply(left, matrix, product)
+    for row in range(len(matrix)):
+        for column in range(len(matrix)):
+            matrix[row, column] = product[row, column]
+
+
 def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
     """P becomes F P F', by way of `product`."""
     size = len(covariance)
-    for row in range(size):
-        for column in range(size):
-            entry = 0.0
-            for k in range(size):
-                entry += transition[row, k] * covariance[k, column]
-            product[row, column] = entry
+    multiply(transition, covariance, product)
     for row in range(size):
         for column in range(row + 1):
             entry = 0.0

@@ -87,7 +87,6 @@ def happenings_of(
         tables.append(_control_table(control, block.streams[found.control.name], width, own))
         for each, topic in found.instead:
             tables.append(_control_table(each, block.streams[topic.name], width, columns))
-    first = len(tables)
     for number, (_, topic) in enumerate(found.sensors):
         tables.append(sensor_table(stage, number, block.streams[topic.name], world, settings))
     data, source, target, lacking = (
@@ -99,12 +98,52 @@ def happenings_of(
     if lacking.any():  # as if these had not come
         happenings = of_rows(happenings, ~lacking)
         happenings = happenings._replace(is_due=last_of_stamps(happenings))
-    if first and not (control is not None and control.estimates) and found.sensors:
-        stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
-        sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-        sensed[stamp[happenings.source != CONTROL]] = True
-        happenings = happenings._replace(is_due=happenings.is_due & sensed[stamp])
-    return happenings, lacking
+    return happenings._replace(is_due=_wanted(stage, happenings)), lacking
+
+
+def _wanted(stage: Stage, happenings: Happenings) -> Booleans:
+    """Which of the last events of their stamps want an estimate: not where the control's are all."""
+    control = stage.model.control
+    if control is None or control.estimates or not stage.sensors:
+        return happenings.is_due
+    stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
+    sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+    sensed[stamp[happenings.source != CONTROL]] = True
+    return happenings.is_due & sensed[stamp]
+
+
+def delays_of(stage: Stage, settings: Floats) -> Integers:
+    """How long before their stamps messages were measured, in ns, by an event's source.
+
+    (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
+    """
+    names, control = number_fields(stage.model.parameters), stage.model.control
+    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
+    asked += [(0, ""), (0, control.delay if control else "")]
+    delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
+    return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
+
+
+def as_measured(
+    stage: Stage, happenings: Happenings, delays_ns: Integers, *, is_end: bool
+) -> tuple[Happenings, Happenings]:
+    """Events at the times at which they were measured, in order; and those still to wait.
+
+    What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
+    something older may come.
+    """
+    runs = len(happenings.offsets) - 1
+    run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
+    time_ns = happenings.time_ns - delays_ns[happenings.source]
+    last_ns = np.append(happenings.time_ns, 0)[happenings.offsets[1:] - 1]
+    settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
+    waiting = of_rows(happenings, ~settled)
+    measured = of_rows(happenings._replace(time_ns=time_ns), settled)
+    order = np.lexsort((measured.time_ns, run[settled]))
+    columns: Any = (column[order] for column in measured[1:])
+    measured = Happenings(measured.offsets, *columns)
+    measured = measured._replace(is_due=last_of_stamps(measured))
+    return measured._replace(is_due=_wanted(stage, measured)), waiting
 
 
 def last_of_stamps(happenings: Happenings) -> Booleans:
@@ -129,7 +168,10 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), np.zeros(count, bool))
+    lacking = np.zeros(count, bool)
+    if control.interpolated:  # one that is not finite is as if it had not come
+        lacking |= ~np.isfinite(read).all(axis=1)
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), lacking)
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settings: Floats) -> Table:
@@ -167,6 +209,9 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
         rows = places.rows(run, target)
         source[rows < 0] = NOTHING
         parts.insert(1, places.at(rows))
+    if sensor.control is not None:  # see `with_control`
+        unknown = np.full((len(stream), len(sensor.control.components)), np.nan)
+        parts.insert(2 if sensor.about else 1, unknown)
     source[lacking] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
@@ -237,10 +282,13 @@ def of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
     return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
 
 
-def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Happenings]:
+def interpolated(
+    happenings: Happenings, controls: int, gap_ns: float = np.inf
+) -> tuple[Happenings, Happenings]:
     """Events with the control at their stamps, linear between messages; and those still to wait.
 
-    What comes after a run's last control message waits for the next, with that message before it.
+    What comes after a run's last control message waits for the next, with that message before it. From
+    one message that comes more than a gap before the next, up to that, the control is NaN.
     """
     data, is_control = happenings.data.copy(), happenings.source == CONTROL
     ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
@@ -255,13 +303,26 @@ def interpolated(happenings: Happenings, controls: int) -> tuple[Happenings, Hap
         )
         for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
+        for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
+            data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
         ready[inside], waiting[begin : at[-1]] = True, False
     again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
     return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
 
 
-def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
-    """Events that wait for a control message that does not come: the last one holds.
+def with_control(stage: Stage, happenings: Happenings) -> Happenings:
+    """Events whose control is known, with its numbers where sensors read them."""
+    data = happenings.data.copy()
+    for number, sensor in enumerate(stage.sensors):
+        if sensor.control is not None:
+            rows, controls = happenings.source == number, len(sensor.control.components)
+            end = len(sensor.measured) + sensor.about_size
+            data[rows, end - controls : end] = data[rows, -controls:]
+    return happenings._replace(data=data)
+
+
+def held(happenings: Happenings, initial: Sequence[float], gap_ns: float = np.inf) -> Happenings:
+    """Events that wait for a control message that does not come: the last one holds, for up to a gap.
 
     `initial` holds in a run in which there was none.
     """
@@ -271,6 +332,8 @@ def held(happenings: Happenings, initial: Sequence[float]) -> Happenings:
             is_control = happenings.source[begin] == CONTROL
             control = data[begin, -len(initial) :].copy() if is_control else initial
             data[begin:end, -len(initial) :] = control
+            late = happenings.time_ns[begin:end] - happenings.time_ns[begin] > gap_ns
+            data[begin:end][late & is_control, -len(initial) :] = np.nan
     return happenings._replace(data=data)
 
 

@@ -18,21 +18,14 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Ragged, copied, ragged_rows
 from replay.inference import smoothers
+from replay.inference.affine import LOSSES, Trajectory, no_factors
 from replay.inference.estimators import State
-from replay.inference.gauss_newton import LOSSES, Ended, Plan, Trajectory, no_factors, searching
+from replay.inference.gauss_newton import Ended, Plan, searching
 from replay.inference.happenings import data_columns, joined, last_of_stamps, of_rows, times_alone
 from replay.inference.methods import FILTERS, Method
 from replay.inference.recursion import NOTHING, Estimates, Happenings, no_results
-from replay.inference.smoothers import (
-    FOREVER_NS,
-    Nodes,
-    Piece,
-    Smoother,
-    SmootherParameters,
-    back_memory,
-    no_later,
-    smoothing_steps,
-)
+from replay.inference.smoothers import Piece, Smoother, SmootherParameters
+from replay.inference.smoothing import FOREVER_NS, Nodes, back_memory, no_later, smoothing_steps
 from replay.inference.steps import Gaussian, Stage, Steps
 
 

@@ -294,7 +294,7 @@ def _lacks_slopes(model: Model) -> str:
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if sensor.noises and sensor.jacobian is None:
-            m, about = len(sensor.measured), (0.7,) * (sensor.about.size if sensor.about else 0)
+            m, about = len(sensor.measured), (0.7,) * sensor.about_size
             rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
             work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
             try:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, PositiveFloat
@@ -34,6 +34,9 @@ class ModelParameters(Parameters):
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
     """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+    gate_reopens_s: PositiveFloat | None = None
+    """The gate is open where a sensor's last measurement that was let in is older, so that a filter that
+    has lost its way, as in an outage, does not keep out all that would bring it back."""
     sigma_fix_m: PositiveFloat | None = None
     """Of each component of a position fix that does not state its covariance."""
 
@@ -77,6 +80,9 @@ class Control:
         interpolated: the control is linear between two messages, and the motion over a step gets the
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
+        gap: the parameter that says how long, in s, an interpolated control may be silent: what is
+            estimated ends there.
+        delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
         instead: other topics that the components of these names are taken from where the log has them,
             such as a gyro's turn rate in place of the wheels'.
@@ -88,6 +94,8 @@ class Control:
     read: Callable[[Stream], Floats] | None = None
     interpolated: bool = False
     initial: tuple[float, ...] = ()
+    gap: str = ""
+    delay: str = ""
     estimates: bool = False
     instead: tuple["Control", ...] = ()
 
@@ -152,8 +160,11 @@ class Sensor:
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
         about: what the message is about.
+        control: the model's, which has to be interpolated, where what is measured depends on it:
+            `about` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
+        delay: the parameter that says how long before its stamp, in s, a message was measured.
         linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
             moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
             measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
@@ -170,11 +181,19 @@ class Sensor:
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
     about: Map | None = None
+    control: Control | None = None
     read: Callable[[Stream], Floats] | None = None
+    delay: str = ""
     linear: bool = False
     jacobian: Function | None = None
     moments: Function | None = None
     log_likelihood: Function | None = None
+
+    @property
+    def about_size(self) -> int:
+        """How many numbers `measure` gets as `about`: those of the point, then those of the control."""
+        controls = len(self.control.components) if self.control else 0
+        return (self.about.size if self.about else 0) + controls
 
 
 @lru_cache(maxsize=64)
@@ -199,9 +218,9 @@ class Start:
     """What is assumed of a log that has no prior: it was not made for the model.
 
     It begins at the first message that measures components of the state by their names, a fix or a pose
-    with its covariance. What that does not measure is zero, and as uncertain as is said here. Where
-    nothing measures the state, so is everything; with no sensor at all, the thing begins at zero, which
-    is where its frame is.
+    with its covariance. What that does not measure is zero, and as uncertain as is said here. With no
+    sensor at all the thing begins at zero, which is where its frame is. Sensors that do not measure the
+    state itself need a prior.
 
     Attributes:
         sigmas: standard deviations of the state's components, linear ones and angles.
@@ -211,11 +230,24 @@ class Start:
             zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
             The state is that at the last of them, and begins just after it: they are used up. For a
             state of which a position tells too little.
+        find: (first messages of a run by the model's names for their topics, parameters) -> `Started`,
+            in place of all that; for a state that is found from several sensors together. Raises
+            BadInput where they do not tell it. Such a model needs a sensor.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
     align: Callable[..., tuple[Floats, Floats] | None] | None = None
+    find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
+
+
+class Started(NamedTuple):
+    """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found, in words."""
+
+    time_ns: int
+    mean: Floats
+    covariance: Floats
+    how: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,7 +425,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
-    state, about = trial_state(model.kinds), (1.0,) * (sensor.about.size if sensor.about else 0)
+    state, about = trial_state(model.kinds), (1.0,) * sensor.about_size
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):

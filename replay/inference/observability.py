@@ -23,10 +23,10 @@ from replay.engine.blocks import Ragged, copied
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
 from replay.engine.tangent import tangent_components
+from replay.inference.affine import carrying
 from replay.inference.binding import number_fields, reading_settings
 from replay.inference.estimators import State, modelled_by, of_any_model
-from replay.inference.gauss_newton import carrying
-from replay.inference.gaussian import kalman_step, keep_measured, whiten
+from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
 from replay.inference.generate import differencing, is_flat, tuple_of
 from replay.inference.iterated import ITERATED, IteratedSmoother, Way
 from replay.inference.methods import Method, MethodParameters
@@ -107,21 +107,13 @@ def _carried_by_motion(stage: Stage) -> Function:
         use: int,
         work: Workspace,
     ) -> bool:
-        along, transition, product = work.samples[0], belief.transition[run], work.product
+        along, transition = work.samples[0], belief.transition[run]
         node = along.node[use]
         linearise(read_state(along.mean[node - 1]), read_control(control), duration_s, parameters, work)
         if not flat:
             subtract(along.mean[node], work.state, along.offset, 0)
             carry(along.offset[0], work.transition, work.step)
-        for row in range(len(product)):
-            for column in range(len(product)):
-                entry = 0.0
-                for k in range(len(product)):
-                    entry += work.transition[row, k] * transition[k, column]
-                product[row, column] = entry
-        for row in range(len(product)):
-            for column in range(len(product)):
-                transition[row, column] = product[row, column]
+        multiply_into(work.transition, transition, work.product)
         return True
 
     return predict

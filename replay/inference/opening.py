@@ -13,16 +13,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Clock, Topic, make_stream, schemas
+from recorders.log import Clock, Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.blocks import Block, Ragged, merge_events, ragged_rows
+from replay.engine.blocks import Block, Ragged, merge_events
 from replay.engine.estimator import Opened, Opening
 from replay.engine.failures import reason_stream
-from replay.engine.geodetic import origins_of
+from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
-from replay.inference.binding import Found, complaint_of, number_fields, reading_settings
-from replay.inference.happenings import World, happenings_of, sensor_table
+from replay.inference.binding import (
+    Found,
+    complaint_of,
+    measures_state,
+    number_fields,
+    reading_settings,
+)
+from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
 from replay.inference.model import Sensor, Start
 from replay.inference.recursion import CONTROL, Happenings
 from replay.inference.steps import Stage
@@ -60,12 +66,11 @@ class Beginning:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """The sensors that measure components of the state by their names, with their numbers."""
-        state = self.stage.model.state
+        """The sensors that measure the state itself, with their numbers; none of a thing without."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
-            if sensor.covariance and sensor.measured.items() <= state.items()
+            if measures_state(self.stage.model, sensor)
         ]
 
     @property
@@ -73,16 +78,23 @@ class Beginning:
         """The topics whose first message is where to begin."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.instead)]
-        if self._measuring:
-            return [*(drives if self._aligns else []), *(topic for _, _, topic in self._measuring)]
-        return [*drives, *(topic for _, topic in self.found.sensors)]
+        if self._finds:
+            return [*drives, *(topic for _, topic in self.found.sensors)]
+        needs_drives = self._aligns or not self._measuring
+        return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
+
+    @property
+    def _finds(self) -> bool:
+        """Whether the model finds the state from several sensors together."""
+        start = self.stage.model.start
+        return start is not None and start.find is not None
 
     @property
     def _aligns(self) -> bool:
         """Whether fixes alone have to tell the whole state, and can."""
         model = self.stage.model
-        is_whole = any(len(sensor.measured) == model.size for _, sensor, _ in self._measuring)
-        return bool(model.start and model.start.align and self._measuring) and not is_whole
+        sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
+        return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
     def find(self, first: Mapping[str, Ragged], clock: Clock) -> Opened:
         """What is found in the first messages; raises BadInput where none of them can be used."""
@@ -92,11 +104,11 @@ class Beginning:
         origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
-            origins = origins_of(fixes)
-            whole[topic.name] = _first_rows(fixes)
+            time_ns, has_one, rows = _first_of(fixes, clock, None)
+            whole[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            origins = origins_of(whole[topic.name])
             told.append(self._told_origin(whole[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
-            time_ns, has_one, _ = _first_of(fixes, clock, None)
             facts.append(_Fact(what, time_ns, has_one))
         if not self.found.has_prior:
             prior, found = self._prior(first, clock, origins)
@@ -109,14 +121,15 @@ class Beginning:
     ) -> tuple[Ragged, list["_Fact"]]:
         """The priors of all runs, and what is to be told of them."""
         model, runs = self.stage.model, _runs(first)
-        mean, sigma = _anywhere(model.state, model.start)
+        mean, sigma = _unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
-        facts = (
-            self._at_first(first, clock, origins, begun)
-            if self._measuring
-            else self._anywhere(first, clock, begun)
-        )
+        if self._finds:
+            facts = self._found(first, origins, begun)
+        elif self._measuring:
+            facts = self._at_first(first, clock, origins, begun)
+        else:
+            facts = self._at_zero(first, clock, begun)
         if self._aligns:
             aligned = self._aligned(first, clock, origins, begun)
             others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
@@ -137,22 +150,52 @@ class Beginning:
             begun.covariance[has_begun],
             named(model.state),
         )
-        return Ragged(stream, np.append(0, np.cumsum(has_begun))), facts
+        return _of_runs(stream, has_begun), facts
 
     @property
     def _without(self) -> str:
         return f"the log has no prior ({self.found.prior.name}): it begins"
 
-    def _anywhere(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
-        """Begin all runs at their first message, for nothing measures the state itself."""
+    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+        """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
         for topic in self._starting:
             found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
-        where = "anywhere"
-        if not self.found.sensors:
-            begun.covariance[:] *= CERTAIN**2
-            where = "at zero, where its frame is"
+        begun.covariance[:] *= CERTAIN**2
+        where = "at zero, where its frame is"
         return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+
+    def _found(
+        self, first: Mapping[str, Ragged], origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs where the model finds them; raises BadInput where it finds none."""
+        model, control = self.stage.model, self.found.control
+        assert model.start is not None
+        assert model.start.find is not None
+        given = {}
+        if model.control is not None and control is not None:
+            given[model.control.topic] = first[control.name]
+        for sensor, topic in self.found.sensors:
+            ragged = first[topic.name]
+            if origins is not None and topic in self.found.geodetic:
+                ragged = in_plane(ragged, origins)
+            given[sensor.topic] = ragged
+        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
+        how = [""] * len(begun.time_ns)
+        for run in range(len(how)):
+            try:
+                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+                started = model.start.find(streams, parameters)
+            except BadInput as error:
+                if run == len(how) - 1 and not any(how):
+                    raise BadInput(f"estimator {self.name}: {error}") from error
+                continue
+            begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
+            begun.covariance[run], how[run] = started.covariance, started.how
+        return [
+            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            for words in dict.fromkeys(filter(None, how))
+        ]
 
     def _at_first(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
@@ -179,7 +222,7 @@ class Beginning:
     def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
         """The mean and the much wider sigmas of a state that one message tells of."""
         model, sensor = self.stage.model, self.stage.sensors[number]
-        mean, sigma = _anywhere(model.state, model.start)
+        mean, sigma = _unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
@@ -225,6 +268,7 @@ class Beginning:
         places: list[Floats] = []
         spreads: list[Floats] = []
         begin, end = happenings.offsets[run : run + 2]
+        _, first = data_columns(stage)
         before_ns = first_ns = 0
         for event in range(begin, end):
             time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
@@ -233,7 +277,7 @@ class Beginning:
                 state = model.motion.move(state, tuple(control), duration_s, parameters)
             before_ns, data = time_ns, happenings.data[event]
             if source == CONTROL:
-                own = data[: len(control)]
+                own = data[first : first + len(control)]
                 control = np.where(np.isnan(own), control, own)
             elif source >= 0:
                 size = len(stage.sensors[source].measured)
@@ -308,8 +352,8 @@ def _runs(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
-def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,) of a state of which nothing is known."""
+def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
     assert start is not None
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
@@ -317,7 +361,7 @@ def _anywhere(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Fl
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([start.sigmas[name] for name in names])
+    return mean, np.array([start.sigmas.get(name, np.nan) for name in names])
 
 
 def _first_of(
@@ -334,8 +378,6 @@ def _first_of(
     return time_ns, has_one, rows
 
 
-def _first_rows(ragged: Ragged) -> Ragged:
-    """The first message of every run that has one."""
-    is_first = np.zeros(len(ragged), bool)
-    is_first[ragged.offsets[:-1][np.diff(ragged.offsets) > 0]] = True
-    return Ragged(ragged.stream.take(is_first), ragged_rows(is_first, ragged.offsets))
+def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
+    """A stream of one message for each of some runs."""
+    return Ragged(stream, np.append(0, np.cumsum(has_one)))

@@ -788,7 +788,7 @@ def _lacks_likelihood(model: Model) -> str:
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
             continue
-        about = (0.7,) * (sensor.about.size if sensor.about else 0)
+        about = (0.7,) * sensor.about_size
         steps = np.linspace(0.3, 0.7, sensor.noises)
         with np.errstate(all="ignore"):
             try:

@@ -18,6 +18,7 @@ from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
 from replay.inference.model import Model
 from replay.inference.steps import (
+    NOT_DRIVEN,
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -65,12 +66,14 @@ class Carried(NamedTuple):
         belief: the method's own.
         control: (runs, controls), what drives the state.
         time_ns: (runs,), of the belief.
+        accepted_ns: (runs, sensors), of the last measurement that the gate let in, or of the start.
         failure: (runs,), ALL_WELL or an index of `steps.FAILURES`.
     """
 
     belief: Any
     control: Floats
     time_ns: Integers
+    accepted_ns: Integers
     failure: Integers
 
 
@@ -137,6 +140,7 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
+    has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: Carried) -> None:
@@ -178,6 +182,8 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         source, data = happenings.source[event], happenings.data[event]
         duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
+            if has_gaps and np.isnan(data[len(data) - 1]):
+                return NOT_DRIVEN
             carried.time_ns[run] = happenings.time_ns[event]
             if not advance(run, event, duration_s, happenings, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE
@@ -189,12 +195,14 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
             parameters = settings_of(settings, source + 1)
-            told = update(
-                source, run, carried.belief, data, parameters, gates[source], event, memory, note
-            )
+            waited_s = (happenings.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
+            gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
+            told = update(source, run, carried.belief, data, parameters, gate, event, memory, note)
             if told >= 0:
                 return told
             if told == ALL_WELL:
+                if note.numbers[2] > 0.0:
+                    carried.accepted_ns[run, source] = happenings.time_ns[event]
                 innovations.time_ns[row] = happenings.time_ns[event]
                 innovations.target_id[row] = happenings.target_id[event]
                 innovations.end[run] = row + 1

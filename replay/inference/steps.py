@@ -43,8 +43,10 @@ FAILURES = (
     "the estimate is no longer finite",
     "no particle explains what was measured",
     "the truth is not known here",
+    "what drives the motion is silent for too long",
 )
-NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH = 0, 1, 2, 3  # indices of FAILURES
+# indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
 
 
@@ -329,7 +331,7 @@ class Reading(NamedTuple):
 
 def reading(sensor: Sensor) -> Reading:
     """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
-    m, about = len(sensor.measured), sensor.about.size if sensor.about else 0
+    m, about = len(sensor.measured), sensor.about_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
 
@@ -424,8 +426,8 @@ def linear_innovation(sensor: Sensor, number: int) -> Function:
     return compare
 
 
-def weighing(sensor: Sensor, number: int) -> Function:
-    """`weigh(data, parameters, work)`: a linearised measurement's residual in units of its noise.
+def whitening(sensor: Sensor, number: int) -> Function:
+    """`whiten_residual(data, parameters, work)`: a linearised measurement in units of its noise.
 
     From the workspace's `predicted` and `rows`, with R = L L': the innovation's difference becomes
     L^-1 (y - h), its cross-covariance H' L^-T. Returns how many components were measured, and the square
@@ -434,7 +436,7 @@ def weighing(sensor: Sensor, number: int) -> Function:
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
 
-    def weigh(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
+    def whiten_residual(data: Floats, parameters: Any, work: Workspace) -> tuple[int, float]:
         innovation = work.innovations[number]
         difference, noise, turned = innovation
         for i in range(m):
@@ -449,7 +451,7 @@ def weighing(sensor: Sensor, number: int) -> Function:
         kalman_step(innovation, size, work.step)
         return size, squared
 
-    return weigh
+    return whiten_residual
 
 
 def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:

@@ -263,11 +263,11 @@ def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
     """
     first = np.flatnonzero(np.diff(of_span, prepend=-1))
     sizes = np.diff(first, append=len(of_span))
-    found = []
+    is_extreme = np.zeros(len(values), bool)
     for extreme in (np.fmin, np.fmax):
         rows = np.flatnonzero(values == np.repeat(extreme.reduceat(values, first), sizes))
-        found.append(rows[np.diff(of_span[rows], prepend=-1) > 0])
-    return np.unique(np.concatenate(found))
+        is_extreme[rows[np.diff(of_span[rows], prepend=-1) > 0]] = True
+    return np.flatnonzero(is_extreme)
 
 
 def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,10 +39,17 @@ def above_events(
     return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
 
 
-def draw_events(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TextLogView]:
-    """The events of a case, one entity per estimator and sensor: no view where nothing happened."""
+def draw_events(
+    canvas: Canvas, scene: Scene, case: str, not_drawn: Mapping[str, str] | None = None
+) -> list[rrb.TextLogView]:
+    """The events of a case, one entity per estimator and sensor: no view where nothing happened.
+
+    `not_drawn` says of topics that have no drawing why, beside those that cannot be read.
+    """
     root = entity_path("events", case)
-    unread = Happened("log", "INFO", np.full(len(scene.unread), canvas.epoch_ns), _not_drawn(scene))
+    reasons = {**scene.unread, **(not_drawn or {})}
+    texts = [f"{topic} is not drawn: {reason}" for topic, reason in reasons.items()]
+    unread = Happened("log", "INFO", np.full(len(texts), canvas.epoch_ns), texts)
     happened = [unread, *_of_estimators(scene, case), *_of_sensors(scene, case)]
     happened = [each for each in happened if each.texts]
     for who, level, time_ns, texts in happened:
@@ -50,10 +57,6 @@ def draw_events(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TextLogView
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
     return [events_view(root)] if happened else []
-
-
-def _not_drawn(scene: Scene) -> list[str]:
-    return [f"{topic} is not drawn: {reason}" for topic, reason in scene.unread.items()]
 
 
 def events_view(root: str) -> rrb.TextLogView:

@@ -98,8 +98,19 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     modes = draw_modes(canvas, scene, case)
     if modes:
         boards.append(rrb.Vertical(*modes, name="modes"))
-    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, case), 4.0)
+    events = draw_events(canvas, scene, case, _not_drawn(sensed))
+    board = above_events(rrb.Tabs(*boards), events, 4.0)
     return beside(board, draw_quality(canvas, scene, case), case)
+
+
+def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
+    """What has no drawing, by topic, and why."""
+    shown_elsewhere = NOT_SENSED - {schemas.LINK_EVENT.full_name}
+    return {
+        stream.topic: "none of its fields is a quantity over time"
+        for stream in sensed
+        if stream.schema.full_name not in shown_elsewhere and not list(curves_of(stream))
+    }
 
 
 def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:

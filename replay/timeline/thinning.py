@@ -91,7 +91,9 @@ class Thinned(Generic[Rows]):
         self._thin()
         while self._count > most and self._shift < LAST_SHIFT:
             self._shift += 1
-            self._thin()
+            cells = self._time_ns(self._parts[0]) >> self._shift
+            if np.count_nonzero(np.diff(cells)) < most:  # of each cell a row is left at least
+                self._thin()
 
     def _thin(self) -> None:
         """Join the parts, some of which may share a cell."""
@@ -107,7 +109,10 @@ class Thinned(Generic[Rows]):
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
         if self._shift < LAST_SHIFT:
             kept += [extremes(cell, values) for values in self._curves(rows)]
-        return np.isin(time_ns, time_ns[np.concatenate(kept)])
+        stamp = np.cumsum(np.diff(time_ns, prepend=time_ns[:1]) > 0)
+        stays = np.zeros(len(time_ns), bool)
+        stays[stamp[np.concatenate(kept)]] = True
+        return stays[stamp]
 
     def _is_first(self, rows: Rows) -> NDArray[np.bool_]:
         """Which rows have the first stamp: others of it may have come in the block before."""

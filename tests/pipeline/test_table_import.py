@@ -25,6 +25,7 @@ def drive(tmp_path: Path) -> Path:
     fixes = [f"{1756402241 + time};50.{time:02d};8.1;{100 + time};{time}" for time in times]
     (folder / "gnss.csv").write_text("time;lat;lon;alt;speed [km/h]\n" + "\n".join(fixes))
     (folder / "photo.jpg").write_bytes(bytes(range(256)))
+    (folder / "readme.md").write_text("# Drive\n\n| file | rate |\n| - | - |\n| imu.csv | 100 |\n")
     return folder
 
 
@@ -43,6 +44,7 @@ def test_a_guessed_mapping_works_as_it_is(
     assert 'units.turn_rate_radps = "deg/s"   # the largest is 2' in text
     assert "# not taken:" in text
     assert "photo.jpg" in text
+    assert "readme.md: has no times" in text
     again = fuselog("import", "table", str(drive), "--guess", "-o", str(mapping))
     assert (again.code, "give another name, or remove it yourself" in again.err) == (2, True)
     assert fuselog("import", "table", str(drive), "--mapping", str(mapping), "-o", str(out)).code == 0

@@ -426,6 +426,24 @@ def test_trajectories(imported: Callable[..., Any], trajectories: Path) -> None:
     assert set(np.diff(streams["/truth"].publish_time_ns[:100]).tolist()) == {100_000_000}
 
 
+def test_a_euroc_folder(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """Inertial samples, gyro first, and the truth with its velocity, by their places in the folder."""
+    for name, text in {
+        "imu0": "#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z\n"
+        "1403636579758555392,.1,.2,.3,9,8,7\n",
+        "state_groundtruth_estimate0": "#timestamp,x,y,z,w,x,y,z,vx,vy,vz,b,b,b,c,c,c\n"
+        "1403636580838555648,1,2,3,0,1,0,0,4,5,6,0,0,0,0,0,0\n",
+    }.items():
+        (tmp_path / "seq" / "mav0" / name).mkdir(parents=True)
+        (tmp_path / "seq" / "mav0" / name / "data.csv").write_text(text)
+    streams, _ = imported(tmp_path / "seq", "euroc")
+    inertial, truth = streams["/imu0/inertial"], streams["/truth"]
+    assert inertial.publish_time_ns.tolist() == [1403636579_758555392]
+    assert inertial["specific_force_mps2"].tolist() == [[9, 8, 7]]
+    assert inertial["turn_rate_radps"].tolist() == [[0.1, 0.2, 0.3]]
+    assert truth["state"].tolist() == [[1, 2, 3, 4, 5, 6, 0, 1, 0, 0]]
+
+
 def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any], tmp_path: Path) -> None:
     """What repeats or goes back is kept, told, and in order where a log is read; a cut row is told."""
     mapping = FIX.replace('time = { column = "t" }', 'time = { column = "t", zero = "2026-01-01" }')
@@ -501,9 +519,18 @@ BAD = [
     ("", FIX, "", "", "table.csv: holds no rows"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
 [[tables.streams]]
+topic = "/truth"
+becomes = "TruthState"
+fields = { state = ["w", "x", "y", "z"] }
+components = "a_w,a_x,a_y,a_z"
+kinds = "quaternion,quaternion,quaternion,quaternion"
+""", "table.csv: /truth: the quaternions of state: the vector at (0,) has length 1.41421356"),
+    ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
+[[tables.streams]]
 topic = "/o"
 becomes = "Orientation"
 fields = { quaternion = ["w", "x", "y", "z"] }
+mounting_deg = [180, 0, 0]
 """, "table.csv: /o: its quaternions: the vector at (0,) has length 1.41421356"),
 ]  # fmt: skip
 

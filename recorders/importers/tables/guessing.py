@@ -23,9 +23,15 @@ from recorders.importers.units import unit
 
 # How many rows are looked at.
 _ROWS = 100_000
+# A file without times that has fewer is a summary or a text.
+_FEWEST = 10
 # Units of stamps by the least that today's date is in them.
 _EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8))
 _UNKNOWN_ZERO = "2026-01-01"
+# What vectors are called.
+_ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
+_GYROSCOPES = ("gyr", "gyro", "gyroscope", "angular_velocity", "rate", "omega", "w", "g")
+_QUATERNIONS = ("quaternion", "quat", "orientation", "rotation", "q")
 
 
 class _Column(NamedTuple):
@@ -54,13 +60,14 @@ def guess(paths: Sequence[Path]) -> str:
             try:
                 tables.append(_table(file, name.as_posix(), is_alone=len(files) == 1))
             except BadInput as error:
-                notes.append(f"# not taken: {error}")
+                notes.append(str(error))
     if not tables:
-        raise BadInput(
-            f"{paths[0]}: holds no table; {notes[0][len('# not taken: ') :] if notes else 'it is empty'}"
-        )
-    summary = f"summary = {json.dumps(f'guessed from {paths[0].name}')}"
-    head = ["# What fuselog guessed; mend what is wrong: docs/own-log.md says how.", summary, *notes]
+        raise BadInput(notes[0] if len(notes) == 1 else f"{paths[0]}: holds no table among its files")
+    head = [
+        "# What fuselog guessed; mend what is wrong: docs/own-log.md says how.",
+        f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
+        *(f"# not taken: {note}" for note in notes),
+    ]
     return "\n".join(head) + "\n\n" + "\n".join(tables)
 
 
@@ -79,6 +86,8 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         else:
             columns.append(_Column(column, *_parted(column), values))
     time, used, told = _time(batch, columns, texts)
+    if not columns or (not used and len(columns[0].values) < _FEWEST):
+        raise BadInput(f"{path}: has no times, and no columns of numbers to speak of")
     lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):
         blanks = ", ".join(f'"{column}"' for column in table.columns)
@@ -125,12 +134,10 @@ def _time(
 ) -> tuple[str, set[str], list[str]]:
     """The time as TOML, the columns that it is of, and what was seen."""
     for name in texts:
-        if re.search("time|date|stamp|utc|gpst", name, re.IGNORECASE):
-            names = ["date", "time"] if name == "date" and "time" in texts else [name]
-            found = _seen(TimeMapping(column=names, unit="date"), batch)
-            if found:
-                zone = "# If its clock is not UTC: utc_offset_h = 8 is one 8 hours ahead."
-                return f'{{ column = {json.dumps(names)}, unit = "date" }}', set(names), [*found, zone]
+        names = ["date", "time"] if name == "date" and "time" in texts else [name]
+        if found := _seen(TimeMapping(column=names, unit="date"), batch):
+            zone = "# If its clock is not UTC: utc_offset_h = 8 is one 8 hours ahead."
+            return f'{{ column = {json.dumps(names)}, unit = "date" }}', set(names), [*found, zone]
     named = [column for column in columns if re.search("time|stamp|utc|^t$|^sec", column.plain)]
     first = [columns[0]] if columns else []
     for column in (*named, *first):
@@ -203,22 +210,16 @@ def _axes(columns: list[_Column], *stems: str) -> list[_Column]:
     return []
 
 
-def _norm(columns: Sequence[_Column]) -> float:
-    """The median length of a vector."""
-    return float(np.nanmedian(np.linalg.norm([column.values for column in columns], axis=0)))
-
-
-def _by_size(
-    columns: Sequence[_Column], sizes: Mapping[str, tuple[float, float]], usual: str
-) -> tuple[str, str]:
-    """The unit in which a vector's length is as it must be, and what was seen."""
-    if columns[0].unit:
+def _by_size(columns: Sequence[_Column], sizes: Mapping[str, tuple[float, float]]) -> tuple[str, str]:
+    """The unit in which a vector's length is as it must be, else the first; and what was seen."""
+    usual = next(iter(sizes))
+    if columns[0].unit and unit(columns[0].unit).powers == unit(usual).powers:
         return columns[0].unit, "as its name says"
-    norm = _norm(columns)
+    length = float(np.nanmedian(np.linalg.norm([column.values for column in columns], axis=0)))
     for name, (low, high) in sizes.items():
-        if low <= norm <= high:
-            return name, f"its median length is {norm:.4g}"
-    return usual, f"a guess: its median length is {norm:.4g}"
+        if low <= length <= high:
+            return name, f"its median length is {length:.4g}"
+    return usual, f"a guess: its median length is {length:.4g}"
 
 
 def _stream(topic: str, becomes: str, *lines: str) -> list[str]:
@@ -231,26 +232,15 @@ def _names(columns: Sequence[_Column]) -> str:
 
 def _inertial(columns: list[_Column], prefix: str) -> Iterator[str]:
     whole = list(columns)
-    force = _axes(columns, "acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
-    rate = _axes(
-        columns,
-        "gyr",
-        "gyro",
-        "gyroscope",
-        "angular_velocity",
-        "angular_rate",
-        "turn_rate",
-        "rate",
-        "omega",
-        "w",
-        "g",
-    )
+    force = _axes(columns, *_ACCELEROMETERS)
+    rate = _axes(columns, *_GYROSCOPES)
     if not (force and rate):
         columns[:] = whole
         return
-    force_unit, why = _by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)}, "m/s^2")
+    force_unit, why = _by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)})
     largest = float(np.nanmax(np.abs([column.values for column in rate])))
-    rate_unit = rate[0].unit or ("deg/s" if largest > 10 else "rad/s")
+    stated = rate[0].unit if rate[0].unit and unit(rate[0].unit).powers == unit("rad/s").powers else ""
+    rate_unit = stated or ("deg/s" if largest > 10 else "rad/s")
     yield from _stream(
         f"{prefix}/inertial",
         "InertialSample",
@@ -266,14 +256,8 @@ def _inertial(columns: list[_Column], prefix: str) -> Iterator[str]:
 def _magnetic(columns: list[_Column], prefix: str) -> Iterator[str]:
     field = _axes(columns, "mag", "magnetometer", "magnetic_field", "m")
     if field:
-        sizes = {
-            "uT": (15, 90),
-            "G": (0.15, 0.9),
-            "mG": (150, 900),
-            "nT": (15e3, 90e3),
-            "T": (15e-6, 90e-6),
-        }
-        given, why = _by_size(field, sizes, "uT")
+        sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
+        given, why = _by_size(field, sizes)
         yield from _stream(
             f"{prefix}/magnetic_field",
             "MagneticField",
@@ -311,21 +295,13 @@ def _fix(columns: list[_Column], prefix: str) -> Iterator[str]:
 
 
 def _pose(columns: list[_Column], prefix: str) -> Iterator[str]:
-    place = _axes(columns, "pos", "position", "p", "translation", "") or _take(
+    place = _axes(columns, "pos", "position", "p", "translation", "t", "") or _take(
         columns, "east", "north", "up"
     )
     factors = "" if place else "factors.position_m = [1, 1, -1]"
     place = place or _take(columns, "east", "north", "down")
-    turn = next(
-        filter(
-            None,
-            (
-                _take(columns, *(rf"(.*_)?{stem}_?{part}" for part in "wxyz"))
-                for stem in ("quaternion", "quat", "orientation", "rotation", "q")
-            ),
-        ),
-        [],
-    )
+    turns = (_take(columns, *(rf"(.*_)?{stem}_?{part}" for part in "wxyz")) for stem in _QUATERNIONS)
+    turn = next(filter(None, turns), [])
     if not place:
         columns += turn
         return

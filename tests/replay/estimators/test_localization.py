@@ -509,9 +509,8 @@ def test_what_no_run_can_use_is_bad_input():
         replayed("ekf", [replace(source, streams={**source.streams, "/landmarks": line})])
     for topic in ("/landmarks", "/robot1/range_bearing", "/robot1/prior", "/robot1/odometry"):
         said = f"run 0 of landmarks: .* ekf does not fit this log: model robot .* lacks .*{topic}"
-        if topic != "/robot1/prior":  # without it the robot begins anywhere
-            with pytest.raises(BadInput, match=rf"{said} .*; the log has /"):
-                replayed("ekf", [without(source, topic)])
+        with pytest.raises(BadInput, match=rf"{said} .*; the log has /"):
+            replayed("ekf", [without(source, topic)])
         foreign = replace(source.streams[topic], schema=schemas.SCAN)
         with pytest.raises(BadInput, match=f"{said} .*which is fuselog.Scan here"):
             replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])

@@ -1,12 +1,13 @@
 """A robot with odometry and what else a bag may have: poses, fixes, headings, a gyro; no prior."""
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
+from pipeline.starting import start_from
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.log.run import RunMetadata
@@ -15,7 +16,6 @@ from recorders.recording import Recording
 from replay.engine.failures import sentences_of
 from replay.engine.sources import MemorySource, memory_source
 from replay.estimators.landmarks import RECKONING, ROBOT
-from replay.inference import estimators
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]
@@ -25,13 +25,7 @@ SLOW = STAMPS[7::10]
 SIGMA = np.array([0.3, 0.2, 0.05])
 
 
-@pytest.fixture(autouse=True)
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Loops in plain Python, of which none is left to the next test."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    estimators._compiled.cache_clear()
-    yield
-    estimators._compiled.cache_clear()
+pytestmark = pytest.mark.usefixtures("uncompiled")
 
 
 def poses() -> Floats:
@@ -111,6 +105,16 @@ def test_a_robot_begins_at_its_first_pose() -> None:
     assert_array_equal(found["innovation"]["accepted"], 1)
 
 
+def test_a_span_begins_at_its_own_first_pose() -> None:
+    source = log(odometry(), seen())
+    later = replace(source, start_ns=int(SLOW[2]) + 1)
+    estimates = outputs(ROBOT, "ekf", [later])["pose"].stream
+    assert estimates.publish_time_ns[0] == SLOW[3]
+    (filtering,) = bound(ROBOT, "ekf", [later])
+    with pytest.raises(BadInput, match=r"no prior in this log .*leave out --start-from"):
+        start_from(filtering, [later], [], "publish_time")
+
+
 def test_what_a_log_states_is_not_assumed() -> None:
     stated = odometry(forward_noise_density="0.01", turn_noise_density="0.01")
     found = outputs(ROBOT, "ekf", [log(stated, seen())])
@@ -133,8 +137,8 @@ def test_odometry_alone_begins_at_zero() -> None:
     assert bound(ROBOT, "ekf", [log(odometry(), sighting)]) == []
 
 
-def test_sightings_alone_begin_anywhere() -> None:
-    """That is said; a pose makes the beginning sure, and a prior is never overruled."""
+def test_sightings_need_a_prior_which_nothing_overrules() -> None:
+    """They do not say where to begin, unless there are poses as well."""
     landmark = make_stream(
         "/landmarks", schemas.LANDMARK, STAMPS[:1], landmark_id=[1], position_m=[[0.0, 0.0]]
     )
@@ -146,11 +150,8 @@ def test_sightings_alone_begin_anywhere() -> None:
         target_id=[1] * 6,
         range_m=[20.0] * 6,
     )
-    found = outputs(ROBOT, "ekf", [log(odometry(), landmark, sighting)])
-    assert sentences_of(found["started"].stream)[0].endswith("(/prior): it begins anywhere")
-    first = found["pose"]["covariance"][0]
-    assert first[[0, 4]] == pytest.approx(1e6)
-    assert found["pose"].stream.publish_time_ns[0] == STAMPS[0]
+    assert bound(ROBOT, "ekf", [log(odometry(), landmark, sighting)]) == []
+    assert len(bound(ROBOT, "ekf", [log(odometry(), landmark, sighting, seen())])) == 1
     prior = make_stream(
         "/prior",
         schemas.GAUSSIAN_ESTIMATE,
@@ -206,6 +207,8 @@ def test_headings_are_a_sensor() -> None:
         metadata={"covariance_rad2": "0.01,0,0,0,0.01,0,0,0,0.0004"},
         quaternion=np.column_stack([np.cos(half), np.zeros((n, 2)), np.sin(half)]),
     )
+    with_fixes = outputs(ROBOT, "ekf", [log(odometry(), fix(), heading)])
+    assert "at the first message of /heading" in sentences_of(with_fixes["started"].stream)[1]
     found = outputs(ROBOT, "ekf", [log(odometry(), seen(), heading)])["pose"]
     variance = found["covariance"][found.stream.publish_time_ns == SLOW[0], 8]
     assert_allclose(variance, 1 / (1 / 0.0025 + 1 / 0.0004), rtol=2e-3)

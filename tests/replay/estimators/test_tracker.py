@@ -1,6 +1,5 @@
 """The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from replay.engine.estimator import bind
 from replay.engine.late import parse_late
 from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
-from replay.inference import tracking
 from replay.inference.association import existence_after, marginals
 from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
 
@@ -26,15 +24,6 @@ SECOND = 1_000_000_000
 RADAR = {"sigma_m": "2.0", "detection_probability": "0.9", "clutter_per_m2": "1e-5"}
 CAMERA = {"sigma_rad": "0.02", "detection_probability": "0.6", "clutter_per_rad": "0.5"}
 Places = list[list[tuple[float, float]]]
-
-
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Loops in plain Python, of which none is left to the next test."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    tracking._compiled.cache_clear()
-    yield
-    tracking._compiled.cache_clear()
 
 
 def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]]) -> list[Stream]:
@@ -56,8 +45,8 @@ def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]
     return [scan, made(f"/{name}/detection", schemas.DETECTION, **own, position_m=place)]
 
 
-def log(*streams: list[Stream]) -> MemorySource:
-    run = RunMetadata("scene", {}, None, 0, SIMULATION_EPOCH_NS, {})
+def log(*streams: list[Stream], scenario: str = "scene") -> MemorySource:
+    run = RunMetadata(scenario, {}, None, 0, SIMULATION_EPOCH_NS, {})
     return memory_source(Recording([each for of in streams for each in of]), run)
 
 
@@ -198,6 +187,14 @@ def test_a_miss_in_a_blind_sector_says_nothing(uncompiled: None):
         sensor("radar", RADAR, range(8), seen[:8]), sensor("lidar", stated, [8.5, 9.5], seen[8:])
     )
     assert replay(turned)["existence"]["existence"][-1] > 0.9
+
+
+def test_clusters_that_are_too_large_are_told(uncompiled: None):
+    """Thirteen tracks and detections in each other's gates; twelve are still summed."""
+    for count, told in ((12, []), (13, [13])):
+        row = [(1.0 * each, 0.0) for each in range(count)]
+        found = replay(log(sensor("radar", {**RADAR, "sigma_m": "9"}, [0, 1], [row, row])))
+        assert found["approximation"]["tracks"].tolist() == told
 
 
 def test_a_lag_is_of_the_measurement(uncompiled: None):

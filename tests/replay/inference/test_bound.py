@@ -16,6 +16,7 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
+from replay.inference.bound import back_memory, smooth
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 from replay.judging.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a
@@ -313,3 +314,28 @@ def test_a_bound_without_truth_is_refused_in_one_sentence() -> None:
     found = outputs(CV, "bound", [memory_source(Recording(cut), short.run)])
     assert len(found["state"]) == 19
     assert "the truth is not known here" in str(found["failure"].stream.metadata)
+
+
+def test_the_way_back_is_the_smoothers_where_what_is_predicted_is_singular() -> None:
+    """Two runs of their own; the last state is known exactly, so that no inverse of P- is there."""
+    rng, steps = np.random.default_rng(6), 9
+    transition = np.eye(3) + 0.2 * rng.standard_normal((steps, 3, 3))
+    transition[:, 2] = [0.0, 0.0, 1.0]
+    root = rng.standard_normal((2, steps, 3, 3)) * np.array([1.0, 1.0, 0.0])[:, None]
+    covariance, noise = root @ root.swapaxes(-1, -2)
+    for node in range(1, steps):  # a measurement leaves half of what is predicted
+        predicted = transition[node] @ covariance[node - 1] @ transition[node].T + noise[node]
+        covariance[node] = 0.5 * predicted
+    offsets, found = np.array([0, 4, steps]), covariance.copy()
+    for run in range(2):
+        smooth(run, offsets, transition, noise, found, back_memory(3))
+    for begin, end in ((0, 4), (4, steps)):
+        wanted = covariance[end - 1]
+        assert_allclose(found[end - 1], wanted)
+        for node in range(end - 2, begin - 1, -1):
+            step, here = transition[node + 1], covariance[node]
+            predicted = step @ here @ step.T + noise[node + 1]
+            gain = here @ step.T @ np.linalg.pinv(predicted, 1e-10, hermitian=True)
+            wanted = here + gain @ (wanted - predicted) @ gain.T
+            assert_allclose(found[node], wanted, rtol=1e-9, atol=1e-12)
+            assert found[node].trace() < 0.99 * here.trace()

@@ -16,9 +16,9 @@ from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
+from replay.inference.affine import robust
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import modelled_by
-from replay.inference.gauss_newton import robust
 from replay.inference.model import Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE

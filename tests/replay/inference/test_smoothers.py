@@ -22,7 +22,7 @@ from replay.engine.tangent import rotation_vector
 from replay.inference import smoothers
 from replay.inference.generate import resetting
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.inference.smoothers import solve_semidefinite
+from replay.inference.smoothing import solve_semidefinite
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

@@ -464,6 +464,12 @@ def test_what_sensors_see_is_drawn_about_them_and_on_the_map(tmp_path: Path) -> 
     sights = np.array(found["/map/sights"]["LineStrips2D:strips"][0])
     assert sights.tolist() == [[[1, 1], [5, 0]], [[1, 1], [0, 5]]]
     assert "Events" not in views(tmp_path / "bare.rrd")  # nothing happened
+    scans = make_stream("/scan", schemas.SCAN, time_ns, scan_id=range(10), detections=[2] * 10)
+    found = drawn_bare([*streams, scans], tmp_path / "bare.rrd")
+    assert found["/events/log"]["TextLog:text"] == [
+        ["log: /scan is not drawn: none of its fields is a quantity over time"]
+    ]
+    assert "Events" in views(tmp_path / "bare.rrd")
 
 
 def test_poses_orientations_and_geodetic_fixes_have_their_places(tmp_path: Path) -> None:

@@ -1,0 +1,387 @@
+"""A vehicle, a person or a quadrotor that moves with an inertial unit and a GNSS receiver on it.
+
+Its path is a spline through way-points, of which velocity and acceleration are exact, so that the unit
+measures what belongs to the path and not to an integration. It begins at rest. The unit's errors are
+those of its grade; fixes have outages, float solutions, bursts of multipath, and delays.
+"""
+
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.inertial import earth_rate, gravity
+from recorders.models.states import NAVIGATION, state_metadata
+from recorders.parameters import Parameters
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
+
+Floats = NDArray[np.float64]
+WayPoint = tuple[float, float, float]
+Span = tuple[float, float]
+
+GRID_S = 0.05  # between the knots of the path
+
+
+class Unit(Parameters):
+    """The grade of an inertial unit; that of a small one, as telephones have, unless given.
+
+    Noise densities are per square root of hertz, those of the biases' random walks per square root of a
+    second; the first biases, errors of scale and misalignments of the axes are drawn with their standard
+    deviations. A quantum of zero rounds nothing.
+    """
+
+    rate_hz: PositiveFloat = 100.0
+    force_noise_density: NonNegativeFloat = 0.002
+    gyro_noise_density: NonNegativeFloat = 2e-4
+    force_bias_density: NonNegativeFloat = 2e-4
+    gyro_bias_density: NonNegativeFloat = 5e-6
+    force_bias_sigma_mps2: PositiveFloat = 0.1
+    gyro_bias_sigma_radps: PositiveFloat = 0.003
+    scale_sigma: NonNegativeFloat = 0.0
+    misalignment_sigma_rad: NonNegativeFloat = 0.0
+    force_quantum_mps2: NonNegativeFloat = 0.0
+    gyro_quantum_radps: NonNegativeFloat = 0.0
+    delay_s: float = 0.0
+
+
+class Receiver(Parameters):
+    """A GNSS receiver: rates and standard deviations, horizontal and up.
+
+    It is silent during `outages_s` and reports float solutions during `floats_s`, spans of begin and
+    end: these err `float_factor` times as much, and say so. During `multipath_s` positions are off by
+    `multipath_m`, which it does not say. A velocity rate of zero leaves velocities out.
+    """
+
+    rate_hz: PositiveFloat = 5.0
+    velocity_rate_hz: NonNegativeFloat = 5.0
+    sigma_m: PositiveFloat = 0.5
+    sigma_up_m: PositiveFloat = 1.0
+    sigma_mps: PositiveFloat = 0.05
+    sigma_up_mps: PositiveFloat = 0.1
+    lever_m: WayPoint = (0.0, 0.0, 0.0)
+    delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    outages_s: list[Span] = []
+    floats_s: list[Span] = []
+    float_factor: PositiveFloat = 10.0
+    multipath_s: list[Span] = []
+    multipath_m: WayPoint = (3.0, -2.0, 5.0)
+
+
+class Prior(Parameters):
+    """Standard deviations of what is told of the start; the biases' are the unit's."""
+
+    is_told: bool = True
+    sigma_m: PositiveFloat = 0.5
+    sigma_mps: PositiveFloat = 0.2
+    tilt_sigma_rad: PositiveFloat = 0.02
+    heading_sigma_rad: PositiveFloat = 0.05
+
+
+class NavigationParameters(Parameters):
+    """The scenario: what moves, along which way-points (east, north, up, in m), and its sensors.
+
+    Without way-points they are drawn at random, a leg of `leg_s` apart. A person sways and bobs with
+    each step and turns to both sides of the way; a quadrotor leans into its acceleration and looks where
+    it likes.
+    """
+
+    carrier: Literal["vehicle", "pedestrian", "quadrotor"] = "vehicle"
+    duration_s: Annotated[float, Field(gt=10.0)] = 120.0
+    rest_s: PositiveFloat = 5.0
+    leg_s: PositiveFloat = 6.0
+    speed_mps: PositiveFloat = 10.0
+    way_points_m: list[WayPoint] = []
+    origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 48.0
+    origin_longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 11.0
+    origin_altitude_m: float = 500.0
+    unit: Unit = Unit()
+    gnss: Receiver = Receiver()
+    prior: Prior = Prior()
+
+
+class Path(NamedTuple):
+    """The way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
+
+    position: BSpline
+    attitude: BSpline
+
+    def orientation(self, times_s: Floats) -> Rotation:
+        """How the body is turned, forward, left, up to east, north, up."""
+        return Rotation.from_euler("ZYX", self.attitude(times_s))
+
+    def turn_rate(self, times_s: Floats) -> Floats:
+        """How fast it turns against the plane, (n, 3) in the body's axes."""
+        _, pitch, roll = self.attitude(times_s).T
+        yaw_rate, pitch_rate, roll_rate = self.attitude.derivative()(times_s).T
+        return np.stack(
+            [
+                roll_rate - np.sin(pitch) * yaw_rate,
+                np.cos(roll) * pitch_rate + np.sin(roll) * np.cos(pitch) * yaw_rate,
+                np.cos(roll) * np.cos(pitch) * yaw_rate - np.sin(roll) * pitch_rate,
+            ],
+            axis=1,
+        )
+
+
+def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Recording:
+    """Record one run."""
+    path_rng, unit_rng, gnss_rng, prior_rng = rng.spawn(4)
+    unit = parameters.unit
+    times_s = np.arange(int(parameters.duration_s * unit.rate_hz + 1e-9) + 1) / unit.rate_hz
+    path = _path(parameters, path_rng)
+    inertial, gyro_bias, force_bias = _inertial(parameters, path, times_s, unit_rng)
+    truth = np.hstack(
+        [
+            path.position(times_s),
+            path.position.derivative()(times_s),
+            path.orientation(times_s).as_quat(canonical=True, scalar_first=True),
+            gyro_bias,
+            force_bias,
+        ]
+    )
+    metadata = state_metadata(NAVIGATION)
+    streams = [
+        inertial,
+        *_gnss(parameters, path, gnss_rng),
+        make_stream(
+            "/body/truth",
+            schemas.TRUTH_STATE,
+            simulation_stamps_ns(times_s),
+            metadata=metadata,
+            state=truth,
+        ),
+    ]
+    if parameters.prior.is_told:
+        streams.append(_prior(parameters, truth[0], metadata, prior_rng))
+    return Recording(streams)
+
+
+def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
+    """The spline through the way-points, at rest first, and the attitude that goes with it."""
+    points = np.array(parameters.way_points_m, float).reshape(-1, 3)
+    if not len(points):
+        points = _random_points(parameters, rng)
+    if len(points) < 3:
+        raise BadInput(f"way_points_m has {len(points)} points; give three or more, east, north and up")
+    begin_s, end_s = parameters.rest_s, parameters.duration_s
+    knots_s = np.linspace(begin_s, end_s, len(points))
+    still = [(1, np.zeros(3)), (2, np.zeros(3))]
+    moving = make_interp_spline(knots_s, points, k=5, bc_type=(still, still))
+    # a grid of its own joins rest and way, fine enough to be as smooth as the spline
+    grid_s = np.arange(0.0, end_s + 0.1, GRID_S)
+    moving_s = np.clip(grid_s, begin_s, end_s)
+    place, velocity = moving(moving_s), moving.derivative()(moving_s)
+    moves = np.hypot(*velocity.T[:2]) > 0.05
+    course = np.unwrap(np.arctan2(velocity[moves, 1], velocity[moves, 0]))
+    attitude = np.zeros((len(grid_s), 3))
+    attitude[:, 0] = np.interp(grid_s, grid_s[moves], course)
+    set_off = np.clip((grid_s - begin_s) / 2.0, 0.0, 1.0)
+    going = set_off**3 * (10.0 - 15.0 * set_off + 6.0 * set_off**2)
+    if parameters.carrier == "vehicle":
+        attitude[:, 1] = -np.arctan(velocity[:, 2] / np.maximum(np.hypot(*velocity.T[:2]), 1.0))
+    elif parameters.carrier == "pedestrian":
+        _step(grid_s, going, place, attitude, rng)
+    else:
+        _lean(grid_s, going, place, attitude, rng)
+    return Path(make_interp_spline(grid_s, place, k=5), make_interp_spline(grid_s, attitude, k=5))
+
+
+def _step(
+    grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
+) -> None:
+    """Bob and sway with each step, 1.9 a second, and turn slowly to both sides, in place."""
+    phase, step = rng.uniform(0.0, 2 * np.pi, 4), 2 * np.pi * 1.9 * grid_s
+    place[:, 2] += 0.03 * going * np.sin(step + phase[0])
+    attitude[:, 0] += 0.8 * going * np.sin(0.5 * grid_s + phase[1])
+    attitude[:, 1] = 0.05 * going * np.sin(step + phase[2])
+    attitude[:, 2] = 0.05 * going * np.sin(0.5 * step + phase[3])
+
+
+def _lean(
+    grid_s: Floats, going: Floats, place: Floats, attitude: Floats, rng: np.random.Generator
+) -> None:
+    """Look about, and have the thrust point along the body's up, in place."""
+    phase = rng.uniform(0.0, 2 * np.pi, 2)
+    yaw = phase[0] + 1.5 * going * np.sin(0.2 * grid_s + phase[1])
+    thrust = make_interp_spline(grid_s, place, k=5).derivative(2)(grid_s)
+    thrust[:, 2] += 9.81
+    ahead = np.cos(yaw) * thrust[:, 0] + np.sin(yaw) * thrust[:, 1]
+    left = np.cos(yaw) * thrust[:, 1] - np.sin(yaw) * thrust[:, 0]
+    pitch = np.arctan2(ahead, thrust[:, 2])
+    attitude[:] = np.stack([yaw, pitch, -np.arctan2(left, np.hypot(ahead, thrust[:, 2]))], axis=1)
+
+
+def _random_points(parameters: NavigationParameters, rng: np.random.Generator) -> Floats:
+    """Way-points a leg apart: of a vehicle or person that goes on, of a quadrotor in a box."""
+    legs = max(3, round((parameters.duration_s - parameters.rest_s) / parameters.leg_s))
+    length_m = parameters.speed_mps * parameters.leg_s
+    if parameters.carrier == "quadrotor":
+        inside = rng.uniform(-1.0, 1.0, (legs, 3)) * [length_m, length_m, 0.25 * length_m]
+        return np.vstack([np.zeros(3), inside + np.array([0.0, 0.0, 0.5 * length_m])])
+    course = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(size=legs) * 0.6)
+    steps = length_m * np.stack([np.cos(course), np.sin(course), 0.02 * rng.normal(size=legs)], axis=1)
+    return np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+
+
+def _inertial(
+    parameters: NavigationParameters, path: Path, times_s: Floats, rng: np.random.Generator
+) -> tuple[Stream, Floats, Floats]:
+    """What the unit says (n samples), and its biases of gyro and accelerometer (n, 3)."""
+    unit = parameters.unit
+    turned = path.orientation(times_s).inv()
+    earth = np.array(earth_rate(parameters.origin_latitude_deg))
+    down = np.array([0.0, 0.0, -gravity(parameters.origin_latitude_deg, parameters.origin_altitude_m)])
+    velocity, acceleration = (path.position.derivative(order)(times_s) for order in (1, 2))
+    force = turned.apply(acceleration - down + 2.0 * np.cross(earth, velocity))
+    rate = path.turn_rate(times_s) + turned.apply(earth)
+    rates, gyro_bias = _sensed(
+        unit, rate, unit.gyro_noise_density, unit.gyro_bias_density, unit.gyro_bias_sigma_radps, rng
+    )
+    forces, force_bias = _sensed(
+        unit, force, unit.force_noise_density, unit.force_bias_density, unit.force_bias_sigma_mps2, rng
+    )
+    densities = ("force_noise_density", "gyro_noise_density", "force_bias_density", "gyro_bias_density")
+    stream = make_stream(
+        "/body/inertial",
+        schemas.INERTIAL_SAMPLE,
+        simulation_stamps_ns(times_s + unit.delay_s),
+        metadata={name: repr(getattr(unit, name)) for name in densities} | _origin(parameters),
+        specific_force_mps2=_rounded(forces, unit.force_quantum_mps2),
+        turn_rate_radps=_rounded(rates, unit.gyro_quantum_radps),
+        magnetic_field_ut=np.full_like(force, np.nan),
+    )
+    return stream, gyro_bias, force_bias
+
+
+def _sensed(
+    unit: Unit,
+    true: Floats,
+    noise_density: float,
+    bias_density: float,
+    bias_sigma: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """What three axes measure of a true quantity (n, 3), and their biases (n, 3)."""
+    step_s = 1.0 / unit.rate_hz
+    walk = rng.normal(size=true.shape) * bias_density * np.sqrt(step_s)
+    walk[0] = bias_sigma * rng.normal(size=3)
+    bias = np.cumsum(walk, axis=0)
+    axes = np.eye(3) + np.diag(unit.scale_sigma * rng.normal(size=3))
+    axes += unit.misalignment_sigma_rad * rng.normal(size=(3, 3)) * (1.0 - np.eye(3))
+    noise = rng.normal(size=true.shape) * noise_density / np.sqrt(step_s)
+    return true @ axes.T + bias + noise, bias
+
+
+def _rounded(values: Floats, quantum: float) -> Floats:
+    """Values to whole numbers of a quantum."""
+    return np.round(values / quantum) * quantum if quantum else values
+
+
+def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
+    """The fixes and velocities of the receiver's antenna, and the outages."""
+    gnss, origin = parameters.gnss, _origin(parameters)
+    lever = np.array(gnss.lever_m)
+
+    def times(rate_hz: float) -> Floats:
+        every_s = np.arange(0.0, parameters.duration_s + 1e-9, 1.0 / rate_hz)
+        return every_s[~_within(every_s, gnss.outages_s)]
+
+    def noise(times_s: Floats, sigma: float, sigma_up: float) -> tuple[Floats, Floats]:
+        factor = np.where(_within(times_s, gnss.floats_s), gnss.float_factor, 1.0)
+        sigmas = factor[:, None] * np.array([sigma, sigma, sigma_up])
+        covariance = (sigmas[:, :, None] ** 2 * np.eye(3)).reshape(-1, 9)
+        return sigmas * rng.normal(size=sigmas.shape), covariance
+
+    fix_s = times(gnss.rate_hz)
+    antenna = path.position(fix_s) + path.orientation(fix_s).apply(lever)
+    error, covariance = noise(fix_s, gnss.sigma_m, gnss.sigma_up_m)
+    error += _within(fix_s, gnss.multipath_s)[:, None] * np.array(gnss.multipath_m)
+    streams = [
+        make_stream(
+            "/body/fix",
+            schemas.POSITION_FIX,
+            simulation_stamps_ns(fix_s + gnss.delay_s),
+            metadata=origin,
+            position_m=antenna + error,
+            covariance_m2=covariance,
+        )
+    ]
+    if gnss.velocity_rate_hz > 0:
+        velocity_s = times(gnss.velocity_rate_hz)
+        swung = path.orientation(velocity_s).apply(np.cross(path.turn_rate(velocity_s), lever))
+        error, covariance = noise(velocity_s, gnss.sigma_mps, gnss.sigma_up_mps)
+        streams.append(
+            make_stream(
+                "/body/velocity",
+                schemas.VELOCITY_FIX,
+                simulation_stamps_ns(velocity_s + gnss.velocity_delay_s),
+                metadata=origin,
+                velocity_mps=path.position.derivative()(velocity_s) + swung + error,
+                covariance_m2ps2=covariance,
+            )
+        )
+    if gnss.outages_s:
+        spans_ns = simulation_stamps_ns(np.array(gnss.outages_s))
+        outages = make_stream(
+            "/body/fix/outages", schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1]
+        )
+        streams.append(outages)
+    return streams
+
+
+def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
+    """Which times lie in one of the spans."""
+    spans = np.array(spans_s, float).reshape(-1, 2)
+    inside = (times_s[:, None] >= spans[:, 0]) & (times_s[:, None] < spans[:, 1])
+    return np.any(inside, axis=1, keepdims=True)[:, 0]
+
+
+def _prior(
+    parameters: NavigationParameters, truth: Floats, metadata: dict[str, str], rng: np.random.Generator
+) -> Stream:
+    """The first Gaussian: the truth with an error, which in orientation is a turn of the body."""
+    told, unit = parameters.prior, parameters.unit
+    sigma = np.repeat(
+        [
+            told.sigma_m,
+            told.sigma_mps,
+            told.tilt_sigma_rad,
+            unit.gyro_bias_sigma_radps,
+            unit.force_bias_sigma_mps2,
+        ],
+        3,
+    )
+    sigma[8] = told.heading_sigma_rad
+    error = sigma * rng.normal(size=15)
+    mean = truth.copy()
+    mean[:6] += error[:6]
+    turned = Rotation.from_quat(truth[6:10], scalar_first=True) * Rotation.from_rotvec(error[6:9])
+    mean[6:10] = turned.as_quat(canonical=True, scalar_first=True)
+    mean[10:] = 0.0  # the biases are drawn about zero
+    return make_stream(
+        "/body/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        simulation_stamps_ns([0.0]),
+        metadata=metadata | _origin(parameters),
+        mean=mean[None],
+        covariance=np.diag(sigma**2).reshape(1, -1),
+    )
+
+
+def _origin(parameters: NavigationParameters) -> dict[str, str]:
+    """Where on earth the plane lies, as channels state it."""
+    names = ("origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
+    return {name: repr(getattr(parameters, name)) for name in names}
+
+
+NAVIGATING = Simulator(
+    "a vehicle, person or quadrotor with an inertial unit and GNSS: outages, float solutions, delays",
+    NavigationParameters,
+    simulate,
+)

@@ -1,0 +1,164 @@
+"""Inertial navigation, corrected by what a log has of position and velocity.
+
+The state of 15 components, with an inertial unit for its control: position and velocity in a local
+plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro
+and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems,
+2nd edition, 2013, chapter 14; the error of the orientation is one in the body's axes.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.log import Stream, schemas
+from recorders.models.inertial import cross, into_plane, strapdown
+from recorders.models.planar import Components
+from recorders.models.states import NAVIGATION
+from replay.engine.arrays import Floats
+from replay.engine.components import components_of
+from replay.engine.tangent import Kind
+from replay.estimators.alignment import AlignmentParameters, align, mounted
+from replay.inference.model import Control, Model, Motion, Sensor, Start
+
+LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
+MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
+STATE = components_of(NAVIGATION)
+POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6])
+
+
+class NavigationParameters(AlignmentParameters):
+    """The inertial unit, how it is mounted, and where; None takes what the log's channels state.
+
+    Noise densities are per square root of hertz, those of the biases' random walks per square root of a
+    second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
+    the body's axes. Gravity and the turn of the earth are those of the plane's origin. Where the unit is
+    silent for longer than `inertial_gap_s`, all is unknown.
+    """
+
+    force_noise_density: NonNegativeFloat | None = None
+    gyro_noise_density: NonNegativeFloat | None = None
+    force_bias_density: NonNegativeFloat | None = None
+    gyro_bias_density: NonNegativeFloat | None = None
+    origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    origin_altitude_m: float | None = None
+    inertial_gap_s: PositiveFloat = 1.0
+    lever_x_m: float = 0.0
+    lever_y_m: float = 0.0
+    lever_z_m: float = 0.0
+    sigma_velocity_mps: PositiveFloat | None = None
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.9999986
+    gate_reopens_s: PositiveFloat | None = 1.0
+
+
+def read_inertial(stream: Stream) -> Floats:
+    """Specific force and turn rate (n, 6) of inertial samples."""
+    return np.hstack([stream["specific_force_mps2"], stream["turn_rate_radps"]])
+
+
+def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """The state after a step with the mean of both ends' samples."""
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    fx, fy, fz = mounted(control[:3], parameters)
+    wx, wy, wz = mounted(control[3:], parameters)
+    moved = strapdown(
+        (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
+        (fx - bx, fy - by, fz - bz),
+        (wx - gx, wy - gy, wz - gz),
+        duration_s,
+        (parameters.origin_latitude_deg, parameters.origin_altitude_m),
+    )
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz = moved
+    return px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz
+
+
+def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that white noise of the samples, and the walks of their biases, add."""
+    force = parameters.force_noise_density**2 * duration_s
+    rate = parameters.gyro_noise_density**2 * duration_s
+    gyro_bias = parameters.gyro_bias_density**2 * duration_s
+    force_bias = parameters.force_bias_density**2 * duration_s
+    placed, moved, turned = (0.0, 0.0, 0.0), (force, force, force), (rate, rate, rate)
+    gyro, accelerometer = (gyro_bias, gyro_bias, gyro_bias), (force_bias, force_bias, force_bias)
+    return placed + moved + turned + gyro + accelerometer
+
+
+def position(state: Components, about: Any, parameters: Any) -> Components:
+    """Where the end of the lever arm is."""
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    x, y, z = into_plane((qw, qx, qy, qz), lever)
+    return px + x, py + y, pz + z
+
+
+def velocity(state: Components, samples: Components, parameters: Any) -> Components:
+    """How fast the end of the lever arm moves, which turns with the body."""
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
+    wx, wy, wz = mounted(samples[3:], parameters)
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    x, y, z = into_plane((qw, qx, qy, qz), cross((wx - gx, wy - gy, wz - gz), lever))
+    return vx + x, vy + y, vz + z
+
+
+def fix_noise(parameters: Any) -> Components:
+    """The variances of a fix that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
+
+
+def velocity_noise(parameters: Any) -> Components:
+    """The variances of a velocity that does not state them."""
+    variance = parameters.sigma_velocity_mps**2
+    return variance, variance, variance
+
+
+# Of a log that was not made for this model: a small unit that is carried about, somewhere on earth.
+HANDHELD = {
+    "force_noise_density": 0.05,
+    "gyro_noise_density": 0.001,
+    "force_bias_density": 3e-4,
+    "gyro_bias_density": 2e-6,
+    "origin_latitude_deg": 45.0,
+    "origin_altitude_m": 0.0,
+}
+UNIT = Control(
+    "inertial",
+    schemas.INERTIAL_SAMPLE,
+    tuple(f"force_{axis}_mps2" for axis in "xyz") + tuple(f"rate_{axis}_radps" for axis in "xyz"),
+    read_inertial,
+    interpolated=True,
+    gap="inertial_gap_s",
+    delay="inertial_delay_s",
+)
+INERTIAL = Model(
+    "position, velocity and orientation from an inertial unit, and its biases",
+    STATE,
+    NavigationParameters,
+    (
+        Sensor(
+            "fix",
+            schemas.POSITION_FIX,
+            POSITION,
+            position,
+            fix_noise,
+            vector="position_m",
+            covariance="covariance_m2",
+            delay="fix_delay_s",
+        ),
+        Sensor(
+            "velocity",
+            schemas.VELOCITY_FIX,
+            VELOCITY,
+            velocity,
+            velocity_noise,
+            vector="velocity_mps",
+            covariance="covariance_m2ps2",
+            delay="velocity_delay_s",
+            control=UNIT,
+        ),
+    ),
+    Motion(move, move_noise),
+    control=UNIT,
+    start=Start({}, HANDHELD, find=align),
+    estimable={**LEVER, **MOUNTING},
+)

@@ -1,0 +1,174 @@
+"""The timeline of tracks of many things: what each sensor scans, the tracks in colours of their own.
+
+The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
+nothing; bearings are rays from where the sensor is. Beside it are GOSPA, the number of tracks and how
+probable it is that they exist.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
+from replay.engine.measurements import PLANE, read_vectors
+from replay.estimators.scans import ORIGIN
+from replay.judging.evaluation import Floats
+from replay.judging.track_errors import instants_of, track_errors, tracks_at
+from replay.timeline.ais import track_colours
+from replay.timeline.canvas import MUTED, PALETTE, TRUTH, Canvas, Scene, Timeline
+from replay.timeline.plane import (
+    ROOT,
+    Stroke,
+    draw_lines,
+    draw_outlines,
+    draw_path,
+    ellipses,
+    plane_view,
+    turn_up,
+)
+from replay.timeline.plots import LINE, POINTS, draw_curve, plot_view
+
+# How far rays of bearings are drawn.
+RAY_M = 300.0
+SCANS = "scans"
+
+
+def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
+    """A map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
+    turn_up(canvas)
+    ground, paths, places = f"{ROOT}/ground", [], []
+    for topic, place, stroke in _ways(scene):
+        entity = f"{ground}{topic}"
+        stream = scene.read(topic)
+        draw_path(canvas, entity, stream.publish_time_ns, place, stroke)
+        paths.append(entity)
+        places.append(place)
+    _draw_scans(canvas, scene)
+    shown = np.concatenate(places) if places else np.zeros((1, 2))
+    shared = [ground, f"{ROOT}/{SCANS}"]
+    trackers = scene.outputs_of("", schemas.TRACK_ESTIMATE)
+    boards = []
+    for name, tracks in trackers:
+        drawn = _draw_tracks(canvas, f"{ROOT}/{name}", tracks)
+        view = plane_view(canvas, f"{ROOT}/{name}", shared, [*paths, *drawn], shown, name=name)
+        boards.append(view)
+    if not boards:
+        return plane_view(canvas, ground, shared, paths, shown)
+    plots = [
+        _draw_gospa(canvas, scene, trackers),
+        _draw_counts(canvas, scene),
+        _draw_existence(canvas, scene, trackers),
+    ]
+    return rrb.Horizontal(rrb.Tabs(*boards), rrb.Vertical(*plots), column_shares=[3, 1])
+
+
+def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
+    """What moves with a known position: things with a truth, and sensors."""
+    for topic in scene.source.topics.values():
+        if topic.schema_name == schemas.TRUTH_STATE.full_name:
+            yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)
+        elif topic.schema_name == schemas.POSITION_FIX.full_name:
+            yield topic.name, read_vectors(scene.read(topic.name), "position_m", PLANE), Stroke(MUTED)
+
+
+def _draw_scans(canvas: Canvas, scene: Scene) -> None:
+    """The detections of every sensor, scan by scan."""
+    scans = [each for each in scene.source.topics.values() if each.name.endswith("/scan")]
+    for number, topic in enumerate(scans):
+        prefix, colour = topic.name.removesuffix("/scan"), PALETTE[number % len(PALETTE)]
+        scan, entity = scene.read(topic.name), f"{ROOT}/{SCANS}{prefix}"
+        own = _own_places(scene, scan)
+        if f"{prefix}/detection" in scene.source.topics:
+            seen = scene.read(f"{prefix}/detection")
+            place = own[_scan_of(scan, seen)] + read_vectors(seen, "position_m", PLANE)
+            order = np.argsort(_scan_of(scan, seen), kind="stable")
+            columns = rr.Points2D.columns(positions=place[order]).partition(scan["detections"])
+            canvas.send(entity, scan.publish_time_ns, columns)
+            canvas.fix(entity, rr.Points2D.from_fields(**Stroke(colour, 1.5).fields(widen=2.0)))
+        elif f"{prefix}/bearing" in scene.source.topics:
+            seen = scene.read(f"{prefix}/bearing")
+            begin, bearing = own[_scan_of(scan, seen)], seen["bearing_rad"]
+            away = RAY_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+            colours = np.tile(np.array([*colour, 90], np.uint8), (len(seen), 1))
+            lines = np.stack([begin, begin + away], axis=1)
+            draw_lines(canvas, entity, seen.publish_time_ns, lines, colours)
+
+
+def _scan_of(scan: Stream, seen: Stream) -> np.ndarray:
+    """The row of each detection's scan."""
+    order = np.argsort(scan["scan_id"], kind="stable")
+    return order[np.searchsorted(scan["scan_id"][order], seen["scan_id"])]
+
+
+def _own_places(scene: Scene, scan: Stream) -> Floats:
+    """Where the sensor is at its scans, (n, 2)."""
+    topic = scan.metadata.get(ORIGIN, "")
+    if topic not in scene.source.topics:
+        return np.zeros((len(scan), 2))
+    fix = scene.read(topic)
+    last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
+    return read_vectors(fix, "position_m", PLANE)[np.maximum(last, 0)]
+
+
+def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
+    """The ways of all tracks and their 95 % ellipses; returns the entities of the ways."""
+    at = [tracks.components.index(name) for name in PLANE]
+    place = tracks["mean"][:, at]
+    size = len(tracks.components)
+    covariance = tracks["covariance"].reshape(-1, size, size)[:, at][:, :, at]
+    numbers = tracks["track_id"].astype(np.int64)
+    ways = []
+    for number in np.unique(numbers):
+        rows = numbers == number
+        [(red, green, blue)] = track_colours(np.array([number])).tolist()
+        stroke, entity = Stroke((red, green, blue), 1.5), f"{root}/track{number}"
+        time_ns = tracks.publish_time_ns[rows]
+        draw_path(canvas, f"{entity}/way", time_ns, place[rows], stroke)
+        draw_outlines(
+            canvas, f"{entity}/ellipse", time_ns, ellipses(place[rows], covariance[rows]), stroke
+        )
+        ways.append(f"{entity}/way")
+    return ways
+
+
+def _draw_gospa(canvas: Canvas, scene: Scene, trackers: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:
+    """GOSPA at instants, where the log has truths."""
+    try:
+        at_ns, truths = instants_of(scene.source)
+    except BadInput:  # nothing to judge by: the plot is empty
+        at_ns, truths = np.empty(0, np.int64), np.empty((0, 0, 2))
+    sizes = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))
+    for name, tracks in trackers if len(at_ns) else []:
+        errors = track_errors(tracks_at(sizes[name], tracks, at_ns), truths)
+        draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, errors.gospa, LINE)
+    return plot_view("plots/gospa", "GOSPA (m), c = 20 m, without what has no truth")
+
+
+def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
+    """How many tracks there are."""
+    for name, sizes in scene.outputs_of("", schemas.ESTIMATE_SIZE):
+        counts = sizes["elements"].astype(float)
+        draw_curve(canvas, "plots/count", name, scene.colour(name), sizes.publish_time_ns, counts, LINE)
+    return plot_view("plots/count", "Confirmed tracks")
+
+
+def _draw_existence(
+    canvas: Canvas, scene: Scene, trackers: list[tuple[str, Stream]]
+) -> rrb.TimeSeriesView:
+    """How probable it is that each track of the first tracker exists."""
+    existence = dict(scene.outputs_of("", schemas.EXISTENCE))
+    for name, tracks in trackers[:1]:
+        numbers = tracks["track_id"].astype(np.int64)
+        for number in np.unique(numbers):
+            rows = numbers == number
+            [(red, green, blue)] = track_colours(np.array([number])).tolist()
+            time_ns, values = tracks.publish_time_ns[rows], existence[name]["existence"][rows]
+            entity = "plots/existence"
+            draw_curve(canvas, entity, f"track{number}", (red, green, blue), time_ns, values, POINTS)
+    return plot_view("plots/existence", "Existence", (0.0, 1.0), legend=False)
+
+
+TIMELINE = Timeline(draw)

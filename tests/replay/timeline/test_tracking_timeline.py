@@ -1,0 +1,64 @@
+"""The timeline of tracks: scans in the world, empty ones too, rays, ways of tracks, GOSPA."""
+
+from pathlib import Path
+
+import numpy as np
+
+from recorders.log import make_stream, schemas
+from recorders.models.states import state_metadata
+from recorders.recording import SIMULATION_EPOCH_NS
+from replay.engine.estimator import bind
+from replay.engine.replaying import collect, replay
+from replay.judging.track_errors import instants_of, track_errors, tracks_at
+from replay.timeline.show import show
+from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
+from tests.replay.timeline.test_timeline import read
+
+
+def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
+    """The sensors are on a ship at (10, 0); its radar sees nothing at 15 s."""
+    seconds = np.arange(24)
+    stamps = SIMULATION_EPOCH_NS + seconds * SECOND
+    seen = [[(x - 10.0, y)] for [(x, y)] in passing(24)]
+    seen[15] = []
+    bearings = [[np.arctan2(100.0, 2.0 * second - 10.0)] for second in seconds]
+    place = state_metadata(("x_m", "y_m"))
+    ship = make_stream(
+        "/ship/fix",
+        schemas.POSITION_FIX,
+        stamps,
+        metadata=place,
+        position_m=np.tile([10.0, 0.0], (24, 1)),
+        covariance_m2=np.full((24, 4), np.nan),
+    )
+    truth = make_stream(
+        "/vessel/truth",
+        schemas.TRUTH_STATE,
+        stamps,
+        metadata=place,
+        state=np.stack([2.0 * seconds, np.full(24, 100.0)], axis=1),
+    )
+    source = log(
+        [ship, truth],
+        sensor("radar", {**RADAR, "origin": "/ship/fix"}, seconds, seen),
+        sensor("camera", {**CAMERA, "origin": "/ship/fix"}, seconds, bearings),
+        scenario="autoferry",
+    )
+    outputs = collect(replay([source], bind("jipda", [source], {"kind": "tracker:jipda"})))
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    found = read(tmp_path / "run.rrd")
+    points = found["/map/scans/radar"]["Points2D:positions"]
+    assert [len(row) for row in points] == [1] * 15 + [0] + [1] * 8
+    np.testing.assert_allclose(np.concatenate(points[:3]), [[0, 100], [2, 100], [4, 100]], atol=1e-5)
+    rays = [strip for row in found["/map/scans/camera"]["LineStrips2D:strips"] for strip in row]
+    np.testing.assert_allclose(np.array(rays)[:, 0], np.tile([10, 0], (24, 1)), atol=1e-5)
+    tracks = outputs["/estimates/jipda/track"].stream
+    assert set(tracks["track_id"]) == {1}
+    way = found["/map/jipda/track1/way"]["LineStrips2D:strips"]
+    assert len(way) == len(tracks) - 1
+    np.testing.assert_allclose(way[-1][0][1], tracks["mean"][-1][[0, 2]], rtol=1e-5)
+    at_ns, truths = instants_of(source)
+    sizes = outputs["/estimates/jipda/set"].stream
+    gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
+    drawn = np.concatenate(found["/plots/gospa/jipda"]["Scalars:scalars"])
+    np.testing.assert_allclose(drawn, gospa, rtol=1e-9)
