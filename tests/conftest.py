@@ -29,11 +29,12 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     from replay.engine import blocks, supervision
     from replay.inference import (
         estimators,
+        fixed_lag,
         gauss_newton,
         imm,
         observability,
         rewinding,
-        smoothers,
+        smoothing,
         tracking,
     )
 
@@ -43,8 +44,8 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         estimators._compiled,
         rewinding._compiled,
         gauss_newton.searching,
-        smoothers._way_back,
-        smoothers._sliding,
+        smoothing.going_back,
+        fixed_lag.sliding_over_runs,
         imm._smoothing,
         observability._summing,
         tracking._compiled,
