@@ -120,7 +120,7 @@ def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[P
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
     """The cells: a cut that only the number of runs decides."""
-    require_memory(f"the rows of {experiment.runs} runs", experiment.runs * KEPT_BYTES)
+    require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)
         parameters = merge(values, experiment.record.parameters)

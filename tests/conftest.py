@@ -27,7 +27,16 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
     """
     from replay.engine import blocks, supervision
-    from replay.inference import estimators, gauss_newton, imm, observability, rewinding, smoothers
+    from replay.inference import (
+        estimators,
+        fixed_lag,
+        gauss_newton,
+        imm,
+        observability,
+        rewinding,
+        smoothing,
+        tracking,
+    )
 
     loops = (
         blocks._merge,
@@ -35,10 +44,11 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         estimators._compiled,
         rewinding._compiled,
         gauss_newton.searching,
-        smoothers._way_back,
-        smoothers._sliding,
+        smoothing.going_back,
+        fixed_lag.sliding_over_runs,
         imm._smoothing,
         observability._summing,
+        tracking._compiled,
     )
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
     for each in loops:

@@ -166,7 +166,7 @@ class Objective:
     gap_limit_s: float
     on_best: Callable[[Best], None]
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
-    _told: dict[str, int] = field(default_factory=dict)
+    _told: dict[int, int] = field(default_factory=dict)
 
     def __call__(self, points: Floats) -> Floats:
         """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements."""
@@ -201,7 +201,7 @@ class Objective:
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
                 )
-            self._told[run.name] = _count(outputs)
+            self._told[id(run.ensemble)] = _count(outputs)
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """What the estimator makes of a log with these values (k,), by topic; BadInput as `replay`."""
@@ -214,7 +214,7 @@ class Objective:
             outputs = self.outputs(values, run)
         except BadInput:  # as of a batch that does not converge
             return None
-        if _failures(outputs) or _count(outputs) != self._told[run.name]:
+        if _failures(outputs) or _count(outputs) != self._told[id(run.ensemble)]:
             return None
         return self._measured(run, outputs)
 

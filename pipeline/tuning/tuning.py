@@ -87,7 +87,9 @@ def tune(
         raise BadInput(f"--by {by}: {choices(by, CRITERIA)}")
     sources, held_out = sources_of(logs), sources_of(validate) if validate else []
     if folds and not 2 <= folds <= len(sources):
-        raise BadInput(f"--folds {folds}: {len(sources)} logs can be cut into 2 to {len(sources)} parts")
+        raise BadInput(
+            f"--folds {folds}: give two or more, and a log for each at least; there are {len(sources)}"
+        )
     chosen = settings_of(estimator)
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
@@ -157,7 +159,7 @@ def _searched(
             raise BadInput(f"--free {name}: is named twice; once is enough")
         if name in OPEN and CRITERIA[by].is_smooth:
             raise BadInput(
-                f"--free {name}: more innovations are kept out than explained; tune it --by nees"
+                f"--free {name}: the best gate would let nothing in; leave it out, or tune --by nees"
             )
     return [_free(name, bounds.get(name), source, bound[0]) for name in names]
 

@@ -24,6 +24,7 @@ from recorders.log import Topic, make_stream, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.models.planar import Component, Components
 from recorders.models.states import PLANE_MOTION, state_metadata
+from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
@@ -54,7 +55,7 @@ UNUSED = (
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
-class TrackerParameters(ModelParameters):
+class TrackerParameters(Parameters):
     """How targets move, how tracks begin and end, and what sensors are like.
 
     What is None is what the channel of a sensor's scans states; given here, it holds for all sensors.
@@ -82,7 +83,7 @@ class TrackerParameters(ModelParameters):
     same_within_mps: NonNegativeFloat = 2.0
     most_tracks: PositiveInt = 100
 
-    gate_probability: Probability | None = None  # type: ignore[assignment]
+    gate_probability: Probability | None = None
     sigma_m: PositiveFloat | None = None
     sigma_across_rad: NonNegativeFloat | None = None
     lag_s: float | None = None
@@ -131,7 +132,7 @@ def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> C
 TARGET = Model(
     "a target in the plane that keeps its velocity",
     dict.fromkeys(PLANE_MOTION, "linear"),
-    TrackerParameters,
+    ModelParameters,
     (),
     Motion(move, acceleration_noise, linear=True),
     needs_sensor=False,

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.log import Schema, Topic, schemas
+from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.channels import resolved, stated
 from replay.engine.geodetic import GEODETIC
@@ -235,7 +236,7 @@ def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
 
 
 @cache
-def number_fields(parameters: type[ModelParameters]) -> tuple[str, ...]:
+def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
     """The parameters that model functions may read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")

@@ -25,7 +25,7 @@ from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
-PAGES = sorted(FOLDER.parent.glob("*.md"))
+PAGES = [*sorted(FOLDER.parent.glob("*.md")), ROOT / "docs" / "tuning.md"]
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 

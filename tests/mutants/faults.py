@@ -523,8 +523,8 @@ FAULTS = [
     ),
     Fault(
         "replay/engine/measurements.py",
-        "np.isnan(found).any(axis=(1, 2))",
-        "np.isnan(found).all(axis=(1, 2))",
+        "missing = unknown(found)",
+        "missing = np.isnan(found).all(axis=(1, 2))",
         VECTORS,
     ),
     Fault(

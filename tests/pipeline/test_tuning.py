@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
@@ -127,7 +128,11 @@ def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
             {"bounds": {"sigma_bearing_rad": (0.1, 1)}},
             "--bound sigma_bearing_rad: is not",
         ),
-        ("sigma_range_m", {"folds": 2}, "--folds 2: 1 logs can be cut into 2 to 1 parts"),
+        (
+            "sigma_range_m",
+            {"folds": 2},
+            "--folds 2: give two or more, and a log for each at least; there are 1",
+        ),
         ("bias_range_m", {"grid": 3}, "bias_range_m: a grid goes from bound to bound"),
         ("sigma_range_m", {"grid": 10_001}, "--grid 10001: that is 10001 points of 1 parameters"),
     ],
@@ -244,7 +249,7 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
 def seen() -> list[fl.MemorySource]:
     """Two short runs with truth, in which ranges are told by a single sighting a second."""
     rate = {"range_bearing": {"rate_hz": 2.0}}
-    return [fl.record("landmarks", seed=2, run=run, duration_s=20.0, **rate) for run in range(2)]
+    return [fl.record("landmarks", seed=seed, duration_s=20.0, **rate) for seed in (2, 3)]
 
 
 @pytest.mark.parametrize(
@@ -302,3 +307,17 @@ def test_what_need_not_be_positive_is_found_too() -> None:
     for row in found.parameters.to_dict("records"):
         assert row["low"] < true[row["parameter"]] < row["high"], row
         assert row["high"] - row["low"] < 0.2
+
+
+def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:
+    """Values of every run and parameter, and over the runs how often their intervals hold the truth."""
+    out = tmp_path / "tuning"
+    short = ("--set", "options.durations_s=[20.0]", "--runs", "2", "--logs", "0")
+    told = fuselog("run", "tuning", *short, "--out", out, "--json")
+    assert told.code == 0
+    table = pd.read_csv(out / "tables" / "tuned.csv")
+    assert len(table) == 2 * len(FREE)
+    assert (np.abs(np.log(table["value"] / table["true"])) < 4 * table["standard_error"]).all()
+    covered = table.groupby("parameter")["is_covered"].mean()
+    for name in FREE:
+        assert told.json["metrics"][f"ekf.covered_share.{name}-20s"] == covered[name]

@@ -1,6 +1,5 @@
 """The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from replay.engine.estimator import bind
 from replay.engine.late import parse_late
 from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
-from replay.inference import tracking
 from replay.inference.association import existence_after, marginals
 from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
 
@@ -26,15 +24,6 @@ SECOND = 1_000_000_000
 RADAR = {"sigma_m": "2.0", "detection_probability": "0.9", "clutter_per_m2": "1e-5"}
 CAMERA = {"sigma_rad": "0.02", "detection_probability": "0.6", "clutter_per_rad": "0.5"}
 Places = list[list[tuple[float, float]]]
-
-
-@pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Loops in plain Python, of which none is left to the next test."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    tracking._compiled.cache_clear()
-    yield
-    tracking._compiled.cache_clear()
 
 
 def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]]) -> list[Stream]:

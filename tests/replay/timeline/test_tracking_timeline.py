@@ -3,24 +3,20 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from recorders.log import make_stream, schemas
 from recorders.models.states import state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
-from replay.inference import tracking
 from replay.judging.track_errors import instants_of, track_errors, tracks_at
 from replay.timeline.show import show
 from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
 from tests.replay.timeline.test_timeline import read
 
 
-def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     """The sensors are on a ship at (10, 0); its radar sees nothing at 15 s."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    tracking._compiled.cache_clear()
     seconds = np.arange(24)
     stamps = SIMULATION_EPOCH_NS + seconds * SECOND
     seen = [[(x - 10.0, y)] for [(x, y)] in passing(24)]
@@ -49,7 +45,6 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, monkeypatch: pytest
         scenario="autoferry",
     )
     outputs = collect(replay([source], bind("jipda", [source], {"kind": "tracker:jipda"})))
-    tracking._compiled.cache_clear()
     show(source, outputs, [], save=tmp_path / "run.rrd")
     found = read(tmp_path / "run.rrd")
     points = found["/map/scans/radar"]["Points2D:positions"]
