@@ -101,17 +101,18 @@ def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
     if parameters.mapping is None:
         return {}
     mappings = read_mapping(Path(parameters.mapping))
-    types = {each.type_name for each in bag.connections}
-    for name in mappings.keys() - types:
-        raise BadInput(
-            f"{parameters.mapping}: no topic of {bag.path} is of type {name}; {choices(name, types)}"
-        )
+    types = sorted({each.type_name for each in bag.connections})
+    for name in mappings:
+        if name not in types:
+            raise BadInput(
+                f"{parameters.mapping}: no topic of {bag.path} is of type {name}; {choices(name, types)}"
+            )
     return mappings
 
 
 def _check_topics(bag: Bag, parameters: RosParameters) -> None:
     """Raise BadInput where a topic that a parameter names is not there."""
-    topics = {each.topic for each in bag.connections}
+    topics = sorted({each.topic for each in bag.connections})
     truth = [] if parameters.truth is None else [parameters.truth]
     for topic in [*parameters.topics, *parameters.names, *truth]:
         if topic not in topics:
