@@ -87,7 +87,10 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
             columns.append(_Column(column, *_parted(column), values))
     time, used, told = _time(batch, columns, texts)
     if not columns or (not used and len(columns[0].values) < _FEWEST):
-        raise BadInput(f"{path}: has no times, and no columns of numbers to speak of")
+        raise BadInput(
+            f"{path}: has no times, and no columns of {_FEWEST} numbers or more; write a mapping "
+            "by hand, as docs/own-log.md says"
+        )
     lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):
         blanks = ", ".join(f'"{column}"' for column in table.columns)
