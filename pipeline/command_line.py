@@ -192,7 +192,11 @@ def record(
     type=click.Choice(["header", "bag"]),
     help="For ROS: what says when a message was published, its header or the bag [default: header].",
 )
-@click.option("--mapping", help="What becomes of messages or columns: a TOML file, or one that ships.")
+@click.option(
+    "--mapping",
+    help="What becomes of messages or columns: a TOML file, or the name of one that ships; "
+    "import table without it lists these.",
+)
 @click.option(
     "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
 )

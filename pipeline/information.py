@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pipeline.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
-from recorders.log import Log, RunMetadata, Topic, open_log, read_span
+from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from recorders.parameters import describe
 from recorders.recording import Recorder
 from recorders.registry import load
@@ -23,13 +23,19 @@ from replay.inference.model import Model
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
-    """Print what a log holds: the run, how long it is, its topics; of a ROS log, how to import it."""
+    """Print what a log holds: the run, how long it is, its topics; of other data, how to import them."""
     from recorders.importers.ros.bags import looks_like_bag
 
     if looks_like_bag(path):
         _show_bag(path, as_json=as_json)
         return
-    log = open_log(path, recover=recover)
+    try:
+        log = open_log(path, recover=recover)
+    except BadInput as error:
+        if not (path.is_dir() or isinstance(error, NotMcap)):
+            raise
+        command = f"fuselog import table {shlex.quote(str(path))}"
+        raise BadInput(f"{error}; tables, such as CSV, become a log with: {command}") from error
     if as_json:
         print_json(_as_json(log))
         return

@@ -271,6 +271,11 @@ def _losses(log: Log) -> list[str]:
         losses.append(
             f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"
         )
+    if attachments := log.container.attachments:
+        losses.append(
+            f"{log.path}: attachments, which fuselog does not read, are left out: "
+            f"{len(attachments)} ({', '.join(attachments)})"
+        )
     return losses
 
 

@@ -327,9 +327,10 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
         if column is None or column.dtype.kind != "f":
             continue
         is_finite = np.isfinite(column).reshape(size, -1)
+        is_whole = is_finite.all()  # then its rows need no look, which would take longer
         if is_finite.size and entry.kind != "identifier":
-            finite.append(is_finite.any(axis=1))
-        if not entry.may_be_nan:
+            finite.append(np.ones(size, bool) if is_whole else is_finite.any(axis=1))
+        if not (is_whole or entry.may_be_nan):
             lacks |= ~is_finite.all(axis=1)
     return lacks | ~np.any(finite, axis=0) if finite else lacks
 

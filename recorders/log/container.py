@@ -32,6 +32,8 @@ _FOOTER = struct.Struct("<BQQQI8s")
 _FOOTER_CHECKED_BYTES = 25
 _LOOSE = frozenset({Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL})
 _DATA_END_BYTES = RECORD_HEAD.size + 4
+# What stands before an attachment's name: when it was logged and made, and how long the name is.
+_ATTACHMENT_HEAD = struct.Struct("<QQI")
 # A run of records outside chunks is cut here, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
 # No record has this opcode: it stands for bytes that hold no whole record.
@@ -62,11 +64,13 @@ class Container:
     """What a file holds: channels and schemas by id, metadata by name, regions in file order.
 
     Both counts are by channel: the messages that can be read, and those that a whole summary states.
+    Attachments are known by name alone.
     """
 
     channels: dict[int, records.Channel] = field(default_factory=dict)
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: list[str] = field(default_factory=list)
     regions: list[Region] = field(default_factory=list)
     message_counts: Counter[int] = field(default_factory=Counter)
     stated_counts: Counter[int] = field(default_factory=Counter)
@@ -310,12 +314,25 @@ def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> Non
             region = Region(place.offset, place.length, contents.spans, frozenset(contents.messages))
             found.regions.append(region)
             found.message_counts.update({key: len(each) for key, each in contents.messages.items()})
+    elif place.opcode == Opcode.ATTACHMENT:
+        found.attachments.append(_attachment_name(file, place))
     elif place.opcode in (Opcode.METADATA, Opcode.DATA_END):
         for record in read_records(read_bytes(file, place.offset, place.length)):
             if isinstance(record, records.Metadata):
                 found.metadata[record.name] = unseal(record.name, record.metadata)
             elif not index.chunks and record.data_section_crc not in (0, _checksum(file, place.offset)):
                 raise Damaged("the checksum of its data section is wrong")
+
+
+def _attachment_name(file: BinaryIO, place: _Place) -> str:
+    """The name of an attachment, whose data, which may be large, are not read. Raises Damaged."""
+    start = RECORD_HEAD.size + _ATTACHMENT_HEAD.size
+    if place.length >= start:
+        head = read_bytes(file, place.offset + RECORD_HEAD.size, _ATTACHMENT_HEAD.size)
+        *_, length = _ATTACHMENT_HEAD.unpack(head)
+        if start + length <= place.length:
+            return read_bytes(file, place.offset + start, length).decode(errors="replace")
+    raise Damaged(f"the attachment at byte {place.offset} is damaged (its name is not whole)")
 
 
 def _declare(found: Container, declarations: Iterable[Any]) -> None:

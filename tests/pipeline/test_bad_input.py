@@ -205,7 +205,8 @@ TABLE: dict[str, tuple[str, ...]] = {
     "replay log.mcap -e ekf --start nan": ("--start", "nan"),
     # logs that are none, or broken
     "info zzz.mcap": ("zzz.mcap", "No such file"),
-    "info folder": ("folder", "directory"),
+    "info folder": ("folder", "directory", "fuselog import table folder"),
+    "info line.tum": ("line.tum", "not an MCAP", "fuselog import table line.tum"),
     "info text.mcap": ("text.mcap", "not an MCAP"),
     "info empty.mcap": ("empty.mcap", "not an MCAP"),
     "info cut.mcap": ("cut.mcap", "cut off", "--recover"),

@@ -176,10 +176,12 @@ def test_what_is_no_column_is_counted_and_said(log: Path, fuselog: Fuselog) -> N
             writer.add_message(columns, time_ns, message, time_ns)
             writer.add_message(texts, time_ns, b"{}", time_ns)
         writer.add_metadata("vendor", {"firmware": "7"})
+        writer.add_attachment(0, 0, "camera.yaml", "text/plain", b"focal length")
         writer.finish()
     said = fuselog("cut", "foreign.mcap", "--start", "1", "-o", "part.mcap")
     assert said.code == 0, said.err
     assert "metadata of other programs is left out: vendor" in said.err
+    assert "attachments, which fuselog does not read, are left out: 1 (camera.yaml)" in said.err
     assert "topic /texts is without a schema" in said.err
     assert f"its {len(stream)} messages are left out" in said.err
     part, whole = fl.open("part.mcap"), fl.open("foreign.mcap")

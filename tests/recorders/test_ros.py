@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
@@ -23,8 +24,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recorders.errors import BadInput
 from recorders.importers.ros import importer
-from recorders.importers.ros.layouts import Messages, MessageType
+from recorders.importers.ros.bags import open_bag
+from recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
 from recorders.importers.ros.messages import TYPES
+from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.sqlite_pages import missing_bytes, whole_rows
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
@@ -179,16 +182,16 @@ def test_every_type_is_read_as_rosbags_reads_it(form: str, tmp_path: Path) -> No
     ]
     path = write_bag(tmp_path / "bag", form, sent, make.store)
     checked = 0
-    with AnyReader([path]) as theirs, importer.open_bag(path) as ours:
+    with AnyReader([path]) as theirs, open_bag(path) as ours:
         readers: dict[str, MessageType] = {}
         found: dict[str, list[Messages]] = {}
         for batch in ours.batches(lambda _: True):
             each = batch.connection
-            definitions = importer.definitions_of(each.type_name, each.definition, "ros2_humble")
+            definitions = definitions_of(each.type_name, each.definition, "ros2_humble")
             reader = readers.setdefault(
                 each.topic, MessageType(each.type_name, definitions, each.encoding)
             )
-            for which, raw in importer.by_size(batch.data, batch.begins, batch.lengths):
+            for which, raw in by_size(batch.data, batch.begins, batch.lengths):
                 for messages in reader.read(raw, which):
                     assert isinstance(messages, Messages), messages
                     stamps = batch.log_time_ns[messages.rows]
@@ -309,6 +312,8 @@ def test_what_the_streams_say(tmp_path: Path) -> None:
     ]
     assert streams["/detections"]["scan_id"].tolist() == [0, 0, 0]
     assert streams["/scan"]["detections"].tolist() == [3, 0]
+    left_out = "without the sizes, turns, classes and ids of their boxes"
+    assert notes[f"/boxes: detections kept {left_out}"] == "3"
     # two topics that would have one name keep their own
     assert streams["/heat/value"].metadata["components"] == "temperature_degc"
     assert streams["/level/value"]["value"].tolist() == [[0.75]]
@@ -508,6 +513,32 @@ def test_what_is_dropped_is_counted(tmp_path: Path) -> None:
     assert run.notes == notes
 
 
+def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
+    """Attachments and metadata of an MCAP bag; an attachment whose name is not whole is a loss."""
+    make, name, path = Maker(), "std_msgs/msg/Float64", tmp_path / "bag.mcap"
+    definition, _ = make.store.generate_msgdef(name, ros_version=2)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(name, "ros2msg", definition.encode())
+        channel = writer.register_channel("/level", "cdr", schema)
+        level = bytes(make.store.serialize_cdr(make(name, data=0.75), name))
+        writer.add_message(channel, START_NS, level, START_NS)
+        writer.add_metadata("vendor", {"firmware": "7"})
+        for words in (b"one", b"two"):
+            writer.add_attachment(0, 0, "camera.yaml", "text/plain", words)
+        writer.finish()
+    streams, notes = imported(path)
+    assert streams["/value"]["value"].tolist() == [[0.75]]
+    assert notes["not taken, attachment camera.yaml"] == "2, which is no topic"
+    assert notes["not taken, metadata vendor"] == "1, which is no topic"
+    head = (11).to_bytes(4, "little") + b"camera.yaml"
+    path.write_bytes(path.read_bytes().replace(head, b"\xff" * 3 + head[3:], 1))
+    _, notes = imported(path)
+    assert "its name is not whole" in notes["lost (1)"]
+    assert notes["not taken, attachment camera.yaml"].startswith("1, ")
+
+
 def test_frames_and_constants_that_change(tmp_path: Path) -> None:
     """A second frame of a topic is another stream; a covariance that changes is told."""
     make = Maker()
@@ -659,7 +690,7 @@ def test_a_bag_is_imported_block_by_block(tmp_path: Path, monkeypatch: pytest.Mo
     path = write_bag(tmp_path / "bag", "bag", sent, make.store)
     whole, notes = imported(path, transforms="map:base_link")
     monkeypatch.setattr(importer, "_BLOCK_MESSAGES", 50)
-    found = importer.read(path, importer.RosParameters(transforms=["map:base_link"]))
+    found = importer.read(path, RosParameters(transforms=["map:base_link"]))
     sizes = [max(map(len, block)) for block in found.blocks if block]
     assert len(sizes) > 10
     assert max(sizes) < 100

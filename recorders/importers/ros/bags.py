@@ -50,6 +50,11 @@ class Bag:
         return [each for file in self.files for each in file.connections]
 
     @property
+    def others(self) -> list[str]:
+        """What is in all files beside messages."""
+        return [each for file in self.files for each in file.others]
+
+    @property
     def losses(self) -> list[str]:
         """What cannot be read, a sentence each; whole after the reading."""
         return [*self.missing, *(loss for file in self.files for loss in file.losses)]

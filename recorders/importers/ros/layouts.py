@@ -110,7 +110,7 @@ class Messages:
         part = self.raw[:, offset : offset + dtype.itemsize * (1 if count is None else count)]
         if count == 0:
             return np.empty((len(self), 0), dtype)
-        column = np.ascontiguousarray(part).view(dtype).astype(dtype.newbyteorder("="), copy=False)
+        column = part.view(dtype).astype(dtype.newbyteorder("="))
         return column[:, 0] if count is None else column
 
     def text(self, path: str) -> NDArray[np.bytes_]:

@@ -29,6 +29,8 @@ class McapFile:
             number: self._connection(channel) for number, channel in self._container.channels.items()
         }
         self.connections = list(self._by_id.values())
+        self.others = [f"attachment {name}" for name in self._container.attachments]
+        self.others += [f"metadata {name}" for name in self._container.metadata]
         loss = Log(path, self._container).loss_statement
         self.losses = [] if loss is None else [loss]
 

@@ -85,7 +85,9 @@ def quaternion(messages: Messages, path: str) -> Floats:
 def covariance(messages: Messages, path: str) -> Floats:
     """A covariance (n, d * d), row-major; NaN where it is unknown."""
     found = messages.numbers(path).astype(float, copy=False)
-    unknown = ~found.any(axis=1) | (found[:, 0] == -1.0)
+    unknown = found[:, 0] == -1.0
+    may_be_zeros = np.flatnonzero(found[:, 0] == 0.0)
+    unknown[may_be_zeros] = ~found[may_be_zeros].any(axis=1)
     return np.where(unknown[:, None], np.nan, found) if unknown.any() else found
 
 
@@ -270,6 +272,9 @@ def _detections(names: str, unit: str) -> Taken:
             },
             metadata={"components": ",".join(f"{name}_{unit}" for name in names)},
             rows=np.repeat(np.arange(size), count),
+            doubtful={
+                "without the sizes, turns, classes and ids of their boxes": np.ones(size * count, bool)
+            },
         )
 
     return Taken(("scan", "detections"), parts)

@@ -43,10 +43,15 @@ class Batch(NamedTuple):
 
 
 class BagFile(Protocol):
-    """One file of a bag. `losses` says what of it cannot be read; it is whole after the reading."""
+    """One file of a bag.
+
+    `losses` says what of it cannot be read; it is whole after the reading. `others` names what is in it
+    beside messages.
+    """
 
     path: Path
     connections: list[Connection]
+    others: list[str]
     losses: list[str]
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:

@@ -65,6 +65,7 @@ class Ros1File:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.others: list[str] = []
         self.losses: list[str] = []
         self._chunks: list[_Record] = []
         self._stated: dict[int, tuple[str, str, MessageDefinition]] = {}

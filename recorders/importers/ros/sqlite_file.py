@@ -27,6 +27,7 @@ class SqliteFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.others: list[str] = []
         self.losses: list[str] = []
         try:
             self._missing_bytes = missing_bytes(path)

@@ -1,0 +1,151 @@
+"""What is taken of a bag: how the messages of each topic are read, and what their streams are named.
+
+A stream is named by the namespace of its topic and by what it is: /odom gives /odometry, /robot1/imu
+gives /robot1/inertial. Where two topics would give the same name, both are named by the topic:
+/odom/odometry, /wheels/odometry. So are poses without a covariance, which may be goals: /goal_pose/pose.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from recorders.errors import BadInput, choices
+from recorders.importers.ros.bags import Bag
+from recorders.importers.ros.layouts import MessageType, Undecodable, definitions_of
+from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
+from recorders.importers.ros.messages import FRAME, STAMP, TRANSFORM_TYPES, TYPES, Taken
+from recorders.importers.ros.parameters import RosParameters
+from recorders.importers.ros.raw import Connection
+
+
+class Reader(NamedTuple):
+    """How the messages of a connection are read; `taken` is None for transforms."""
+
+    type: MessageType
+    taken: Taken | None
+    stamp: str
+    frame: str
+    is_static: bool
+
+
+class Choice(NamedTuple):
+    """How the messages of connections are read, and by topic why those of others are not."""
+
+    readers: dict[Connection, Reader]
+    not_taken: dict[str, str]
+
+
+def choose(bag: Bag, parameters: RosParameters) -> Choice:
+    """What is taken of a bag.
+
+    Raises BadInput where what is asked for is not in the bag or cannot be read, or nothing is taken.
+    """
+    connections = bag.connections
+    mappings = _mappings(bag, parameters)
+    _check_topics(bag, parameters)
+    found = Choice({}, {})
+    known: dict[tuple, Reader | str] = {}
+    for each in connections:
+        if parameters.topics and each.topic not in parameters.topics:
+            found.not_taken[each.topic] = f"{each.type_name}, not asked for"
+            continue
+        key = (each.type_name, each.encoding, each.definition, each.topic.endswith("_static"))
+        if key not in known:
+            known[key] = _reader(each, mappings.get(each.type_name), parameters)
+        reader = known[key]
+        if isinstance(reader, Reader):
+            found.readers[each] = reader
+            continue
+        found.not_taken[each.topic] = f"{each.type_name or 'of no type'}{reader}"
+        if parameters.topics:
+            raise BadInput(
+                f"{bag.path}: topic {each.topic} cannot be taken: it is "
+                f"{found.not_taken[each.topic]}; describe it with --set mapping=FILE.toml"
+            )
+    if parameters.truth is not None:
+        _check_truth(bag, parameters.truth, found.readers)
+    if not found.readers:
+        listed = ", ".join(f"{topic} ({why})" for topic, why in sorted(found.not_taken.items()))
+        raise BadInput(f"{bag.path}: holds nothing that can be imported: {listed or 'no topics'}")
+    return found
+
+
+def stream_names(
+    readers: Mapping[Connection, Reader], parameters: RosParameters
+) -> dict[tuple[str, str], str]:
+    """The name of a stream by topic and kind."""
+
+    def below(topic: str, taken: Taken) -> str:
+        own = topic if taken.is_doubtful else topic.rpartition("/")[0]
+        return parameters.names.get(topic, own).rstrip("/")
+
+    wanted = {
+        (each.topic, kind): f"{below(each.topic, reader.taken)}/{kind}"
+        for each, reader in readers.items()
+        if reader.taken is not None
+        for kind in reader.taken.kinds
+    }
+    if (truth := parameters.truth) is not None:
+        above = parameters.names.get(truth, truth.rpartition("/")[0]).rstrip("/")
+        wanted[truth, "truth"] = f"{above}/truth"
+    counts = Counter(wanted.values())
+    return {
+        (topic, kind): name if counts[name] == 1 else f"{topic}/{kind}"
+        for (topic, kind), name in wanted.items()
+    }
+
+
+def _mappings(bag: Bag, parameters: RosParameters) -> dict[str, MessageMapping]:
+    """The mappings of messages of one's own, by type."""
+    if parameters.mapping is None:
+        return {}
+    mappings = read_mapping(Path(parameters.mapping))
+    types = {each.type_name for each in bag.connections}
+    for name in mappings.keys() - types:
+        raise BadInput(
+            f"{parameters.mapping}: no topic of {bag.path} is of type {name}; {choices(name, types)}"
+        )
+    return mappings
+
+
+def _check_topics(bag: Bag, parameters: RosParameters) -> None:
+    """Raise BadInput where a topic that a parameter names is not there."""
+    topics = {each.topic for each in bag.connections}
+    truth = [] if parameters.truth is None else [parameters.truth]
+    for topic in [*parameters.topics, *parameters.names, *truth]:
+        if topic not in topics:
+            raise BadInput(f"{bag.path}: has no topic {topic}; {choices(topic, topics)}")
+
+
+def _check_truth(bag: Bag, topic: str, readers: Mapping[Connection, Reader]) -> None:
+    """Raise BadInput where the topic of the truth has no poses."""
+    reader = next((each for of, each in readers.items() if of.topic == topic), None)
+    if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
+        raise BadInput(f"{bag.path}: truth = {topic}: has no poses; name a topic that has some")
+
+
+def _reader(
+    connection: Connection, mapping: MessageMapping | None, parameters: RosParameters
+) -> Reader | str:
+    """How a connection is read, or why it is not taken."""
+    name = connection.type_name
+    where = f"{parameters.mapping}: the mapping of {name}"
+    is_transforms = name in TRANSFORM_TYPES
+    if connection.encoding not in ("cdr", "ros1"):
+        return f", in the encoding '{connection.encoding}', which is none of ROS"
+    if mapping is None and not is_transforms and name not in TYPES:
+        return ""
+    try:
+        definitions = definitions_of(name, connection.definition, parameters.distribution)
+    except Undecodable as error:
+        return f": {error}"
+    kind = MessageType(name, definitions, "cdr" if connection.encoding == "cdr" else "ros1")
+    if mapping is not None:
+        known = kind.fields()
+        for path in mapping.paths():
+            if path not in known and not any(part.isdigit() for part in path.split(".")):
+                raise BadInput(f"{where}: the type has no number '{path}'; {choices(path, known)}")
+        return Reader(kind, taken(mapping, where), mapping.stamp, mapping.frame, is_static=False)
+    is_static = connection.topic.endswith("_static")
+    return Reader(kind, TYPES.get(name), STAMP, FRAME, is_static)

@@ -1,0 +1,190 @@
+"""The streams that are made of a bag: what waits for the end of a block, and what is counted of it."""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.importers.mapping import checked, not_finite
+from recorders.importers.ros.messages import Part
+from recorders.importers.ros.parameters import Clock
+from recorders.log import Schema, Stream, make_stream
+
+# Names of frames, and which messages (n,) name them.
+Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
+
+
+class Sent(NamedTuple):
+    """Messages (n,) of a topic: their places in it, and their stamps; None where there is no header."""
+
+    topic: str
+    rows: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64] | None
+    log_time_ns: NDArray[np.int64]
+
+
+class _Piece(NamedTuple):
+    """Some messages of a stream, which are one of its parts of a block."""
+
+    rows: NDArray[np.int64]
+    publish_time_ns: NDArray[np.int64]
+    log_time_ns: NDArray[np.int64]
+    sensor_time_ns: NDArray[np.int64]
+    columns: dict[str, NDArray]
+
+
+@dataclass
+class _Written:
+    """What a stream keeps from its first block to its last."""
+
+    schema: Schema
+    metadata: dict[str, str]
+    widths: dict[str, int]
+    constants: Mapping[str, NDArray]
+    messages: int = 0
+    last_ns: int = -1
+    pieces: list[_Piece] = field(default_factory=list)
+
+
+class StreamMaker:
+    """Makes streams block by block, and counts what is dropped or doubtful.
+
+    Attributes:
+        told: how many, by subject and fact.
+        came_of: what has come of a topic, in the order in which it came.
+        first_ns: the first publish time of all.
+    """
+
+    def __init__(self, path: Path, clock: Clock, names: Mapping[tuple[str, str], str]) -> None:
+        self.told: Counter[tuple[str, str]] = Counter()
+        self.came_of: dict[str, dict[str, None]] = defaultdict(dict)
+        self.first_ns: int | None = None
+        self._path, self._clock, self._names = path, clock, names
+        self._written: dict[str, _Written] = {}
+        self._streams: dict[tuple[str, ...], str] = {}
+
+    @property
+    def messages(self) -> int:
+        """How many have come of the bag."""
+        return sum(written.messages for written in self._written.values())
+
+    def tell(self, subject: str, fact: str, count: int) -> None:
+        """Count a fact."""
+        if count:
+            self.told[subject, fact] += count
+
+    def add(self, sent: Sent, part: Part, frames: Frames, name: str = "") -> None:
+        """Take up a part of messages (n,), for the stream `name` or that of their topic and frames."""
+        keep = self._kept(sent, part)
+        for frame, which in frames:
+            rows = np.flatnonzero(keep & (which if part.rows is None else which[part.rows]))
+            if len(rows):
+                self._put(name or self._name(sent.topic, part.kind, frame), sent, part, rows, frame)
+
+    def block(self) -> list[Stream]:
+        """The streams of all that waits."""
+        return [
+            self._stream(topic, written) for topic, written in self._written.items() if written.pieces
+        ]
+
+    def _kept(self, sent: Sent, part: Part) -> NDArray[np.bool_]:
+        """Which (k,) of a part are kept; the others are counted by reason."""
+        size = len(next(iter(part.columns.values())))
+        keep = np.ones(size, bool)
+        dropped = dict(part.dropped)
+        dropped["NaN or infinite"] = not_finite(part.schema, part.columns)
+        if sent.stamp_ns is not None and self._clock == "header":
+            own = sent.stamp_ns if part.rows is None else sent.stamp_ns[part.rows]
+            dropped["without a stamp in the header (--clock bag takes the bag's)"] = own == 0
+        for reason, which in dropped.items():
+            self.tell(sent.topic, f"{part.kind} dropped: {reason}", int((which & keep).sum()))
+            keep &= ~which
+        for reason, which in part.doubtful.items():
+            self.tell(sent.topic, f"{part.kind} kept {reason}", int((which & keep).sum()))
+        return keep
+
+    def _name(self, topic: str, kind: str, frame: Mapping[str, str]) -> str:
+        """The stream of a topic, a kind and its frames; a second frame of the topic has its own."""
+        key = (topic, kind, *frame.values())
+        if key not in self._streams:
+            name = self._names[topic, kind]
+            is_first = name not in self._streams.values()
+            self._streams[key] = name if is_first else "/".join([name, *filter(None, frame.values())])
+        return self._streams[key]
+
+    def _put(
+        self,
+        name: str,
+        sent: Sent,
+        part: Part,
+        rows: NDArray[np.int64],
+        frame: Mapping[str, str],
+    ) -> None:
+        """Take up the rows (k,) of a part for a stream."""
+        size = len(next(iter(part.columns.values())))
+        which = slice(None) if len(rows) == size else rows
+        where = f"{self._path}: topic {sent.topic}"
+        columns = {key: checked(where, key, column[which]) for key, column in part.columns.items()}
+        constants = {key: column[which] for key, column in part.constants.items()}
+        widths = {key: column.shape[1] for key, column in columns.items() if column.ndim == 2}
+        if name not in self._written:
+            stated = {key: in_words(value[0]) for key, value in constants.items()}
+            metadata = {**{key: each for key, each in frame.items() if each}, **part.metadata, **stated}
+            first = {key: value[:1].copy() for key, value in constants.items()}
+            self._written[name] = _Written(part.schema, metadata, widths, first)
+        written = self._written[name]
+        if widths != written.widths:
+            self.tell(sent.topic, f"{part.kind} dropped: of another length than the first", len(rows))
+            return
+        for key, value in constants.items():
+            known = written.constants[key]
+            same = ((value == known) | (np.isnan(value) & np.isnan(known))).all(axis=1)
+            fact = f"{part.kind} kept whose {key} is not the first one's, which is stated"
+            self.tell(sent.topic, fact, int((~same).sum()))
+        of = rows if part.rows is None else part.rows[rows]
+        log_time_ns = sent.log_time_ns[of]
+        sensed = log_time_ns if sent.stamp_ns is None else sent.stamp_ns[of]
+        published = log_time_ns if self._clock == "bag" else sensed
+        written.pieces.append(_Piece(sent.rows[of], published, log_time_ns, sensed, columns))
+        self.came_of[sent.topic][name] = None
+
+    def _stream(self, topic: str, written: _Written) -> Stream:
+        """What waits for a stream, in the order in which the bag has it."""
+        parts = written.pieces
+        log_time_ns = np.concatenate([part.log_time_ns for part in parts])
+        rows = np.concatenate([part.rows for part in parts])
+        is_sorted = (np.diff(log_time_ns) >= 0).all() and (np.diff(rows) >= 0).all()
+        order = slice(None) if is_sorted else np.lexsort((rows, log_time_ns))
+        published = np.concatenate([part.publish_time_ns for part in parts])[order]
+        steps_ns = np.diff(
+            published, prepend=published[0] - 1 if written.last_ns < 0 else written.last_ns
+        )
+        self.tell(topic, "stamps repeat, and are kept", int((steps_ns == 0).sum()))
+        self.tell(topic, "stamps go back, and are sorted", int((steps_ns < 0).sum()))
+        written.last_ns = int(published[-1])
+        written.messages += len(published)
+        first_ns = int(published.min())
+        self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
+        stream = make_stream(
+            topic,
+            written.schema,
+            published,
+            log_time_ns=log_time_ns[order],
+            sensor_time_ns=np.concatenate([part.sensor_time_ns for part in parts])[order],
+            metadata=written.metadata,
+            **{
+                name: np.concatenate([part.columns[name] for part in parts])[order]
+                for name in parts[0].columns
+            },
+        )
+        written.pieces.clear()
+        return stream
+
+
+def in_words(values: NDArray) -> str:
+    """Numbers (n,) with commas between them."""
+    return ",".join(f"{value:.9g}" for value in values.tolist())
