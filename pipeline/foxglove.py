@@ -20,7 +20,7 @@ from google.protobuf.message import Message
 from scipy.spatial.transform import Rotation
 
 from recorders.log import Companion, Stream, schemas
-from replay.engine.measurements import PLANE
+from replay.engine.measurements import PLANE, covariances_of
 from replay.judging.evaluation import Floats
 from replay.judging.trajectories import trajectory_of
 from replay.timeline.canvas import PALETTE, TRUTH
@@ -201,9 +201,7 @@ def _by_stamp(stream: Stream) -> Iterator[list[int]]:
 def _outlines(stream: Stream) -> Floats:
     """The ellipses (n, vertices, 2) of the plane that hold the states with 95 %."""
     columns = [stream.components.index(name) for name in PLANE]
-    size = round(stream["covariance"].shape[1] ** 0.5)
-    covariances = stream["covariance"].reshape(-1, size, size)[:, columns][:, :, columns]
-    return ellipses(stream["mean"][:, columns], covariances)
+    return ellipses(stream["mean"][:, columns], covariances_of(stream, PLANE))
 
 
 def _add_entity(scene: Any, stream: Stream, row: int, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -111,6 +112,17 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
         f"topic {stream.topic}: {covariance} has {width} numbers, {size**2} are needed for the {size} "
         f"of {field}"
     )
+
+
+def covariances_of(stream: Stream, wanted: Components) -> Floats:
+    """The covariances (n, t, t) of the wanted components of states, in the tangent space.
+
+    Raises BadInput where the channel lacks one of the components.
+    """
+    at = match_tangent(stream.metadata, wanted, f"topic {stream.topic}")
+    size = isqrt(stream["covariance"].shape[1])
+    whole: Floats = stream["covariance"].reshape(-1, size, size)
+    return whole[:, at][:, :, at]
 
 
 def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -> Stream:

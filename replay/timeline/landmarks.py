@@ -8,7 +8,7 @@ import pandas as pd
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
-from replay.engine.measurements import PLANE
+from replay.engine.measurements import PLANE, covariances_of
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
@@ -114,9 +114,7 @@ def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
         poses[:, 2] = states[rows, stream.components.index(HEADING)]
     covariances = None
     if "covariance" in stream.columns:
-        size = len(stream.components)
-        covariances = stream["covariance"][rows].reshape(-1, size, size)
-        covariances = covariances[:, columns][:, :, columns]
+        covariances = covariances_of(stream.take(rows), PLANE)
     return Track(name, stroke, stream.publish_time_ns[rows], poses, covariances)
 
 

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
-from replay.engine.measurements import PLANE, read_vectors
+from replay.engine.measurements import PLANE, covariances_of, read_vectors
 from replay.estimators.scans import ORIGIN
 from replay.judging.evaluation import Floats
 from replay.judging.track_errors import instants_of, track_errors, tracks_at
@@ -115,10 +115,7 @@ def _own_places(scene: Scene, scan: Stream) -> Floats:
 
 def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
     """The ways of all tracks and their 95 % ellipses; returns the entities of the ways."""
-    at = [tracks.components.index(name) for name in PLANE]
-    place = tracks["mean"][:, at]
-    size = len(tracks.components)
-    covariance = tracks["covariance"].reshape(-1, size, size)[:, at][:, :, at]
+    place, covariance = read_vectors(tracks, "mean", PLANE), covariances_of(tracks, PLANE)
     numbers = tracks["track_id"].astype(np.int64)
     ways = []
     for number in np.unique(numbers):

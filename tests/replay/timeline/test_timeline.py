@@ -28,6 +28,7 @@ from recorders.log import RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import record_run
 from replay.engine.blocks import Ragged, gather
 from replay.engine.estimator import bind
+from replay.engine.measurements import PLANE, covariances_of
 from replay.engine.replaying import collect
 from replay.engine.replaying import replay as replayed
 from replay.engine.sources import LogSource, MemorySource, memory_source
@@ -708,3 +709,26 @@ def test_no_viewer_outlives_a_killed_fuselog(tmp_path: Path) -> None:
                 return
         time.sleep(0.05)
     raise AssertionError("the viewer still answers")
+
+
+def test_a_path_of_states_with_a_quaternion_has_the_ellipses_of_its_position(tmp_path):
+    """A covariance has three rows for the four numbers of a quaternion."""
+    time_ns = np.arange(5) * 10**9
+    quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
+    place = np.column_stack([np.linspace(0, 4, 5), np.zeros(5)])
+    components = {
+        "components": "q_w,q_x,q_y,q_z,x_m,y_m",
+        "kinds": "quaternion,quaternion,quaternion,quaternion,linear,linear",
+    }
+    stated = np.tile(np.diag([0.1, 0.1, 0.1, 4.0, 9.0]).ravel(), (5, 1))
+    estimates = make_stream(
+        "/estimates/own/pose",
+        schemas.GAUSSIAN_ESTIMATE,
+        time_ns,
+        metadata=components,
+        mean=np.hstack([quaternion, place]),
+        covariance=stated,
+    )
+    source = MemorySource({}, RunMetadata("own"), "own")
+    show(source, {"/estimates/own/pose": gather([estimates])}, [], save=tmp_path / "own.rrd")
+    assert np.array_equal(covariances_of(estimates, PLANE)[0], np.diag([4.0, 9.0]))
