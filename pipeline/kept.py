@@ -98,6 +98,9 @@ class Kept:
 
     def end(self, *, is_done: bool) -> None:
         """Let go of the folder; it stays where there is something to go on with."""
+        if is_done and self.folder.is_dir():
+            with suppress(BadInput):  # of what others hold, or have put there
+                self.begin()  # cells of an earlier command that came to no end
         if not self._lock.is_locked:
             return
         done = sum(1 for path in self.folder.iterdir() if path.suffix == _SUFFIX)

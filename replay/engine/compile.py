@@ -430,8 +430,9 @@ def _load(text: str, title: str) -> Callable[..., Any]:
     module = ModuleType(name)
     sys.modules[name] = module  # compiled code that was kept looks for it there
     exec(compile(text, name, "exec"), module.__dict__)
-    module.kernel._cache = code = _CompiledCode(name, title)
-    module.kernel.compile = partial(code.compile, module.kernel.compile)
+    if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        module.kernel._cache = code = _CompiledCode(name, title)
+        module.kernel.compile = partial(code.compile, module.kernel.compile)
     return module.kernel
 
 

@@ -22,11 +22,12 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     # the prior is wrong by a standard deviation, along what the sum of the pressures does not tell
     "batch-reactor": ("batch-reactor", {"prior_mean": [2.9, 1.1], "prior_variance": 0.01}),
     "extended-target": ("extended-target", {}),
+    "inertial": ("navigation", {"duration_s": 12.0}),
     "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
     "vehicle": ("vehicles", {"duration_s": 30.0, "stochastic": True}),
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
-NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
+NEAR_LINEAR = ("robot", "vehicle", "batch-reactor", "inertial")
 # So many particles that a sharp measurement does not leave a few; and these vehicles go on as they
 # are: an interacting multiple model that expects manoeuvres is too careful.
 SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
@@ -38,6 +39,8 @@ CELLS = [
     for name, model in registered_models().items()
     for method, each in METHODS.items()
     if not each.lacks(model) and method != "bound"  # which estimates nothing, see `test_bound`
+    # of 15 components, ten thousand particles leave too few near what sharp fixes say
+    if (name, method) != ("inertial", "particles")
 ]
 
 
@@ -89,7 +92,7 @@ def test_a_sensor_whose_linearisation_is_singular_has_no_extended_filter() -> No
 
 
 @pytest.mark.paper
-@pytest.mark.parametrize("model", NEAR_LINEAR)
+@pytest.mark.parametrize("model", [name for name in NEAR_LINEAR if name != "inertial"])
 @pytest.mark.parametrize("method", ["ekf", "ukf"])
 def test_smoothers_err_less_than_their_filters(model: str, method: str) -> None:
     """Thirty runs each: the RMSE of the whole state, of all stamps together."""
