@@ -73,6 +73,8 @@ class Cell(NamedTuple):
 
     def packed(self, folder: Path) -> bytes:
         """The same as bytes, which any process can take; BadInput where a metric stands against that."""
+        if self.writes:
+            folder.mkdir(exist_ok=True)
         done = self.work_off(folder)
         try:
             return pickle.dumps(done)

@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.campaigns import cells_of
 from pipeline.executors import Crew, processes
 from pipeline.experiment import Setting, load_experiment, run_experiment
-from tests.bench.timing import median_seconds
+from tests.bench.timing import median_seconds, seconds
 
 RUNS = 2000
 Row = tuple[str, str, str, str]
@@ -22,7 +22,7 @@ def main() -> list[Row]:
     """Runs per second, and what the campaign adds to a cell's work."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        campaigns = {count: median_seconds(_campaign(folder, processes(count)), 1) for count in (1, 2)}
+        campaigns = {count: seconds(_campaign(folder, processes(count))) for count in (1, 2)}
         rates = {count: RUNS / taken for count, taken in campaigns.items()}
         whole = median_seconds(_campaign(folder, None, 128), 3)
         alone = median_seconds(_cell(folder / "cell"), 3)

@@ -188,6 +188,13 @@ class Dying(Here):
         return super().submit(work, *args, **kwargs)
 
 
+def test_a_campaign_without_logs_has_its_timeline(tmp_path):
+    name, experiment = load_experiment("landmarks", SETTINGS, {"runs": 130})
+    run_experiment(name, experiment, tmp_path / "result", logs=0)
+    assert (tmp_path / "result" / "timeline.rrd").is_file()
+    assert not (tmp_path / "result" / "logs").exists()
+
+
 def test_what_is_not_ours_stays(tmp_path):
     place = tmp_path / "result"
     unfinished(place).mkdir()
