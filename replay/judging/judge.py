@@ -194,7 +194,8 @@ class Judge:
         columns = _columns_of(errors)
         if topic not in self._quantities:
             width = columns.shape[1]
-            by_time = BinnedSums(width, width=TIME_BIN_NS, limit=TIME_BINS, cells=TIME_CELLS)
+            bins = {"width": TIME_BIN_NS, "limit": TIME_BINS, "cells": TIME_CELLS}
+            by_time = BinnedSums(width, **bins, first=self._first_run)
             self._quantities[topic] = Quantities(errors, BinnedSums(width, limit=STEPS), by_time)
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)

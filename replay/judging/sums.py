@@ -13,12 +13,20 @@ class BinnedSums:
     Bin b holds the positions from b width to (b + 1) width. Where there is a limit, the width doubles
     as often as needed, so that the sums never take more than `limit` bins a group; where there are very
     many groups, those of several sums merged take no more than about `cells` bins in all.
+    `first` is the first group that there is: of those before it nothing is kept.
     """
 
     def __init__(
-        self, columns: int, *, width: int = 1, limit: int | None = None, cells: int | None = None
+        self,
+        columns: int,
+        *,
+        width: int = 1,
+        limit: int | None = None,
+        cells: int | None = None,
+        first: int = 0,
     ) -> None:
         self.width = width
+        self._first = first
         self._limit = limit
         self._cells = cells
         # first column: how many rows there were
@@ -27,10 +35,10 @@ class BinnedSums:
         self._groups = 0
 
     def add(self, position: Integers, values: Floats, group: Integers | None = None) -> None:
-        """Add rows (n, columns) at positions (n,), of groups (n,), by default all of group 0."""
+        """Add rows (n, columns) at positions (n,), of groups (n,), by default all of the first."""
         if len(position) == 0:
             return
-        group = np.zeros(len(position), np.int64) if group is None else group
+        group = np.zeros(len(position), np.int64) if group is None else group - self._first
         self._widen(int(position.max()))
         bins = np.maximum(position, 0) // self.width
         low, high = int(bins.min()), int(bins.max()) + 1
@@ -44,15 +52,17 @@ class BinnedSums:
             part[:, :, 1 + column] += sums.reshape(shape)
 
     def merge(self, other: "BinnedSums") -> None:
-        """Add the sums of others, which have the same columns."""
+        """Add the sums of others, which have the same columns and no group before the first here."""
         theirs = other._sums[: other._groups, : other._bins]
         while self.width < other.width:
             self._double()
         width = other.width
         while width < self.width:
             theirs, width = _halved(theirs), 2 * width
-        self._reserve(len(theirs), theirs.shape[1])
-        self._sums[: len(theirs), : theirs.shape[1]] += theirs
+        begin = other._first - self._first
+        end = begin + len(theirs)
+        self._reserve(end, theirs.shape[1])
+        self._sums[begin:end, : theirs.shape[1]] += theirs
         while self._limit is not None and self._bins > self._limit:
             self._double()
         while self._cells is not None and self._bins > 1 and self._groups * self._bins > self._cells:
@@ -63,6 +73,7 @@ class BinnedSums:
         used = self._sums[: self._groups, : self._bins]
         cells = np.argwhere(used[:, :, 0] > 0)
         rows = used[cells[:, 0], cells[:, 1]]
+        cells[:, 0] += self._first
         return cells, rows[:, 0], rows[:, 1:]
 
     def _widen(self, position: int) -> None:

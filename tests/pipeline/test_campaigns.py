@@ -227,7 +227,7 @@ def test_bins_of_very_many_runs_are_wider():
     whole, parts = (BinnedSums(1, width=1, limit=8, cells=32) for _ in range(2))
     rng = np.random.default_rng(5)
     for first in range(0, 12, 2):
-        part = BinnedSums(1, width=1, limit=8, cells=32)
+        part = BinnedSums(1, width=1, limit=8, cells=32, first=first)
         position, values = rng.integers(0, 8, 40), rng.normal(size=(40, 1))
         part.add(position, values, rng.integers(first, first + 2, 40))
         parts.merge(pickle.loads(pickle.dumps(part)))
@@ -236,6 +236,8 @@ def test_bins_of_very_many_runs_are_wider():
     assert parts.width == 4
     assert len(cells) <= 32
     assert count.sum() == 240
+    assert set(cells[:, 0]) == set(range(12))
+    assert len(part._sums) <= 3  # a part has no place for the groups before its own
     assert np.array_equal(sums, whole.filled()[2])
 
 
