@@ -160,8 +160,9 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept) -> Iterator[Pass]:
                     cell, folder = cells[number], kept.place_of(keys[number])
                     worker = team.executor if team.shares_files or not cell.writes else Here()
                     pending[worker.submit(cell.packed, folder)] = number
-                if kept.has(keys[following]):
-                    yield kept.read(keys[following])
+                left = kept.read(keys[following])
+                if left is not None:
+                    yield left
                     following += 1
                     continue
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:

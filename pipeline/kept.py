@@ -5,7 +5,7 @@
         KEY.bin         what a cell left, checked; KEY is a hash of its description and of the code
         KEY/            the files of that cell: logs and estimates of the first runs, the timeline
 
-The folder is there when the first cell is done, and goes when the result is in its place.
+It is there when the campaign begins, and goes when the result is in place, or where nothing is kept.
 """
 
 import logging
@@ -55,10 +55,8 @@ class Kept:
         foreign = [each.name for each in self.folder.iterdir() if not _is_ours(each)]
         if foreign or not is_private(self.folder):
             self._lock.release()
-            what = f"holds {foreign[0]}, which" if foreign else "can be written by others:"
-            raise BadInput(
-                f"{self.folder}: {what} is not fuselog's; move it away, or give another --out"
-            )
+            what = f"holds {foreign[0]}, which is not fuselog's" if foreign else "others may write to it"
+            raise BadInput(f"{self.folder}: {what}; move it away, or give another --out")
 
     def place_of(self, key: str) -> Path:
         """Where the files of a cell go."""
@@ -66,15 +64,12 @@ class Kept:
 
     def has(self, key: str) -> bool:
         """Whether a cell is done, with all its files."""
-        return self._content(key) is not None
+        return self._left(key) is not None
 
     def read(self, key: str) -> Any:
-        """What a cell left, which is done."""
-        content = self._content(key)
-        assert content is not None
-        return pickle.loads(
-            pickle.loads(content)[0]
-        )  # checked, in a folder that only this user can write
+        """What a cell left; None where it is not done."""
+        left = self._left(key)
+        return None if left is None else pickle.loads(left)
 
     def write(self, key: str, left: bytes) -> None:
         """Keep what a cell left, pickled, when its files are written."""
@@ -120,12 +115,13 @@ class Kept:
             (self.folder / _LOCK).unlink(missing_ok=True)
             self.folder.rmdir()
 
-    def _content(self, key: str) -> bytes | None:
+    def _left(self, key: str) -> bytes | None:
         content = read_checked(self.folder / f"{key}{_SUFFIX}")
         if content is None:
             return None
-        _, files = pickle.loads(content)
-        return content if all((self.folder / name).is_file() for name in files) else None
+        left: bytes
+        left, files = pickle.loads(content)  # checked, in a folder that only this user can write
+        return left if all((self.folder / name).is_file() for name in files) else None
 
     def _files(self, key: str) -> list[Path]:
         return sorted(path for path in self.place_of(key).rglob("*") if path.is_file())
