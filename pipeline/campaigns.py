@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 import pickle
+import shutil
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -74,7 +75,8 @@ class Cell(NamedTuple):
     def packed(self, folder: Path) -> bytes:
         """The same as bytes, which any process can take; BadInput where a metric stands against that."""
         if self.writes:
-            folder.mkdir(exist_ok=True)
+            shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
+            folder.mkdir()
         done = self.work_off(folder)
         try:
             return pickle.dumps(done)

@@ -26,6 +26,9 @@ from replay.engine.cache import is_private, read_checked, write_checked
 
 _LOCK, _SUFFIX = "fuselog.lock", ".bin"
 _KEY = re.compile(r"[0-9a-f]{64}")
+_LEFTOVER = re.compile(
+    r"\.[0-9a-f]{64}\.bin\.[^.]+\.part"
+)  # of a cell that was being kept; recorders.atomic
 _LOG = logging.getLogger("fuselog")
 
 
@@ -57,6 +60,9 @@ class Kept:
             self._lock.release()
             what = f"holds {foreign[0]}, which is not fuselog's" if foreign else "others may write to it"
             raise BadInput(f"{self.folder}: {what}; move it away, or give another --out")
+        for path in self.folder.iterdir():
+            if _LEFTOVER.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
 
     def place_of(self, key: str) -> Path:
         """Where the files of a cell go."""
@@ -147,7 +153,7 @@ def _is_ours(path: Path) -> bool:
         return False
     is_cell = _KEY.fullmatch(path.stem) is not None
     if path.is_dir():
-        return is_cell and not path.suffix
+        return (is_cell and not path.suffix) or _LEFTOVER.fullmatch(path.name) is not None
     return path.name == _LOCK or (is_cell and path.suffix == _SUFFIX)
 
 

@@ -125,6 +125,10 @@ def test_a_stopped_campaign_goes_on_where_it_was(tmp_path, worked_off, monkeypat
             run(place)
     assert not place.exists()
     assert "keeps 1 finished cells; the same command goes on from there" in caplog.text
+    half = unfinished(place) / f".{'0' * 64}.bin.abc.part"  # killed while a cell was being kept
+    half.mkdir()
+    (half / "fuselog.lock").touch()
+    (half / "new.bin").write_bytes(b"half a ce")
     assert run(place) == files
     assert "has 1 of 3 cells" in caplog.text
     assert worked_off == [0, 128, 256]
@@ -144,10 +148,13 @@ def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkey
     elif what == "damaged":
         for path in unfinished(place).glob("*.bin"):
             path.write_bytes(path.read_bytes()[:-1])
+        half = next(unfinished(place).glob("*/logs")) / "half.mcap"
+        half.write_bytes(b"killed while a log was written")
     elif what == "a file is gone":
         next(unfinished(place).glob("*/logs/run-0001.mcap")).unlink()
     run(place, runs={"settings": 131, "one cell": 1}.get(what, 130))
     assert worked_off == {"a file is gone": [0], "one cell": []}.get(what, [0, 128])
+    assert not list(place.rglob("half.mcap"))
     assert not unfinished(place).exists()
 
 
