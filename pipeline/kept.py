@@ -26,9 +26,7 @@ from replay.engine.cache import is_private, read_checked, write_checked
 
 _LOCK, _SUFFIX = "fuselog.lock", ".bin"
 _KEY = re.compile(r"[0-9a-f]{64}")
-_LEFTOVER = re.compile(
-    r"\.[0-9a-f]{64}\.bin\.[^.]+\.part"
-)  # of a cell that was being kept; recorders.atomic
+_LEFTOVER = re.compile(r"\.[0-9a-f]{64}\.bin\.[^.]+\.part")  # where a cell was being written
 _LOG = logging.getLogger("fuselog")
 
 
