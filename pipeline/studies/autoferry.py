@@ -161,12 +161,12 @@ def _claims(table: pd.DataFrame, means: pd.DataFrame, options: AutoferryOptions)
         judged(
             "JIPDA with radar and lidar is as accurate as the reference, and covers as much",
             "RMSE 4.89 and 3.92 m, coverage .92 and .81",
-            f"RMSE {listed([both['thing1_rmse_m'], both['thing2_rmse_m']], 2, ' and ')} m, coverage "
-            f"{listed([both['thing1_coverage'], both['thing2_coverage']], 2, ' and ')}",
-            both["thing1_rmse_m"] <= 4.89 + 0.7
-            and both["thing2_rmse_m"] <= 3.92 + 0.7
-            and both["thing1_coverage"] >= 0.90
-            and both["thing2_coverage"] >= 0.79,
+            f"RMSE {listed([both['target1_rmse_m'], both['target2_rmse_m']], 2, ' and ')} m, coverage "
+            f"{listed([both['target1_coverage'], both['target2_coverage']], 2, ' and ')}",
+            both["target1_rmse_m"] <= 4.89 + 0.7
+            and both["target2_rmse_m"] <= 3.92 + 0.7
+            and both["target1_coverage"] >= 0.90
+            and both["target2_coverage"] >= 0.79,
         ),
         judged(
             "a radar that lags is better modelled as one: GOSPA of radar alone",
@@ -188,9 +188,9 @@ def _claims(table: pd.DataFrame, means: pd.DataFrame, options: AutoferryOptions)
             "RMSE smaller by .5 to 1.4 m; coverage .63 and .59 alone",
             f"RMSE {listed(_rmse(means, 'jipda-radar'), 2, ' and ')} m to "
             f"{listed(_rmse(means, 'jipda-radar-lidar'), 2, ' and ')} m; coverage "
-            f"{listed([alone['thing1_coverage'], alone['thing2_coverage']], 2, ' and ')} alone",
+            f"{listed([alone['target1_coverage'], alone['target2_coverage']], 2, ' and ')} alone",
             bool(np.all(_rmse(means, "jipda-radar-lidar") < _rmse(means, "jipda-radar")))
-            and alone["thing1_coverage"] < both["thing1_coverage"],
+            and alone["target1_coverage"] < both["target1_coverage"],
         ),
     ]
     for association, theirs in (("hungarian", ".3"), ("jipda", ".6")):
@@ -209,7 +209,7 @@ def _claims(table: pd.DataFrame, means: pd.DataFrame, options: AutoferryOptions)
 
 
 def _rmse(means: pd.DataFrame, label: str) -> Floats:
-    return means.loc[label, ["thing1_rmse_m", "thing2_rmse_m"]].to_numpy(float)
+    return means.loc[label, ["target1_rmse_m", "target2_rmse_m"]].to_numpy(float)
 
 
 AUTOFERRY = Study(

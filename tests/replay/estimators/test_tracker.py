@@ -294,10 +294,10 @@ def test_the_sheets_reference_trackers(autoferry: Path):
     assert mean["gospa_m"] < 9.16
     theirs = [5.86, 11.30, 10.28, 8.70, 5.56, 13.28]
     assert all(each["gospa_m"] < one + 0.2 for each, one in zip(figures, theirs, strict=True))
-    assert mean["thing1_rmse_m"] == pytest.approx(4.89, abs=0.7)
-    assert mean["thing2_rmse_m"] == pytest.approx(3.92, abs=0.7)
-    assert mean["thing1_coverage"] == pytest.approx(0.92, abs=0.02)
-    assert mean["thing2_coverage"] == pytest.approx(0.81, abs=0.02)
+    assert mean["target1_rmse_m"] == pytest.approx(4.89, abs=0.7)
+    assert mean["target2_rmse_m"] == pytest.approx(3.92, abs=0.7)
+    assert mean["target1_coverage"] == pytest.approx(0.92, abs=0.02)
+    assert mean["target2_coverage"] == pytest.approx(0.81, abs=0.02)
     rewound = replay_late(sources[5], "rewind:1", sensors=["radar", "lidar"])
     assert len(rewound["rewound"]) == 5
     last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
