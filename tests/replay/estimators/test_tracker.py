@@ -101,6 +101,11 @@ def test_an_update_is_that_of_the_formula(uncompiled: None):
     assert told == pytest.approx(existence_after(existence, beta[0], 0.9 * 0.99), rel=1e-12)
     last = found["association"].publish_time_ns == SIMULATION_EPOCH_NS + 8 * SECOND
     assert found["association"]["probability"][last] == pytest.approx(beta[1:], rel=1e-9)
+    likeliest = int(beta[1:].argmax())
+    told = found["innovation"].take(slice(-1, None))
+    np.testing.assert_allclose(told["innovation"], [innovation[likeliest]], rtol=1e-9)
+    np.testing.assert_allclose(told["covariance"], spread.reshape(1, 4), rtol=1e-9)
+    assert told["normalised_innovation_squared"] == pytest.approx(squared[likeliest], rel=1e-9)
 
 
 def test_tracks_begin_and_end_by_their_existence(uncompiled: None):
