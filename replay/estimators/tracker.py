@@ -33,6 +33,7 @@ from replay.engine.failures import reason_stream
 from replay.engine.measurements import PLANE
 from replay.engine.results import innovation_stream
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.tracking import (
@@ -65,6 +66,9 @@ class TrackerParameters(Parameters):
     Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks.
     With hits_needed = 0 they are managed by their existence; else by hits, and their existence is
     `birth_existence` until they are confirmed.
+
+    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
+    detections that its track ever had.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda"] = "jipda"
@@ -83,6 +87,7 @@ class TrackerParameters(Parameters):
     same_within_m: NonNegativeFloat = 10.0
     same_within_mps: NonNegativeFloat = 2.0
     most_tracks: PositiveInt = 100
+    smoothed: bool = False
 
     gate_probability: Probability | None = None
     sigma_m: PositiveFloat | None = None
@@ -599,7 +604,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     def rewinding(back_ns: int) -> Recursive:
         return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
 
-    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
+    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    return [smoothing_tracks(tracking, TARGET, parameters) if parameters.smoothed else tracking]
 
 
 TRACKER = Estimator(
