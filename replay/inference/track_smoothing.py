@@ -50,7 +50,7 @@ def _nodes(
     transition, noise = _motion(model, parameters, before, duration_s)
     cross = spread @ transition.transpose(0, 2, 1)
     predicted = transition @ cross + noise
-    gain = np.linalg.solve(predicted, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
+    gain = np.asarray(np.linalg.solve(predicted, cross.transpose(0, 2, 1)), float).transpose(0, 2, 1)
     return Nodes(
         end=offsets[1:].copy(),
         time_ns=time_ns,
@@ -72,6 +72,7 @@ def _motion(model: Model, parameters: Any, mean: Floats, duration_s: Floats) -> 
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
     lower = model.motion.noise(state, duration_s, parameters)
-    for (row, column), entry in zip(zip(*np.tril_indices(size), strict=True), lower, strict=True):
-        noise[:, row, column] = noise[:, column, row] = entry
+    rows, columns = np.tril_indices(size)
+    for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):
+        noise[:, i, j] = noise[:, j, i] = entry
     return transition, noise

@@ -92,17 +92,18 @@ def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PE
     return Judged(at_ns, np.array(places).transpose(0, 2, 1))
 
 
-def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers) -> list[TracksAt]:
+def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
     """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
 
-    `sizes` says how many messages of `tracks` each scan has.
+    `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
+    of each one `delay_ns` after its stamp.
     """
     names = tracks.components
     place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
     ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
     found = []
     for time_ns, last in zip(
-        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns, side="right"), strict=True
+        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns - delay_ns, side="right"), strict=True
     ):
         rows = slice(ends[last - 1], ends[last]) if last else slice(0, 0)
         later_s = (time_ns - sizes.publish_time_ns[last - 1]) * 1e-9 if last else 0.0

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.autoferry import mean_interval
+from pipeline.studies.tracking import mean_interval
 from recorders.errors import BadInput
 
 
