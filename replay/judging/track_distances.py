@@ -88,28 +88,26 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
     """The weights (steps, n, m) of pairs that the linear programme finds.
 
     Weights w >= 0 whose rows and columns sum up to 1 at most minimise sum w * gain, which is negative,
-    and half_switch for all changes e >= |w[k + 1] - w[k]|.
+    and half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
     """
     steps, n, m = gain.shape
-    pairs = n * m
-    if steps * pairs == 0:
-        return np.zeros(gain.shape)
-    one_step = sparse.vstack(
-        [
-            sparse.kron(sparse.eye(n), np.ones((1, m))),
-            sparse.kron(np.ones((1, n)), sparse.eye(m)),
-        ]
-    )
+    row, column = np.nonzero((gain < 0.0).any(axis=0))
+    pairs, weights = len(row), np.zeros(gain.shape)
+    if pairs == 0:
+        return weights
+    members = np.append(row, n + column), np.tile(np.arange(pairs), 2)
+    one_step = sparse.coo_matrix((np.ones(2 * pairs), members), (n + m, pairs))
     sums = sparse.kron(sparse.eye(steps), one_step)
     changes = sparse.kron(sparse.diags([-1.0, 1.0], [0, 1], (steps - 1, steps)), sparse.eye(pairs))
     size = sparse.eye((steps - 1) * pairs)
     bounds = sparse.bmat([[sums, None], [changes, -size], [-changes, -size]], format="csr")
     limits = np.concatenate([np.ones(sums.shape[0]), np.zeros(2 * (steps - 1) * pairs)])
-    cost = np.concatenate([gain.ravel(), np.full((steps - 1) * pairs, half_switch)])
+    cost = np.append(gain[:, row, column].ravel(), np.full((steps - 1) * pairs, half_switch))
     found = linprog(cost, bounds, limits, method="highs")
     if not found.success:
         raise BadInput(f"the linear programme of trajectory GOSPA has no solution: {found.message}")
-    return found.x[: steps * pairs].reshape(gain.shape)
+    weights[:, row, column] = found.x[: steps * pairs].reshape(steps, pairs)
+    return weights
 
 
 def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
