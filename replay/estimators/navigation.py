@@ -34,7 +34,8 @@ class NavigationParameters(AlignmentParameters):
     Noise densities are per square root of hertz, those of the biases' random walks per square root of a
     second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
     the body's axes. Gravity and the turn of the earth are those of the plane's origin. Where the unit is
-    silent for longer than `inertial_gap_s`, all is unknown.
+    silent for longer than `inertial_gap_s`, all but the biases is unknown: it may have accelerated and
+    turned by the standard deviations of a gap, and is tilted by that of `gap_tilt_rad` at most.
     """
 
     force_noise_density: NonNegativeFloat | None = None
@@ -44,6 +45,9 @@ class NavigationParameters(AlignmentParameters):
     origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     origin_altitude_m: float | None = None
     inertial_gap_s: PositiveFloat = 1.0
+    gap_acceleration_mps2: PositiveFloat = 2.0
+    gap_turn_radps: PositiveFloat = 0.2
+    gap_tilt_rad: PositiveFloat = 0.1
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     lever_z_m: float = 0.0
@@ -82,6 +86,16 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
     placed, moved, turned = (0.0, 0.0, 0.0), (force, force, force), (rate, rate, rate)
     gyro, accelerometer = (gyro_bias, gyro_bias, gyro_bias), (force_bias, force_bias, force_bias)
     return placed + moved + turned + gyro + accelerometer
+
+
+def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that a gap of the unit adds: of where it may have gone and turned meanwhile."""
+    speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
+    gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
+    moved = (speed_squared + 0.25 * gained) * duration_s**2
+    tilted = parameters.gap_tilt_rad**2
+    turned = (parameters.gap_turn_radps * duration_s) ** 2
+    return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
 
 
 def position(state: Components, about: Any, parameters: Any) -> Components:
@@ -157,7 +171,7 @@ INERTIAL = Model(
             control=UNIT,
         ),
     ),
-    Motion(move, move_noise),
+    Motion(move, move_noise, lost=lost),
     control=UNIT,
     start=Start({}, HANDHELD, find=align),
     estimable={**LEVER, **MOUNTING},
