@@ -345,7 +345,7 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 def _prior(
     parameters: NavigationParameters, truth: Floats, metadata: dict[str, str], rng: np.random.Generator
 ) -> Stream:
-    """The first Gaussian: the truth with an error, in orientation a turn about up and a tilt of the body.
+    """The first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
 
     The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
     """

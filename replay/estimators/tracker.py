@@ -31,7 +31,9 @@ from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
 from replay.engine.measurements import PLANE
+from replay.engine.results import innovation_stream
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
 from replay.inference.model import Model, ModelParameters, Motion
 from replay.inference.tracking import (
@@ -64,6 +66,9 @@ class TrackerParameters(Parameters):
     Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks.
     With hits_needed = 0 they are managed by their existence; else by hits, and their existence is
     `birth_existence` until they are confirmed.
+
+    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
+    detections that its track ever had.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda"] = "jipda"
@@ -82,6 +87,7 @@ class TrackerParameters(Parameters):
     same_within_m: NonNegativeFloat = 10.0
     same_within_mps: NonNegativeFloat = 2.0
     most_tracks: PositiveInt = 100
+    smoothed: bool = False
 
     gate_probability: Probability | None = None
     sigma_m: PositiveFloat | None = None
@@ -545,7 +551,42 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
             np.minimum(scans.offsets, repeated),
         ),
     )
-    return [Ragged(stream, bounds) for stream, bounds in streams]
+    of_pairs = pair, filled(told.probability, 1), filled(told.white, 1), filled(told.factor, 1)
+    innovations = _innovations(setup, scans, pair_ends, *of_pairs)
+    return [*(Ragged(stream, bounds) for stream, bounds in streams), *innovations]
+
+
+def _innovations(
+    setup: Setup,
+    scans: Scans,
+    ends: Integers,
+    pair: Integers,
+    probability: Floats,
+    white: Floats,
+    factor: Floats,
+) -> Iterator[Ragged]:
+    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
+    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
+    track, scan = pair[order, 0], pair[order, 1]
+    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
+    likeliest = np.sort(order[is_first])
+    for sensor, (kind, topic) in enumerate(zip(setup.found.kinds, setup.found.scans, strict=True)):
+        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
+        measured = KINDS[kind].measured
+        size = len(measured)
+        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
+        stream = innovation_stream(
+            f"/estimates/{setup.name}{topic.removesuffix('/scan')}/innovation",
+            scans.time_ns[pair[rows, 1]],
+            measured,
+            "",
+            target_id=pair[rows, 0],
+            accepted=np.ones(len(rows), np.int64),
+            innovation=np.einsum("nij,nj->ni", root, whitened),
+            covariance=root @ root.transpose(0, 2, 1),
+            squared=(whitened**2).sum(axis=1),
+        )
+        yield Ragged(stream, np.searchsorted(rows, ends))
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
@@ -563,7 +604,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     def rewinding(back_ns: int) -> Recursive:
         return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
 
-    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
+    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    return [smoothing_tracks(tracking, TARGET, parameters) if parameters.smoothed else tracking]
 
 
 TRACKER = Estimator(

@@ -156,6 +156,8 @@ class Told(NamedTuple):
         turned_away: (scans,), detections that begin no track because there is no room.
         number, mean, covariance, existence: (runs, rows, ...), of confirmed tracks.
         pair: (runs, rows, 3), track, scan and detection; probability: (runs, rows).
+        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation, and
+            Cholesky's factor of the innovation covariance; a bearing's stand first.
     """
 
     end: Integers
@@ -168,6 +170,8 @@ class Told(NamedTuple):
     existence: Floats
     pair: Integers
     probability: Floats
+    white: Floats
+    factor: Floats
 
 
 class Memory(NamedTuple):
@@ -226,7 +230,10 @@ def memory_of(stage: Stage, places: int, detections: int) -> Memory:
 
 
 def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory) -> int:
-    """Fill the detections of a scan, each chain of those within a distance as their mean."""
+    """Fill the detections of a scan, each chain of those within a distance as their mean.
+
+    Chains are in the order of their first detections.
+    """
     count = end - first
     for each in range(count):
         memory.group[each] = each
@@ -237,10 +244,11 @@ def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory)
                 scans.detection[first + each, 1] - scans.detection[first + other, 1],
             )
             if apart <= within and memory.group[each] != memory.group[other]:
-                old, new = memory.group[each], memory.group[other]
+                first_of_both = min(memory.group[each], memory.group[other])
+                joining = max(memory.group[each], memory.group[other])
                 for member in range(each + 1):
-                    if memory.group[member] == old:
-                        memory.group[member] = new
+                    if memory.group[member] == joining:
+                        memory.group[member] = first_of_both
     joined = 0
     for group in range(count):
         members, x, y = 0, 0.0, 0.0
@@ -548,6 +556,8 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     told.pair[run, row, 0] = tracks.number[run, place]
                     told.pair[run, row, 1], told.pair[run, row, 2] = scan, detection
                     told.probability[run, row] = memory.probability[place, 1 + detection]
+                    white, factor = memory.white[place, detection], memory.spread[place]
+                    copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
                     told.end[run, 1] = row + 1
 
     def tell_tracks(run: int, scan: int, tracks: Tracks, told: Told) -> None:
@@ -591,6 +601,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 BATCH = 1000
 BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
 BY_TRACK = ("number", "mean", "covariance", "existence")
+BY_PAIR = ("probability", "white", "factor")
 
 
 @lru_cache(maxsize=16)
@@ -643,6 +654,8 @@ def _no_told(scans: Scans, runs: int, places: int, size: int) -> Told:
         existence=np.empty((runs, rows)),
         pair=np.empty((runs, pairs, 3), np.int64),
         probability=np.empty((runs, pairs)),
+        white=np.empty((runs, pairs, 2)),
+        factor=np.empty((runs, pairs, 2, 2)),
     )
 
 
@@ -679,5 +692,5 @@ def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
         **by_scan,
         **by_track,
         pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
-        probability=told.probability[:, :paired][:, is_of_it],
+        **{name: getattr(told, name)[:, :paired][:, is_of_it] for name in BY_PAIR},
     )
