@@ -11,10 +11,12 @@ from scipy.stats import chi2
 from pipeline.ensemble import replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
 from replay.engine import replaying
 from replay.engine.estimator import bind
 from replay.engine.late import parse_late
+from replay.engine.measurements import PLANE
 from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference.association import existence_after, marginals
@@ -133,6 +135,114 @@ def test_tracks_begin_by_four_hits_in_six_chances(uncompiled: None):
         seen[gone] = []
     seldom = replay(log(sensor("radar", RADAR, range(8), seen)), "tracker:hungarian")
     assert seldom["set"]["elements"].tolist() == [0] * 8
+
+
+@pytest.mark.parametrize("association", ["nearest", "hungarian", "jpda"])
+def test_tracks_are_managed_by_score(uncompiled: None, association: str):
+    """The sum of log(P_D g / lambda) and log(1 - P_D P_G) passes Wald's bounds, up and down."""
+    seen = [*passing(8), *[[] for _ in range(9)]]
+    errors = {"false_confirmation": 1e-5, "missed_confirmation": 1e-5}
+    found = replay(
+        log(sensor("radar", RADAR, range(17), seen)),
+        f"tracker:{association}",
+        management="score",
+        **errors,
+    )
+    # a first hit is worth about log(.9 / (2 pi 17 1e-5)) = 6.7, and Wald's upper bound is 11.5
+    assert found["set"]["elements"].tolist()[:5] == [0, 0, 1, 1, 1]
+    missed = np.log(1.0 - 0.9 * 0.99)
+    lasting = int(np.floor(np.log(1e-5) / missed))
+    assert found["set"]["elements"].tolist()[8:] == [1] * lasting + [0] * (9 - lasting)
+    doubtful = replay(
+        log(sensor("radar", {**RADAR, "clutter_per_m2": "0.01"}, range(17), seen)),
+        f"tracker:{association}",
+        management="score",
+        **errors,
+    )
+    assert doubtful["set"]["elements"].tolist()[2] == 0
+
+
+def test_existence_goes_with_any_association(uncompiled: None):
+    """Of a single track all maps have the weights of jipda; the nearest detection is for certain."""
+    source = log(sensor("radar", RADAR, range(10), [*passing(7), [], [], []]))
+    jipda, jpda, nearest = (
+        replay(source, label, management="existence")
+        for label in ("tracker:jipda", "tracker:jpda", "tracker:nearest")
+    )
+    existence = [each["existence"]["existence"] for each in (jipda, jpda, nearest)]
+    np.testing.assert_array_equal(existence[0], existence[1])
+    assert existence[2][0] == 1.0
+    missed = 1.0 - 0.9 * 0.99
+    before = existence[2][-2] * np.exp(-1 / 60)
+    assert existence[2][-1] == pytest.approx(missed * before / (1 - 0.9 * 0.99 * before), rel=1e-12)
+
+
+def seen_by_fixes(places: Places) -> MemorySource:
+    """One target's detections as scans, and as fixes of a vehicle that begins where a track would."""
+    stamps = SIMULATION_EPOCH_NS + np.arange(len(places)) * SECOND
+    made: Any = make_stream
+    first = np.array(places[0][0])
+    prior = made(
+        "/target/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        stamps[:1],
+        metadata=state_metadata(PLANE_MOTION),
+        mean=[[first[0], 0.0, first[1], 0.0]],
+        covariance=[np.diag([4.0, 9.0, 4.0, 9.0]).ravel()],
+    )
+    fixes = made(
+        "/target/fix",
+        schemas.POSITION_FIX,
+        stamps[1:],
+        metadata=state_metadata(PLANE),
+        position_m=np.array(places[1:]).reshape(-1, 2),
+        covariance_m2=np.tile((4.0 * np.eye(2)).ravel(), (len(places) - 1, 1)),
+    )
+    clear = {**RADAR, "clutter_per_m2": "1e-30", "gate_probability": "0.999999999"}
+    return log(sensor("radar", clear, range(len(places)), places), [prior, fixes])
+
+
+def turning(seconds: int) -> Places:
+    """A target that goes straight on, turns sharply, and stands."""
+    rng = np.random.default_rng(5)
+    rates = np.where(np.abs(np.arange(seconds) - 15) < 4, 0.4, 0.0)
+    speeds = np.where(np.arange(seconds) < 25, 8.0, 0.0)
+    heading = np.cumsum(rates)
+    path = np.cumsum(speeds[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    return [[tuple(place)] for place in path + 2.0 * rng.normal(size=path.shape)]
+
+
+@pytest.mark.parametrize("association", ["jpda", "hungarian"])
+def test_a_track_of_several_modes_is_an_interacting_multiple_model(uncompiled: None, association: str):
+    """One target without clutter: states and modes are those of the house's own filter."""
+    source = seen_by_fixes(turning(40))
+    motion = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
+    alone = {topic: each.stream for topic, each in replay_in_memory([source], {"imm": motion}).items()}
+    label = f"tracker:{association}"
+    found = replay(source, label, model="vehicle", motion=motion, hits_needed=1)
+    rows = slice(-len(found["track"]), None)
+    assert len(found["track"]) == 39
+    assert found["modes"].components == ["drive", "manoeuvre", "stand"]
+    for ours, theirs, field in (
+        ("track", "state", "mean"),
+        ("track", "state", "covariance"),
+        ("modes", "modes", "probability"),
+    ):
+        expected = alone[f"/estimates/imm/target/{theirs}"][field][rows]
+        np.testing.assert_allclose(found[ours][field], expected, rtol=1e-9, atol=1e-9)
+    likeliest = found["modes"]["probability"].argmax(axis=1)
+    assert set(likeliest) == {0, 1, 2}
+
+
+def test_one_mode_of_a_model_is_a_filter(uncompiled: None):
+    source = seen_by_fixes(passing(12))
+    motion = {"turn_rate_radps": 0.02, "acceleration_sigma_mps2": 0.3}
+    ekf = replay_in_memory([source], {"ekf": motion})["/estimates/ekf/target/state"]
+    found = replay(
+        source, "tracker:hungarian", model="vehicle", mode="drive", motion=motion, hits_needed=1
+    )
+    assert "modes" not in found
+    np.testing.assert_allclose(found["track"]["mean"], ekf["mean"], rtol=1e-9, atol=1e-9)
 
 
 def test_a_second_target_needs_distance_and_room(uncompiled: None):
@@ -275,6 +385,19 @@ def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
         (_without(sensor("radar", RADAR, [0], [[(1, 2)]]), "/radar/scan"), {}, "does not fit this log"),
         (sensor("radar", {"sigma_m": "1"}, [0], [[]]), {}, "does not state clutter_per_m2.*--set"),
         (sensor("radar", RADAR, [0], [[]]), {"sensors": ["lidar"]}, "no scans of sensor lidar"),
+        (
+            sensor("radar", RADAR, [0], [[]]),
+            {"model": "vehicle"},
+            "states turn_rate_radps; .*--set motion.",
+        ),
+        (sensor("radar", RADAR, [0], [[]]), {"model": "robot"}, "robot: is driven by odometry"),
+        (sensor("radar", RADAR, [0], [[]]), {"model": "batch-reactor"}, "has no position x_m, y_m"),
+        (sensor("radar", RADAR, [0], [[]]), {"management": "hits"}, "management = hits goes with jpda"),
+        (
+            sensor("radar", RADAR, [0], [[]]),
+            {"motion": {"turn_rate_radps": 0.0}},
+            "of a model; give model=",
+        ),
     ],
 )
 def test_bad_input_is_named(uncompiled: None, streams, settings, said: str):
