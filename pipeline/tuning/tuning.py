@@ -27,8 +27,8 @@ from pipeline.tuning.search import (
     Free,
     coordinates_of,
     curvature,
+    least,
     least_of_grid,
-    minimum,
 )
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
@@ -203,7 +203,7 @@ def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
         if grid > 1:
             point = least_of_grid(objective, coordinates, grid)
         is_smooth = CRITERIA[objective.by].is_smooth
-        point, has_converged = minimum(objective, coordinates, point, is_smooth=is_smooth)
+        point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
         inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
         told = None
         if objective.by == "likelihood" and inner:
