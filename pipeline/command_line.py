@@ -81,12 +81,12 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Share the runs among N processes, of one core each."
+    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, of one core each."
 )
 scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|local:N",
-    help="Share the runs among the workers of a Dask scheduler, or of one with N on this machine.",
+    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
@@ -347,6 +347,8 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
+@workers_option
+@scheduler_option
 @recover_option
 @gap_option
 @json_option
