@@ -712,6 +712,38 @@ def sweep(
     sweep_named(experiment, labels, over, **options)
 
 
+@fuselog.command(short_help="Compare estimators over the same runs, with a verdict on every metric.")
+@click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
+@click.option("--case", help="What trajectory files are of, such as robot2, where a log has several.")
+@click.option(
+    "--margin",
+    type=click.FloatRange(min=0),
+    default=0.02,
+    show_default=True,
+    help="Which share of a metric is no matter.",
+)
+@click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
+@click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
+    """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
+
+    Or estimators over logs: fuselog compare LOG.mcap ... -e ekf -e ukf
+
+    All others are compared with the first, metric by metric over the runs that both have, with
+    intervals of 95 % by the bootstrap over runs.
+    """
+    from pipeline.comparing.command import compare_sides
+
+    compare_sides(list(sides), list(labels), **options)
+
+
 @fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
