@@ -366,6 +366,28 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     tune_logs(list(logs), **options)
 
 
+@fuselog.command(short_help="Say why an estimator is inconsistent.")
+@click.argument("log", type=ANY_PATH)
+@click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
+@click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
+@click.option("--save", type=FILE, help="A timeline (.rrd) to write, with the sentences as events.")
+@click.option("--model", help="The model to estimate, where several fit the log.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def diagnose(log: Path, **options: Any) -> None:
+    """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
+
+    LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
+    cause first: that without which the log-likelihood gains most.
+    """
+    from pipeline.diagnosing.command import diagnose_log
+
+    diagnose_log(log, **options)
+
+
 @fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--model", help="The model, where several fit the logs.")
