@@ -91,10 +91,16 @@ class TrackerParameters(Parameters):
     lag_s: float | None = None
     bias_x_m: float | None = None
     bias_y_m: float | None = None
+    bias_range_m: float | None = None
     near_range_m: NonNegativeFloat | None = None
     far_range_m: NonNegativeFloat | None = None
     far_detection_probability: Probability | None = None
     clutter_per_m2: PositiveFloat | None = None
+    far_clutter_factor: PositiveFloat | None = None
+    sector_from_rad: float | None = None
+    sector_to_rad: float | None = None
+    sector_detection_factor: Probability | None = None
+    sector_clutter_factor: PositiveFloat | None = None
     joined_within_m: NonNegativeFloat | None = None
     sigma_rad: PositiveFloat | None = None
     sigma_across_m: NonNegativeFloat | None = None
@@ -122,7 +128,7 @@ class TrackerParameters(Parameters):
 
 
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
-    """The sensors with scans and places or bearings.
+    """The sensors with scans and places, bearings, or both range and bearing.
 
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
@@ -149,10 +155,10 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
                 f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
                 "not there; record the sensor's own position"
             )
-    if rows and 0 not in found.kinds:
+    if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
             "only bearings: they begin no tracks, since they do not say how far a target is; take a "
-            "sensor of places with them"
+            "sensor of places, or of ranges with bearings, with them"
         )
     return found
 
@@ -170,7 +176,7 @@ def settings_of(
         values = {}
         for name in names:
             given = getattr(parameters, name)
-            if given is None and name in FOREIGN[KINDS[kind].leaf]:
+            if name in FOREIGN[KINDS[kind].leaf]:
                 given = np.nan
             if given is None:
                 needed = name not in UNSTATED
@@ -451,7 +457,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
 
 TRACKER = Estimator(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (places), or .../bearing beside those",
+    "per sensor .../scan and .../detection (places) or .../range_bearing, or .../bearing beside those",
     TrackerParameters,
     _bind,
     variant="association",

@@ -19,7 +19,9 @@ from replay.engine.late import parse_late
 from replay.engine.measurements import PLANE
 from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
+from replay.estimators.scan_sensors import place_clutter, polar_clutter
 from replay.inference.association import existence_after, marginals
+from replay.inference.binding import settings_type
 from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
 
 SECOND = 1_000_000_000
@@ -38,6 +40,12 @@ def sensor(name: str, stated: dict[str, str], times_s: Any, seen: list[list[Any]
         f"/{name}/scan", schemas.SCAN, stamps, metadata=stated, scan_id=ids, detections=counts
     )
     own = {"publish_time_ns": np.repeat(stamps, counts), "scan_id": np.repeat(ids, counts)}
+    if {"sigma_rad", "sigma_m"} <= stated.keys():
+        polar = np.array(told, float).reshape(-1, 2)
+        topic = f"/{name}/range_bearing"
+        columns = {"range_m": polar[:, 0], "bearing_rad": polar[:, 1]}
+        own_made: Any = make_stream
+        return [scan, own_made(topic, schemas.SCAN_RANGE_BEARING, **own, **columns)]
     if "sigma_rad" in stated:
         seen_by: Any = make_stream
         bearing = seen_by(f"/{name}/bearing", schemas.SCAN_BEARING, **own, bearing_rad=told)
@@ -282,6 +290,67 @@ def test_bearings_sharpen_confirmed_tracks_alone(uncompiled: None):
     assert variance == sorted(variance)
     assert len(set(variance)) == 3
     assert often["association"].metadata["sensors"] == "radar,camera"
+
+
+SURVEY = {**RADAR, "sigma_m": "1.0", "sigma_rad": "0.01", "sigma_across_m": "1.0"}
+
+
+def test_ranges_with_bearings_are_places(uncompiled: None):
+    """Measured in polar form, with the covariance that this has in the plane, tracks are the same."""
+    places = passing(15, 400.0)
+    polar = [[(np.hypot(x, y), np.arctan2(y, x))] for [(x, y)] in places]
+    found = replay(log(sensor("radar", SURVEY, range(15), polar)))
+    narrow = {**RADAR, "sigma_m": "1.0", "sigma_across_rad": "0.01"}
+    planar = replay(log(sensor("radar", narrow, range(15), places)))
+    assert len(found["track"]) == len(planar["track"]) >= 10
+    np.testing.assert_allclose(found["track"]["mean"], planar["track"]["mean"], atol=0.05)
+    covariance = (each["track"]["covariance"] for each in (found, planar))
+    np.testing.assert_allclose(*covariance, atol=0.02)
+    np.testing.assert_allclose(
+        found["existence"]["existence"], planar["existence"]["existence"], atol=1e-3
+    )
+
+
+def test_biases_as_parameters_are_taken_off(uncompiled: None):
+    places = passing(15, 400.0)
+    polar = [[(np.hypot(x, y) + 20.0, np.arctan2(y, x) - 0.1)] for [(x, y)] in places]
+    out = {**SURVEY, "bias_range_m": "20", "bias_rad": "-0.1"}
+    found = replay(log(sensor("radar", out, range(15), polar)))
+    np.testing.assert_allclose(found["track"]["mean"][-1], [28.0, 2.0, 400.0, 0.0], atol=0.05)
+    off = [[(x + 7.0, y - 9.0)] for [(x, y)] in places]
+    found = replay(log(sensor("radar", {**RADAR, "bias_x_m": "7", "bias_y_m": "-9"}, range(15), off)))
+    np.testing.assert_allclose(found["track"]["mean"][-1], [28.0, 2.0, 400.0, 0.0], atol=0.05)
+
+
+def test_clutter_in_polar_form_is_that_of_the_plane():
+    """Over a disc it is its area times the density, whatever varies by range and sector."""
+    names = ("clutter_per_m2", "near_range_m", "far_range_m", "far_clutter_factor")
+    names += ("sector_from_rad", "sector_to_rad", "sector_clutter_factor")
+    parameters = settings_type(names)(0.01, 20.0, 40.0, 3.0, 3.0, -3.0, 5.0)
+    ranges = (np.arange(500) + 0.5) * 0.1
+    turns = -np.pi + (np.arange(360) + 0.5) * 2 * np.pi / 360
+    cells = [[polar_clutter((each, turn), parameters) for turn in turns] for each in ranges]
+    steady, outer = 20.0**2 / 2, 3 * (50.0**2 - 40.0**2) / 2
+    rising = sum(each * (1 + (each - 20) / 10) * 0.1 for each in ranges if 20 <= each <= 40)
+    turned = 2 * np.pi + 4 * (2 * np.pi - 6.0)
+    expected = 0.01 * (steady + rising + outer) * turned
+    assert np.sum(cells) * 0.1 * 2 * np.pi / 360 == pytest.approx(expected, rel=0.01)
+    place = 30.0 * np.cos(1.0), 30.0 * np.sin(1.0)
+    assert place_clutter(place, parameters) == pytest.approx(0.02)
+    assert place_clutter((-45.0, 0.0), parameters) == pytest.approx(0.15)
+
+
+def test_misses_count_by_range_and_sector(uncompiled: None):
+    """P_D .9 near, falling to .1; half of it in the sector: (1 - P_D P_G) tells how much a miss says."""
+    limits = {"near_range_m": "50", "far_range_m": "150", "far_detection_probability": "0.1"}
+    sector = {"sector_from_rad": "1.0", "sector_to_rad": "2.0", "sector_detection_factor": "0.5"}
+    for stated, probability in ((limits, 0.5), (sector, 0.45), (limits | sector, 0.25)):
+        seen = [*[[(0.0, 100.0)] for _ in range(8)], []]
+        radar = sensor("radar", RADAR, range(8), seen[:8])
+        found = replay(log(radar, sensor("lidar", {**RADAR, **stated}, [8], [[]])))
+        before, after = found["existence"]["existence"][-2:]
+        before *= np.exp(-1 / 60)
+        assert after == pytest.approx(existence_after(before, 1.0, 0.99 * probability), rel=1e-3)
 
 
 def test_a_miss_in_a_blind_sector_says_nothing(uncompiled: None):
