@@ -79,11 +79,13 @@ def place_clutter(detection: Any, parameters: Any) -> Component:
     return clutter_in_plane(np.hypot(x, y), np.arctan2(y, x), parameters)
 
 
-def place_birth(detection: Any, origin: Any, parameters: Any) -> tuple[Components, Components]:
+def place_birth(
+    detection: Any, origin: Any, parameters: Any
+) -> tuple[Components, Components, Component]:
     """A target where it was detected."""
     x = detection[0] - parameters.bias_x_m + origin[0]
     y = detection[1] - parameters.bias_y_m + origin[1]
-    return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters)
+    return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters), 1.0
 
 
 # Bearings
@@ -131,7 +133,9 @@ def polar_clutter(detection: Any, parameters: Any) -> Component:
     return range_m * clutter_in_plane(range_m, bearing_rad, parameters)
 
 
-def polar_birth(detection: Any, origin: Any, parameters: Any) -> tuple[Components, Components]:
+def polar_birth(
+    detection: Any, origin: Any, parameters: Any
+) -> tuple[Components, Components, Component]:
     """A target where it was detected."""
     range_m, bearing_rad = detection[0] - parameters.bias_range_m, detection[1] - parameters.bias_rad
     cosine, sine = np.cos(bearing_rad), np.sin(bearing_rad)
@@ -143,7 +147,7 @@ def polar_birth(detection: Any, origin: Any, parameters: Any) -> tuple[Component
         (along - across) * cosine * sine,
         along * sine**2 + across * cosine**2,
     )
-    return (x, y), triangle
+    return (x, y), triangle, range_m
 
 
 PLACES = ScanSensor(

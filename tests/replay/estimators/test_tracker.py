@@ -1,6 +1,7 @@
 """The tracker of scans: its update against the formula, how tracks begin and end, and real scenarios."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from replay.estimators.scan_sensors import place_clutter, polar_clutter
 from replay.inference.association import existence_after, marginals
 from replay.inference.binding import settings_type
 from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
+from tests.replay.estimators import scan_scenes
+from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2
 
 SECOND = 1_000_000_000
 RADAR = {"sigma_m": "2.0", "detection_probability": "0.9", "clutter_per_m2": "1e-5"}
@@ -163,6 +166,62 @@ def test_tracks_are_managed_by_score(uncompiled: None, association: str):
         **errors,
     )
     assert doubtful["set"]["elements"].tolist()[2] == 0
+
+
+ALL_TOLD = {"confirming_existence": 1e-9, "keeping_existence": 0.0, "ending_existence": 1e-9}
+
+
+def test_pmbm_of_one_target_and_one_detection(uncompiled: None):
+    """Closed form: a detection is clutter, the known target, or one never detected before."""
+    seen: Places = [[(0.0, 100.0)], [(2.0, 100.0)]]
+    found = replay(log(sensor("radar", RADAR, range(2), seen)), "tracker:pmbm", **ALL_TOLD)
+    unknown, clutter = 0.9 * 1e-6, 1e-5
+    assert found["set"]["elements"].tolist() == [1, 2]
+    first, known, new = found["existence"]["existence"]
+    assert first == pytest.approx(unknown / (clutter + unknown), rel=1e-12)
+    before = first * np.exp(-1 / 60)
+    variance = 4 + 9 + 0.1 / 3 + 4
+    density = np.exp(-0.5 * 2.0**2 / variance) / (2 * np.pi * variance)
+    detected = 0.9 * before * density / (clutter + unknown)
+    missed = 1 - 0.9 * 0.99 * before
+    none = missed / (missed + detected)
+    assert known == pytest.approx(existence_after(before, none, 0.9 * 0.99), rel=1e-9)
+    assert new == pytest.approx(none * unknown / (clutter + unknown), rel=1e-9)
+
+
+def test_pmbm_is_the_sum_over_all_maps(uncompiled: None):
+    """Existence of two known and three new targets, by enumeration of all global hypotheses."""
+    seen: Places = [[(0.0, 100.0), (6.0, 100.0)], [(2.0, 101.0), (4.0, 99.0), (7.0, 100.0)]]
+    found = replay(log(sensor("radar", RADAR, range(2), seen)), "tracker:pmbm", **ALL_TOLD)
+    unknown, clutter, detectable = 0.9 * 1e-6, 1e-5, 0.9 * 0.99
+    existence = found["existence"]["existence"]
+    before = existence[:2] * np.exp(-1 / 60)
+    variance = 4 + 9 + 0.1 / 3 + 4
+    apart = np.array(seen[1])[None] - np.array(seen[0])[:, None]
+    density = np.exp(-0.5 * (apart**2).sum(axis=2) / variance) / (2 * np.pi * variance)
+    weights, exists = [], []
+    for chosen in product([None, 0, 1, 2], repeat=2):
+        used = [each for each in chosen if each is not None]
+        if len(used) != len(set(used)):
+            continue
+        weight, alive = 1.0, []
+        for track, detection in enumerate(chosen):
+            missed = 1 - detectable * before[track]
+            if detection is None:
+                weight *= missed
+                alive.append((1 - detectable) * before[track] / missed)
+            else:
+                weight *= 0.9 * before[track] * density[track, detection]
+                alive.append(1.0)
+        for detection in range(3):
+            is_left = detection not in used
+            weight *= clutter + unknown if is_left else 1.0
+            alive.append(unknown / (clutter + unknown) if is_left else 0.0)
+        weights.append(weight)
+        exists.append(alive)
+    assert len(weights) == 13
+    marginal = np.average(exists, weights=weights, axis=0)
+    np.testing.assert_allclose(existence[2:], marginal, rtol=1e-9)
 
 
 def test_existence_goes_with_any_association(uncompiled: None):
@@ -467,6 +526,30 @@ def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
 def test_bad_input_is_named(uncompiled: None, streams, settings, said: str):
     with pytest.raises(BadInput, match=said):
         replay(log(streams), **settings)
+
+
+def test_pmbm_follows_targets_in_clutter():
+    """Five targets that come near each other, ten false detections a scan: fewer errors than others."""
+    values: dict[str, list[float]] = {"pmbm": [], "jipda": [], "nearest": []}
+    scenes = [scan_scenes.simulate(seed, clutter=10.0) for seed in range(6)]
+    sources = [scan_scenes.source(scene, clutter=10.0) for scene in scenes]
+    for name, values_of in values.items():
+        settings = {"acceleration_density": 0.04, "birth_sigma_mps": 1.0, "sigma_m": VARIANCE_M2**0.5}
+        settings |= {"birth_distance_m": 0.0, "same_within_m": 0.0}
+        if name == "pmbm":
+            settings |= {"undetected_per_m2": 5 / FIELD_M**2 / 50}
+        label = f"tracker:{name}"
+        outputs = replay_in_memory(sources, {label: settings})
+        for run, scene in enumerate(scenes):
+            sizes, tracks = (
+                outputs[f"/estimates/{label}/{leaf}"].of_run(run) for leaf in ("set", "track")
+            )
+            found = tracks_at(sizes, tracks, sizes.publish_time_ns[10:])
+            each = track_errors(found, np.moveaxis(scene.states[11:, :, 0::2], 1, 0), cutoff_m=5.0)
+            values_of.append(float(each.gospa_all.mean()))
+    mean = {name: np.mean(each) for name, each in values.items()}
+    assert mean["pmbm"] < 0.9 * mean["nearest"]
+    assert mean["pmbm"] < mean["jipda"]
 
 
 def test_the_sheets_reference_trackers(autoferry: Path):
