@@ -43,8 +43,8 @@ class NavigationParameters(AlignmentParameters):
     its delay, and a velocity `velocity_lag_s`: as lags they may be estimated. The magnetic field is that
     of the place, in the plane's axes. Gravity and the turn of the earth are those of the plane's origin.
 
-    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body may
-    have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
+    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body
+    may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
     """
 
     force_noise_density: NonNegativeFloat | None = None
