@@ -43,8 +43,8 @@ class NavigationParameters(AlignmentParameters):
     its delay, and a velocity `velocity_lag_s`: as lags they may be estimated. The magnetic field is that
     of the place, in the plane's axes. Gravity and the turn of the earth are those of the plane's origin.
 
-    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body may
-    have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
+    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body
+    may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
     """
 
     force_noise_density: NonNegativeFloat | None = None
@@ -62,9 +62,9 @@ class NavigationParameters(AlignmentParameters):
     lever_z_m: float = 0.0
     fix_lag_s: float = 0.0
     velocity_lag_s: float = 0.0
-    axle_x_m: float = 0.0
-    axle_y_m: float = 0.0
-    axle_z_m: float = 0.0
+    axle_x_m: float | None = None
+    axle_y_m: float | None = None
+    axle_z_m: float | None = None
     wheel_scale: float = 0.0
     field_east_ut: float | None = None
     field_north_ut: float | None = None
@@ -163,6 +163,9 @@ HANDHELD = {
     "gyro_bias_density": 2e-6,
     "origin_latitude_deg": 45.0,
     "origin_altitude_m": 0.0,
+    "axle_x_m": 0.0,
+    "axle_y_m": 0.0,
+    "axle_z_m": 0.0,
 }
 UNIT = Control(
     "inertial",
