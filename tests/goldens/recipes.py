@@ -25,6 +25,7 @@ DATA = {
     "broad": ("broad", ""),
     "mrclam": ("mrclam6", "mrclam6.tar.xz"),
     "score-matrices": ("bssr1", "bssr1_set1.tar.xz"),
+    "table": ("navigation", "navigation.tar.xz"),
 }
 
 

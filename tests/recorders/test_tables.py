@@ -262,9 +262,9 @@ def test_recordings_of_one_format_differ_in_mounting_and_delays(imported: Callab
 def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
     """Those that have all files of the mapping, a single folder or many; a part of one is none."""
     mapping = read_mapping("quadrotor")
-    for name, files in {"a/path_2": ["GT.csv", "IMU_1.csv"], "path_10": ["GT.csv", "IMU_1.csv"]}.items():
+    for name, held in {"a/path_2": ["GT.csv", "IMU_1.csv"], "path_10": ["GT.csv", "IMU_1.csv"]}.items():
         (tmp_path / name).mkdir(parents=True)
-        for file in files:
+        for file in held:
             (tmp_path / name / file).touch()
     (tmp_path / "part").mkdir()
     (tmp_path / "part" / "GT.csv").touch()
