@@ -137,8 +137,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     for label, length_s, _, *values in by_length.itertuples(index=False):
         for name, value in zip(by_length.columns[3:], values, strict=True):
             outcome.metrics[f"{label}.{name}.{length_s:g}s"] = value
-    for row in by_window.itertuples(index=False):
-        outcome.metrics[f"{row.estimator}.over_rmse_m.{row.window}"] = row.over_rmse_m
+    for label, name, value in by_window[["estimator", "window", "over_rmse_m"]].to_numpy():
+        outcome.metrics[f"{label}.over_rmse_m.{name}"] = value
     kinds = innovations_of(replayed.outputs, rows, len(runs), options)
     for kind, each in kinds.items():
         outcome.metrics[f"{options.filter}.{kind}_nis"] = each.nis

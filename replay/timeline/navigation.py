@@ -176,7 +176,7 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
 
 def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
     """The whole path with its tube, red where fixes are silent, and the axes at the cursor."""
-    place = body.columns(PLACE).astype(np.float32)
+    place = body.columns(PLACE)
     thin_line = rr.Radius.ui_points(1.5)
     canvas.fix(f"{entity}/path", rr.LineStrips3D([place], colors=[body.colour], radii=thin_line))
     if body.covariance is not None:
