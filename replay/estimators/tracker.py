@@ -4,6 +4,10 @@
     tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
     tracker:jpda        all maps, weighted
     tracker:jipda       all maps, weighted, and how probable it is that each track exists
+    tracker:pmbm        the same, where any detection may be the first one of a target: the Poisson
+                        multi-Bernoulli mixture, of which after each scan the marginals are kept, the
+                        tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015). Targets
+                        that were never detected are a uniform Poisson process of steady density
 
 Targets keep their velocity but for white acceleration, or move as any registered model with a position
 says; where it has several modes, each track is an interacting multiple model. Sensors are those that
@@ -43,6 +47,16 @@ UNUSED = (
     "there is no room for more tracks; give --set most_tracks=...",
     "the scan came after a younger one; give --late rewind:SECONDS",
 )
+# What sets apart the two that go by existence and have the associations of jpda.
+EXISTING: dict[str, dict[str, float]] = {
+    "jipda": {},
+    "pmbm": {
+        "undetected_per_m2": 1e-6,
+        "confirming_existence": 0.5,
+        "keeping_existence": 0.5,
+        "ending_existence": 0.001,
+    },
+}
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -55,18 +69,21 @@ class TrackerParameters(Parameters):
     `model` is a registered one with a position, whose numbers `motion` gives by name; a model with modes
     has all of them, or the one that `mode` names. Without it targets keep their velocity.
 
-    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks.
-    What becomes of them `management` says: "existence" goes by the probability of their targets'; "hits"
-    by `hits_needed` in the first `chances`; "score" by the log-likelihood ratio of target and clutter,
-    tested so that `false_confirmation` and `missed_confirmation` are the probabilities of errors. With
-    hits or score, a track's existence is `birth_existence` until it is confirmed, and then 1. Where it
-    is None, jipda goes by existence and the others by hits.
+    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks;
+    or, where there are `undetected_per_m2` targets that were never detected, with any that may be one of
+    these, by how probable that is. What becomes of them `management` says: "existence" goes by the
+    probability of their targets'; "hits" by `hits_needed` in the first `chances`; "score" by the
+    log-likelihood ratio of target and clutter, tested so that `false_confirmation` and
+    `missed_confirmation` are the probabilities of errors. With hits or score, a track's existence is
+    `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
+    `confirming_existence` on until it falls below `keeping_existence`, and ends below
+    `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
 
     `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
     detections that its track ever had.
     """
 
-    association: Literal["nearest", "hungarian", "jpda", "jipda"] = "jipda"
+    association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
     management: Literal["existence", "hits", "score"] | None = None
     sensors: tuple[str, ...] = ()
     model: str | None = None
@@ -76,7 +93,9 @@ class TrackerParameters(Parameters):
     birth_sigma_mps: PositiveFloat = 3.0
     birth_distance_m: NonNegativeFloat = 30.0
     birth_existence: Probability | None = None
+    undetected_per_m2: NonNegativeFloat = 0.0
     confirming_existence: Probability = 0.97
+    keeping_existence: Annotated[float, Field(ge=0, lt=1)] = 0.0
     ending_existence: Probability = 0.02
     survival_s: PositiveFloat = 60.0
     hits_needed: PositiveInt = 4
@@ -96,10 +115,16 @@ class TrackerParameters(Parameters):
     lag_s: float | None = None
     bias_x_m: float | None = None
     bias_y_m: float | None = None
+    bias_range_m: float | None = None
     near_range_m: NonNegativeFloat | None = None
     far_range_m: NonNegativeFloat | None = None
     far_detection_probability: Probability | None = None
     clutter_per_m2: PositiveFloat | None = None
+    far_clutter_factor: PositiveFloat | None = None
+    sector_from_rad: float | None = None
+    sector_to_rad: float | None = None
+    sector_detection_factor: Probability | None = None
+    sector_clutter_factor: PositiveFloat | None = None
     joined_within_m: NonNegativeFloat | None = None
     sigma_rad: PositiveFloat | None = None
     sigma_across_m: NonNegativeFloat | None = None
@@ -113,21 +138,24 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Existence is what jipda is about; the others count hits."""
-        is_jipda = values.get("association", "jipda") == "jipda"
+        """Existence is what jipda and pmbm are about; the others count hits."""
+        association = values.get("association", "jipda")
+        goes_by_existence = association in EXISTING
         given = values.get("management")
-        if is_jipda and given not in (None, "existence"):
-            raise ValueError(f"jipda goes by existence; management = {given} goes with jpda")
-        management = given or ("existence" if is_jipda else "hits")
-        likely = 0.05 if management == "existence" else 0.135
-        return {"birth_existence": likely, **values, "management": management}
+        if goes_by_existence and given not in (None, "existence"):
+            raise ValueError(f"{association} goes by existence; management = {given} goes with jpda")
+        management = given or ("existence" if goes_by_existence else "hits")
+        if values.get("undetected_per_m2") and management != "existence":
+            raise ValueError("undetected_per_m2 goes with management = existence")
+        likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
+        return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
 
 # Sensors
 
 
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
-    """The sensors with scans and places or bearings.
+    """The sensors with scans and places, bearings, or both range and bearing.
 
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
@@ -154,10 +182,10 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
                 f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
                 "not there; record the sensor's own position"
             )
-    if rows and 0 not in found.kinds:
+    if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
             "only bearings: they begin no tracks, since they do not say how far a target is; take a "
-            "sensor of places with them"
+            "sensor of places, or of ranges with bearings, with them"
         )
     return found
 
@@ -175,7 +203,7 @@ def settings_of(
         values = {}
         for name in names:
             given = getattr(parameters, name)
-            if given is None and name in FOREIGN[KINDS[kind].leaf]:
+            if name in FOREIGN[KINDS[kind].leaf]:
                 given = np.nan
             if given is None:
                 needed = name not in UNSTATED
@@ -464,7 +492,7 @@ def _innovations(
 def tracker_of(parameters: TrackerParameters, stage: Stage, names: tuple[str, ...]) -> Tracker:
     """The parts that the parameters ask for, for targets of a stage without sensors."""
     sensors = tuple(measuring(stage.model, kind) for kind in KINDS)
-    association = parameters.association.replace("jipda", "jpda")
+    association = "jpda" if parameters.association in EXISTING else parameters.association
     assert parameters.management is not None
     return Tracker(stage._replace(sensors=sensors), KINDS, association, parameters.management, names)
 
@@ -491,7 +519,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
 
 TRACKER = Estimator(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (places), or .../bearing beside those",
+    "per sensor .../scan and .../detection (places) or .../range_bearing, or .../bearing beside those",
     TrackerParameters,
     _bind,
     variant="association",

@@ -49,8 +49,9 @@ class ScanSensor:
         detection: (target, origin, parameters) -> how probable it is that the target is detected.
         clutter: (detection, parameters) -> how many false detections there are per unit of what is
             measured.
-        birth: (detection, origin, parameters) -> the position of a target that is there, and the rows of
-            the lower triangle of its covariance; None where a detection does not say enough.
+        birth: (detection, origin, parameters) -> the position of a target that is there, the rows of
+            the lower triangle of its covariance, and how many m^2 of the plane a unit of what is
+            measured has there; None where a detection does not say enough.
     """
 
     leaf: str
@@ -119,14 +120,15 @@ class Memory(NamedTuple):
         step: of the derivatives of sensors.
         place: (detections, 2), those of a scan, joined.
         group: (detections,), which ones are joined.
-        clutter: (detections,), how dense it is there.
+        clutter: (detections,), how dense it is there, with what has never been detected before.
+        undetected: (detections,), how much of that is targets.
         difference, spread, cross: (tracks, modes, ...), of innovations; see `Innovation`.
         predicted: (tracks, modes, 2), what a sensor should measure.
         detectable: (tracks,), how probable each track's detection is.
         white: (tracks, modes, detections, 2), whitened innovations.
         likelihood: (tracks, modes, detections), of a mode and, in it, a detection; relative to clutter.
         weights, probability, association: see `replay.inference.association`.
-        is_free: (detections,), outside all gates.
+        is_free: (detections,), outside all gates; left: (detections,), how probably of no track.
         given: (1 + detections,), a track's associations in one mode.
         after: (modes,), how probable each mode of a track is after them.
         moment: (2, 2), and `shift` (2,), of the weighted innovations.
@@ -137,6 +139,7 @@ class Memory(NamedTuple):
     place: Floats
     group: Integers
     clutter: Floats
+    undetected: Floats
     difference: Floats
     spread: Floats
     cross: Floats
@@ -148,6 +151,7 @@ class Memory(NamedTuple):
     probability: Floats
     association: AssociationMemory
     is_free: Booleans
+    left: Floats
     given: Floats
     after: Floats
     moment: Floats
@@ -163,6 +167,7 @@ def memory_of(stage: Stage, motion: Any, places: int, detections: int) -> Memory
         place=np.empty((detections, 2)),
         group=np.empty(detections, np.int64),
         clutter=np.empty(detections),
+        undetected=np.empty(detections),
         difference=np.empty((places, modes, 2)),
         spread=np.empty((places, modes, 2, 2)),
         cross=np.empty((places, modes, size, 2)),
@@ -174,6 +179,7 @@ def memory_of(stage: Stage, motion: Any, places: int, detections: int) -> Memory
         probability=np.empty((places, 1 + detections)),
         association=memory_for(places, detections),
         is_free=np.empty(detections, bool),
+        left=np.empty(detections),
         given=np.empty(1 + detections),
         after=np.empty(modes),
         moment=np.empty((2, 2)),

@@ -73,11 +73,11 @@ def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) 
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
-    """By Bayes' rule."""
+    """By Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
-    if tracks.existence[run, place] >= p.confirming_existence:
-        tracks.is_confirmed[run, place] = True
+    needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence
+    tracks.is_confirmed[run, place] = tracks.existence[run, place] >= needed
 
 
 def does_not_exist(run: int, place: int, tracks: Tracks, p: Any) -> bool:

@@ -199,8 +199,15 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         """Fill the weights of all pairs, and which detections are outside all gates."""
         kind, weights, origin = scans.kind[scan], memory.weights, read_pair(scans.origin[scan])
         for detection in range(count):
+            measured = read_pair(memory.place[detection])
+            undetected = 0.0
+            if begins[kind] and p.undetected_per_m2 > 0.0:
+                (at_x, at_y), _, area = birth(birth_number[kind], measured, origin, p)
+                detected = detection_of(kind, (at_x, 0.0, at_y, 0.0), origin, p)
+                undetected = detected * p.undetected_per_m2 * area
             memory.is_free[detection] = True
-            memory.clutter[detection] = clutter_of(kind, read_pair(memory.place[detection]), p)
+            memory.undetected[detection] = undetected
+            memory.clutter[detection] = clutter_of(kind, measured, p) + undetected
         for place in range(tracks.used[run]):
             for detection in range(count):
                 weights.detected[place, detection] = 0.0
@@ -288,6 +295,17 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 return True
         return False
 
+    def first_existence(
+        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: Memory
+    ) -> float:
+        """How probable it is that a detection is of a target that no track is of; 0 to begin none."""
+        if p.undetected_per_m2 > 0.0:
+            share = memory.undetected[detection] / memory.clutter[detection]
+            existence = memory.left[detection] * share
+            return existence if existence >= p.ending_existence else 0.0
+        is_another = not memory.is_free[detection] or is_taken(run, at_x, at_y, tracks, p)
+        return 0.0 if is_another else p.birth_existence
+
     def begin_tracks(
         run: int,
         scan: int,
@@ -298,14 +316,13 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         p: Any,
         memory: Memory,
     ) -> int:
-        """Begin a track with each detection far enough from all; returns how many had no room."""
+        """Begin tracks with the detections that may be of no other; returns how many had no room."""
         kind, turned_away = scans.kind[scan], 0
         for detection in range(count if begins[kind] else 0):
-            if not memory.is_free[detection]:
-                continue
             measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])
-            (at_x, at_y), triangle = birth(birth_number[kind], measured, origin, p)
-            if is_taken(run, at_x, at_y, tracks, p):
+            (at_x, at_y), triangle, _ = birth(birth_number[kind], measured, origin, p)
+            existence = first_existence(run, detection, at_x, at_y, tracks, p, memory)
+            if existence == 0.0:
                 continue
             place = tracks.used[run]
             if place == tracks.number.shape[1]:
@@ -326,8 +343,8 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 probability = newborn.mode[mode]
                 tracks.mode[run, place, mode] = probability
                 tracks.log_mode[run, place, mode] = np.log(probability) if probability > 0.0 else -np.inf
-            tracks.existence[run, place] = p.birth_existence
-            tracks.is_confirmed[run, place] = False
+            tracks.existence[run, place] = existence
+            tracks.is_confirmed[run, place] = existence >= p.confirming_existence
             tracks.hits[run, place] = tracks.chances[run, place] = 1
             tracks.score[run, place] = tracks.best_score[run, place] = 0.0
             tracks.seen_ns[run, place] = tracks.time_ns[run]
@@ -389,6 +406,10 @@ def tracking(tracker: Tracker, read: Function) -> Function:
             told.approximated[scan] = associate(
                 memory.weights, used, count, memory.probability, memory.association
             )
+            for detection in range(count):
+                memory.left[detection] = 1.0
+                for place in range(used):
+                    memory.left[detection] -= memory.probability[place, 1 + detection]
             tell_pairs(run, scan, count, tracks, told, memory)
             take_in(run, scan, count, scans, tracks, p, memory)
             end_tracks(run, tracks, p)
