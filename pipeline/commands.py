@@ -43,7 +43,7 @@ from recorders.log import Companions, Log, NotMcap, open_log
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import parse_json, read_toml
 from replay.engine.estimator import find_estimator
-from replay.engine.sources import LogSource
+from replay.engine.sources import LogSource, Source
 from replay.judging.judge import Judge
 from replay.judging.metrics import find_metrics
 from replay.judging.trajectories import Comparison
@@ -234,14 +234,14 @@ def evaluate_logs(
     for each in opened:
         if not any(topic.startswith("/estimates/") for topic in each.topics):
             raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
-    places = logs or [_source_path(each) for each in opened]
+    places = logs or [log_of_estimates(each) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
     for each, source in zip(opened, sources, strict=True):
         check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
-    estimators = _stated_estimators(opened[0])
+    estimators = stated_estimators(opened[0])
     compared = ComparedLogs([LogSource(each) for each in opened], {})
     if comparison:
         if "time_offset_s" in comparison:
@@ -325,7 +325,7 @@ def evaluate_trajectory(
         say(str(path))
 
 
-def _source_path(estimates: Log) -> Path:
+def log_of_estimates(estimates: Log) -> Path:
     """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
     named = estimates.run.notes.get("log") if estimates.run else None
     if named is None:
@@ -336,7 +336,7 @@ def _source_path(estimates: Log) -> Path:
     return path
 
 
-def _stated_estimators(estimates: Log) -> dict[str, Any]:
+def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
     """Parameters by label, in the order of the replay; none where the log does not say."""
     notes = estimates.run.notes if estimates.run else {}
     try:
@@ -432,7 +432,7 @@ def _draw_log(
     estimates = source = LogSource(log)
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
-        source = LogSource(open_log(_source_path(log), recover=recover))
+        source = LogSource(open_log(log_of_estimates(log), recover=recover))
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
