@@ -478,11 +478,11 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
-@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV, Parquet or Foxglove files.")
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.")
 @click.argument("path", type=ANY_PATH)
 @click.option(
     "--to",
-    type=click.Choice(["tum", "kitti", "csv", "parquet", "foxglove"]),
+    type=click.Choice(["tum", "kitti", "mot", "csv", "parquet", "foxglove"]),
     required=True,
     help="The format.",
 )
@@ -497,8 +497,9 @@ def evaluate(
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
-    parquet any stream, as a table; to foxglove one log of the messages that Foxglove and Rerun show.
+    To tum and kitti go the estimates and truths that state a position, as trajectories; to mot tracks
+    and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a table; to
+    foxglove one log of the messages that Foxglove and Rerun show.
     """
     from pipeline.exporting import export as export_log
 

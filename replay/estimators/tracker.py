@@ -16,6 +16,7 @@ begin tracks, bearings only sharpen those that are confirmed. `replay.inference.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -32,10 +33,11 @@ from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
-from replay.engine.results import named
+from replay.engine.results import innovation_stream, named
 from replay.estimators.scan_sensors import FOREIGN, KINDS, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.estimators.targets import Targets, targets_of
+from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
 from replay.inference.steps import Stage
@@ -77,6 +79,9 @@ class TrackerParameters(Parameters):
     `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
     `confirming_existence` on until it falls below `keeping_existence`, and ends below
     `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
+
+    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
+    detections that its track ever had.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
@@ -103,6 +108,7 @@ class TrackerParameters(Parameters):
     same_within_m: NonNegativeFloat = 10.0
     same_within_mps: NonNegativeFloat = 2.0
     most_tracks: PositiveInt = 100
+    smoothed: bool = False
 
     gate_probability: Probability | None = None
     sigma_m: PositiveFloat | None = None
@@ -193,7 +199,10 @@ def settings_of(
 ) -> tuple[tuple[str, ...], Floats]:
     """What the loop reads, by name, and for every sensor (sensors, names)."""
     names = number_fields(TrackerParameters)
-    rows, own = [], {name: value for name, value in targets.numbers.items() if name not in names}
+    rows, own = (
+        [],
+        {name: value for name, value in targets.parameters._asdict().items() if name not in names},
+    )
     for kind, scan in zip(found.kinds, found.scans, strict=True):
         values = {}
         for name in names:
@@ -447,7 +456,42 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
             probability=filled(told.probability, 0),
         )
         outputs.append(Ragged(modes, ends))
-    return outputs
+    of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
+    innovations = _innovations(setup, scans, pair_ends, *of_pairs)
+    return [*outputs, *innovations]
+
+
+def _innovations(
+    setup: Setup,
+    scans: Scans,
+    ends: Integers,
+    pair: Integers,
+    probability: Floats,
+    white: Floats,
+    factor: Floats,
+) -> Iterator[Ragged]:
+    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
+    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
+    track, scan = pair[order, 0], pair[order, 1]
+    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
+    likeliest = np.sort(order[is_first])
+    for sensor, (kind, topic) in enumerate(zip(setup.found.kinds, setup.found.scans, strict=True)):
+        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
+        measured = KINDS[kind].measured
+        size = len(measured)
+        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
+        stream = innovation_stream(
+            f"/estimates/{setup.name}{topic.removesuffix('/scan')}/innovation",
+            scans.time_ns[pair[rows, 1]],
+            measured,
+            "",
+            target_id=pair[rows, 0],
+            accepted=np.ones(len(rows), np.int64),
+            innovation=np.einsum("nij,nj->ni", root, whitened),
+            covariance=root @ root.transpose(0, 2, 1),
+            squared=(whitened**2).sum(axis=1),
+        )
+        yield Ragged(stream, np.searchsorted(rows, ends))
 
 
 def tracker_of(parameters: TrackerParameters, stage: Stage, names: tuple[str, ...]) -> Tracker:
@@ -474,7 +518,11 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     def rewinding(back_ns: int) -> Recursive:
         return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
 
-    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
+    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    if not parameters.smoothed:
+        return [tracking]
+    model = replace(targets.stage.model, motion=targets.stage.motion)
+    return [smoothing_tracks(tracking, model, targets.parameters)]
 
 
 TRACKER = Estimator(

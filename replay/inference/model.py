@@ -37,6 +37,12 @@ class ModelParameters(Parameters):
     gate_reopens_s: PositiveFloat | None = None
     """The gate is open where a sensor's last measurement that was let in is older, so that a filter that
     has lost its way, as in an outage, does not keep out all that would bring it back."""
+    inflate_nis: PositiveFloat | None = None
+    """An innovation with a greater NIS counts with a larger covariance, by which it has this NIS."""
+    student_freedom: PositiveFloat | None = None
+    """Innovations count as if drawn from Student's distribution of so many degrees of freedom."""
+    switch_nis: PositiveFloat | None = None
+    """Above this NIS a measurement is switched off by degrees, as in dynamic covariance scaling."""
     sigma_fix_m: PositiveFloat | None = None
     """Of each component of a position fix that does not state its covariance."""
 
@@ -159,7 +165,8 @@ class Sensor:
             every component is a field of its own.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
-        about: what the message is about.
+        about: what the message is about: a point of a map, or one of each of several maps.
+        is_numbered: whether `about` ends with the numbers of these points.
         control: the model's, which has to be interpolated, where what is measured depends on it:
             `about` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
@@ -180,7 +187,8 @@ class Sensor:
     noises: int = 0
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
-    about: Map | None = None
+    about: Map | tuple[Map, ...] | None = None
+    is_numbered: bool = False
     control: Control | None = None
     read: Callable[[Stream], Floats] | None = None
     delay: str = ""
@@ -190,10 +198,20 @@ class Sensor:
     log_likelihood: Function | None = None
 
     @property
+    def maps(self) -> tuple[Map, ...]:
+        """The maps of the points that a message is about."""
+        return self.about if isinstance(self.about, tuple) else (self.about,) if self.about else ()
+
+    @property
+    def control_start(self) -> int:
+        """How many numbers of `about` come before those of the control: the points' components."""
+        return sum(each.size for each in self.maps)
+
+    @property
     def about_size(self) -> int:
-        """How many numbers `measure` gets as `about`: those of the point, then those of the control."""
+        """How many numbers `measure` gets as `about`: of points, of the control, the points' numbers."""
         controls = len(self.control.components) if self.control else 0
-        return (self.about.size if self.about else 0) + controls
+        return self.control_start + controls + (len(self.maps) if self.is_numbered else 0)
 
 
 @lru_cache(maxsize=64)
@@ -230,9 +248,9 @@ class Start:
             zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
             The state is that at the last of them, and begins just after it: they are used up. For a
             state of which a position tells too little.
-        find: (first messages of a run by the model's names for their topics, parameters) -> `Started`,
-            in place of all that; for a state that is found from several sensors together. Raises
-            BadInput where they do not tell it. Such a model needs a sensor.
+        find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
+            the model's names for their topics, and the maps; for a state that is found from several
+            messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
     """
 
     sigmas: Mapping[str, float]
@@ -329,6 +347,11 @@ class Model:
             return self.sensors
         components = list(self.state)
         return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
+
+    @property
+    def finds_start(self) -> bool:
+        """Whether the model finds where to start itself, see `Start.find`."""
+        return self.start is not None and self.start.find is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -326,7 +326,10 @@ def split_by_mode(
 
 
 def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory) -> int:
-    """Fill the detections of a scan, each chain of those within a distance as their mean."""
+    """Fill the detections of a scan, each chain of those within a distance as their mean.
+
+    Chains are in the order of their first detections.
+    """
     count = end - first
     for each in range(count):
         memory.group[each] = each
@@ -337,10 +340,11 @@ def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory)
                 scans.detection[first + each, 1] - scans.detection[first + other, 1],
             )
             if apart <= within and memory.group[each] != memory.group[other]:
-                old, new = memory.group[each], memory.group[other]
+                first_of_both = min(memory.group[each], memory.group[other])
+                joining = max(memory.group[each], memory.group[other])
                 for member in range(each + 1):
-                    if memory.group[member] == old:
-                        memory.group[member] = new
+                    if memory.group[member] == joining:
+                        memory.group[member] = first_of_both
     joined = 0
     for group in range(count):
         members, x, y = 0, 0.0, 0.0

@@ -24,6 +24,8 @@ from replay.inference.gaussian import (
     no_innovation,
     reduce_covariance,
     whiten,
+    widen,
+    widening,
     wrap,
 )
 from replay.inference.generate import (
@@ -506,7 +508,8 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components.
+    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
+    in may still count less, see `gaussian.widening`.
     """
     m, tell, correct = (
         len(stage.sensors[number].measured),
@@ -538,19 +541,26 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
+        factor = widening(squared, size, parameters)
         if accepted:
+            widen(innovation, size, factor)
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)
             correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, accepted)
+        note_numbers(note, squared, determinant, size, accepted, factor)
         return ALL_WELL
 
     return update
 
 
-def note_numbers(note: Note, squared: float, determinant: float, size: int, accepted: bool) -> None:
-    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is."""
+def note_numbers(
+    note: Note, squared: float, determinant: float, size: int, accepted: bool, factor: float
+) -> None:
+    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
+
+    The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
+    """
     note.numbers[0] = squared
-    likelihood = -0.5 * (squared + determinant + size * LOG_TWO_PI)
+    likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
     note.numbers[1] = likelihood if accepted else 0.0
     note.numbers[2] = 1.0 if accepted else 0.0

@@ -85,6 +85,9 @@ class Told(NamedTuple):
         number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
             `probability` is that of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), how probable.
+        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation, and
+            Cholesky's factor of the innovation covariance; a bearing's stand first. Of several modes
+            they are those of the mode in which the detection is likeliest.
     """
 
     end: Integers
@@ -98,6 +101,8 @@ class Told(NamedTuple):
     existence: Floats
     pair: Integers
     associated: Floats
+    white: Floats
+    factor: Floats
 
 
 class Rows(NamedTuple):
@@ -357,6 +362,12 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     told.pair[run, row, 0] = tracks.number[run, place]
                     told.pair[run, row, 1], told.pair[run, row, 2] = scan, detection
                     told.associated[run, row] = memory.probability[place, 1 + detection]
+                    mode = 0
+                    for other in range(1, modes):
+                        likelihood = memory.likelihood[place, other, detection]
+                        mode = other if likelihood > memory.likelihood[place, mode, detection] else mode
+                    white, factor = memory.white[place, mode, detection], memory.spread[place, mode]
+                    copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
                     told.end[run, 1] = row + 1
 
     def tell_tracks(run: int, scan: int, tracks: Tracks, told: Told, memory: Memory) -> None:
@@ -409,6 +420,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
 BATCH = 1000
+BY_PAIR = ("associated", "white", "factor")
 BY_TRACK = ("number", "mean", "covariance", "probability", "existence")
 
 
@@ -468,6 +480,8 @@ def _no_told(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) 
         existence=np.empty((runs, rows)),
         pair=np.empty((runs, pairs, 3), np.int64),
         associated=np.empty((runs, pairs)),
+        white=np.empty((runs, pairs, 2)),
+        factor=np.empty((runs, pairs, 2, 2)),
     )
 
 
@@ -483,5 +497,5 @@ def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
         **by_scan,
         **by_track,
         pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
-        associated=told.associated[:, :paired][:, is_of_it],
+        **{name: getattr(told, name)[:, :paired][:, is_of_it] for name in BY_PAIR},
     )

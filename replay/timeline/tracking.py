@@ -1,4 +1,4 @@
-"""The timeline of tracks of many things: what each sensor scans, the tracks in colours of their own.
+"""The timeline of tracks of many targets: what each sensor scans, the tracks in colours of their own.
 
 The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
 nothing; bearings are rays from where the sensor is. Beside it are GOSPA, the number of tracks and how
@@ -66,7 +66,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
-    """What moves with a known position: things with a truth, and sensors."""
+    """What moves with a known position: targets with a truth, and sensors."""
     for topic in scene.source.topics.values():
         if topic.schema_name == schemas.TRUTH_STATE.full_name:
             yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)

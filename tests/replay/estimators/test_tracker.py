@@ -114,6 +114,11 @@ def test_an_update_is_that_of_the_formula(uncompiled: None):
     assert told == pytest.approx(existence_after(existence, beta[0], 0.9 * 0.99), rel=1e-12)
     last = found["association"].publish_time_ns == SIMULATION_EPOCH_NS + 8 * SECOND
     assert found["association"]["probability"][last] == pytest.approx(beta[1:], rel=1e-9)
+    likeliest = int(beta[1:].argmax())
+    told = found["innovation"].take(slice(-1, None))
+    np.testing.assert_allclose(told["innovation"], [innovation[likeliest]], rtol=1e-9)
+    np.testing.assert_allclose(told["covariance"], spread.reshape(1, 4), rtol=1e-9)
+    assert told["normalised_innovation_squared"] == pytest.approx(squared[likeliest], rel=1e-9)
 
 
 def test_tracks_begin_and_end_by_their_existence(uncompiled: None):
@@ -569,10 +574,10 @@ def test_the_sheets_reference_trackers(autoferry: Path):
     assert mean["gospa_m"] < 9.16
     theirs = [5.86, 11.30, 10.28, 8.70, 5.56, 13.28]
     assert all(each["gospa_m"] < one + 0.2 for each, one in zip(figures, theirs, strict=True))
-    assert mean["thing1_rmse_m"] == pytest.approx(4.89, abs=0.7)
-    assert mean["thing2_rmse_m"] == pytest.approx(3.92, abs=0.7)
-    assert mean["thing1_coverage"] == pytest.approx(0.92, abs=0.02)
-    assert mean["thing2_coverage"] == pytest.approx(0.81, abs=0.02)
+    assert mean["target1_rmse_m"] == pytest.approx(4.89, abs=0.7)
+    assert mean["target2_rmse_m"] == pytest.approx(3.92, abs=0.7)
+    assert mean["target1_coverage"] == pytest.approx(0.92, abs=0.02)
+    assert mean["target2_coverage"] == pytest.approx(0.81, abs=0.02)
     rewound = replay_late(sources[5], "rewind:1", sensors=["radar", "lidar"])
     assert len(rewound["rewound"]) == 5
     last = outputs[f"/estimates/{label}/track"].of_run(5)["mean"][-1]
