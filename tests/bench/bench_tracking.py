@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.ensemble import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.blocks import Block, gather, merge_events
 from replay.engine.sources import MemorySource
@@ -61,7 +62,27 @@ def main() -> list[Row]:
     return [
         ("JPDA tracker, us per scan", ours_us, theirs_us, theirs_us / ours_us),
         ("largest difference of a marginal", 0.0, 0.0, apart),
+        pmbm_in_time(),
     ]
+
+
+def pmbm_in_time() -> Row:
+    """How long PMBM takes for a scan of 20 targets and 30 false detections, and has at 10 Hz.
+
+    Scans are a second apart, so that gates are wider than at 10 Hz.
+    """
+    scene = simulate(0, things=20, scans=100, clutter=30.0)
+    log = source(scene, clutter=30.0)
+    settings = {"sigma_m": VARIANCE_M2**0.5, "acceleration_density": 0.04, "most_tracks": 300}
+    settings |= {"undetected_per_m2": 20 / FIELD_M**2 / len(scene.scans), "same_within_m": 0.0}
+    times = []
+    for _ in range(1 + REPEATS):
+        begin = perf_counter()
+        outputs = replay_in_memory([log], {"tracker:pmbm": settings})
+        times.append(perf_counter() - begin)
+    assert not len(outputs["/estimates/tracker:pmbm/unused"])
+    seconds = median(times[1:]) / len(scene.scans)
+    return "PMBM, ms per scan and from scan to scan at 10 Hz", 1e3 * seconds, 100.0, 0.1 / seconds
 
 
 def run_ours(scene: Scene, log: MemorySource) -> Tracked:
