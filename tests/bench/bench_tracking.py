@@ -89,16 +89,16 @@ def run_ours(scene: Scene, log: MemorySource) -> Tracked:
     """Our tracker on a scene."""
     found = find_sensors(log.topics, ())
     targets = targets_of("bench", PARAMETERS, [log.topics[scan] for scan in found.scans])
-    names, settings = settings_of(log.topics, found, PARAMETERS, targets)
+    settings = settings_of(log.topics, found, PARAMETERS, targets)
     streams = {topic: gather([log.streams[topic]]) for topic in (*found.scans, *found.detections)}
     scans = scans_of(Block(streams, merge_events(streams, "publish_time")), found, KINDS, {})
-    tracker = tracker_of(PARAMETERS, targets.stage, names)
+    tracker = tracker_of(PARAMETERS, targets, settings)
     tracks = begun(scene.states[0])
-    _, said = track_scans(tracker, scans, settings, targets.newborn, tracks)
+    _, said = track_scans(tracker, scans, settings.numbers, targets.newborn, tracks)
     times = []
     for _ in range(REPEATS):
         begin = perf_counter()
-        track_scans(tracker, scans, settings, targets.newborn, tracks)
+        track_scans(tracker, scans, settings.numbers, targets.newborn, tracks)
         times.append(perf_counter() - begin)
     return Tracked(marginals_of(scans, said, len(scene.states[0])), median(times) / len(scans.time_ns))
 
@@ -106,7 +106,7 @@ def run_ours(scene: Scene, log: MemorySource) -> Tracked:
 def begun(states: np.ndarray) -> Tracks:
     """Confirmed tracks with these states (things, 4)."""
     count = len(states)
-    tracks = no_tracks(1, count, (1, 4, 4), 1)
+    tracks = no_tracks(1, count, (1, 4, 4), 1, np.empty((0, 0)))
     tracks.used[:] = tracks.met[:] = count
     tracks.time_ns[:] = tracks.seen_ns[:] = SIMULATION_EPOCH_NS
     tracks.number[0] = np.arange(count)
