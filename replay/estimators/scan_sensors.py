@@ -183,6 +183,7 @@ RANGES_BEARINGS = ScanSensor(
     polar_birth,
 )
 KINDS = (PLACES, BEARINGS, RANGES_BEARINGS)
+SEEN = {(kind.leaf, kind.schema.full_name) for kind in KINDS}  # of topics with detections
 # What a channel need not state, by kind: none of what it does not say is there.
 UNSTATED: dict[str, float] = {
     "sigma_across_rad": 0.0,

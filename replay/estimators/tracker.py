@@ -34,7 +34,7 @@ from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
 from replay.engine.results import innovation_stream, named
-from replay.estimators.scan_sensors import FOREIGN, KINDS, UNSTATED
+from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.estimators.sensor_errors import BY_SORT, Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
@@ -170,6 +170,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
     rows = []
+    _check_scans(topics, wanted)
     for scan in topics.values():
         prefix, _, leaf = scan.name.rpartition("/")
         if leaf != "scan" or scan.schema_name != schemas.SCAN.full_name:
@@ -198,6 +199,18 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
             "sensor of places, or of ranges with bearings, with them"
         )
     return found
+
+
+def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
+    """Raise BadInput where detections are of scans that nobody recorded."""
+    for seen in topics.values():
+        prefix, _, leaf = seen.name.rpartition("/")
+        is_wanted = not wanted or prefix.strip("/") in wanted
+        if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
+            raise BadInput(
+                f"topic {seen.name}: detections without scans; record {prefix}/scan "
+                f"({schemas.SCAN.full_name}), which says how many each scan has, also where that is none"
+            )
 
 
 class Settings(NamedTuple):
