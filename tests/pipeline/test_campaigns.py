@@ -398,8 +398,13 @@ def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
 
 @pytest.mark.paper
 def test_dask_workers_give_the_same_bytes(tmp_path):
-    pytest.importorskip("distributed")
+    """Of a cluster of its own, and of one that is there, whose workers share no files with it."""
+    distributed = pytest.importorskip("distributed")
     place = tmp_path / "result"
     files = run(place)
     shutil.rmtree(place)
     assert run(place, crew_of(None, "local:2", RUNS)) == files
+    shutil.rmtree(place)
+    loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **loopback) as cluster:
+        assert run(place, crew_of(None, cluster.scheduler_address, RUNS)) == files
