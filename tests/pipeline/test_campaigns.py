@@ -331,7 +331,10 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     assert main([*begin, "--workers", "0"]) == 2
     capsys.readouterr()
     assert main(["run", "ispace", "--workers", "2", *out]) == 2
-    assert "networks, does more than judge; leave out --workers" in capsys.readouterr().err
+    assert (
+        "networks, replays all runs together, in one process; leave out --workers"
+        in capsys.readouterr().err
+    )
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
     assert "give local:N with a number of workers" in capsys.readouterr().err
