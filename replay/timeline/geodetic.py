@@ -59,8 +59,9 @@ def draw_way(canvas: Canvas, entity: str, degrees: Floats, colour: Colour) -> No
 def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
     """Colours (n, 3) of fixes with covariances (n, d * d), by their mean standard deviation."""
     size = round(covariance_m2.shape[1] ** 0.5)
-    variances = covariance_m2.reshape(-1, size, size).diagonal(axis1=1, axis2=2)
-    sigma_m = np.sqrt(variances.mean(axis=1)) if size else np.full(len(covariance_m2), np.nan)
+    sigma_m = np.full(len(covariance_m2), np.nan)
+    if size:  # fixes may come without
+        sigma_m = np.sqrt(covariance_m2[:, :: size + 1].mean(axis=1))
     limits = [limit for limit, _ in QUALITIES]
     colours = np.array([*(colour for _, colour in QUALITIES), POOR, unknown], np.uint8)
     # what is not known comes after all numbers
