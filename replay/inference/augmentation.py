@@ -3,13 +3,17 @@
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
 has the parameter's value for a mean, and stands beside the log's; between measurements it is a random
-walk. Methods see a model as any other.
+walk, or a first-order Gauss-Markov process that comes back to that mean. In the same way the state gets
+the error of what is measured about each point of a map: noise that is not white, as of ranges to an
+anchor. Methods see a model as any other. Bar-Shalom, Li and Kirubarajan, 2001, section 8.2.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, KeysView, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, create_model
@@ -19,38 +23,97 @@ from replay.engine.arrays import Floats, Function
 from replay.engine.blocks import Ragged
 from replay.engine.priors import gaussians
 from replay.engine.results import gaussian_stream
+from replay.engine.tangent import Kind
 from replay.inference.binding import Recorder, number_fields, settings_type
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, ModelParameters, Motion, Sensor, trial_state
 from replay.inference.steps import Stage
 
+ERROR = "error_"
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]
 
 
-def estimated(label: str, model: Model, parameters: Any) -> Names:
-    """The parameters that are to be estimated, as the settings say.
+class Walk(NamedTuple):
+    """What is known of something in the state: a random walk, or one that comes back to its mean.
+
+    Attributes:
+        sigma: its standard deviation at first.
+        drift: the density of its walk, per square root of a second.
+        time_s: how fast it comes back, with noise that keeps up its sigma; infinite for never.
+    """
+
+    sigma: float
+    drift: float
+    time_s: float
+
+
+def estimated(label: str, model: Model, parameters: Any) -> dict[str, Walk]:
+    """What is to be estimated beside the state, by the names of its components, as the settings say.
 
     Raises BadInput where the model does not let one of them, one stands twice, or has no sigma.
     """
-    names: Names = tuple(parameters.estimate or ())
-    sigmas, drifts = parameters.estimate_sigma or {}, parameters.estimate_drift or {}
-    for number, name in enumerate(names):
-        where = f"estimator {label}: estimate = {name}"
-        if name not in model.estimable:
-            known = choices(name, model.estimable)
-            raise BadInput(f"{where}: is no parameter that this model lets be estimated; {known}")
-        if name in names[:number]:
+    asked = parameters.estimate or []
+    options = {
+        "estimate_sigma": parameters.estimate_sigma or {},
+        "estimate_drift": parameters.estimate_drift or {},
+        "estimate_time_s": parameters.estimate_time_s or {},
+    }
+    found: dict[str, Walk] = {}
+    for asks in asked:
+        where = f"estimator {label}: estimate = {asks}"
+        names = _components(where, model, asks)
+        if not names.isdisjoint(found):
             raise BadInput(f"{where}: stands there twice; name it once")
-        if name not in sigmas:
+        sigma, drift, time_s = (given.get(asks) for given in options.values())
+        if sigma is None:
             raise BadInput(
                 f"{where}: how well is it known beforehand? give its standard deviation, "
-                f"estimate_sigma.{name}=..."
+                f"estimate_sigma.{asks}=..."
             )
-    for option, given in (("estimate_sigma", sigmas), ("estimate_drift", drifts)):
-        for name in given.keys() - set(names):
+        if time_s is not None and any(_kind(model, name) != "linear" for name in names):
+            raise BadInput(
+                f"{where}: is an angle, which has no mean to come back to; leave out "
+                f"estimate_time_s.{asks}, and give estimate_drift.{asks} instead"
+            )
+        found |= dict.fromkeys(names, Walk(sigma, drift or 0.0, time_s or np.inf))
+    for option, given in options.items():
+        for name in given.keys() - set(asked):
             raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
-    return names
+    return found
+
+
+def _components(where: str, model: Model, asks: str) -> KeysView[str]:
+    """The components of the state for an entry of `estimate`: a parameter, or errors by number.
+
+    `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
+    about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
+    """
+    errors = re.fullmatch(r"(\w+)\[([\d:, ]+)\]", asks)
+    if errors is None:
+        if asks not in model.estimable:
+            known = choices(asks, model.estimable)
+            raise BadInput(f"{where}: is no parameter that this model lets be estimated; {known}")
+        return dict.fromkeys([asks]).keys()
+    measured, numbers = errors.groups()
+    maps = max((len(each.maps) for each in model.sensors if measured in each.measured), default=0)
+    spans = [re.fullmatch(r" *(\d+)(?::(\d+))? *", each) for each in numbers.split(",")]
+    ranges = [
+        range(int(each[1]), int(each[2] or int(each[1]) + 1)) for each in spans if each is not None
+    ]
+    if len(spans) > maps or len(ranges) < len(spans) or not all(ranges):
+        raise BadInput(
+            f"{where}: expected NUMBER or FIRST:END in the brackets, with a comma before those of a "
+            f"second map; {measured} is measured about the points of {maps} maps in this model"
+        )
+    entries = ("_".join(map(str, pair)) for pair in product(*ranges))
+    return dict.fromkeys(f"{ERROR}{measured}_{each}" for each in entries).keys()
+
+
+def _error_of(name: str) -> tuple[str, tuple[int, ...]]:
+    """What is measured, and about which points, of a component that is its error; "" of any other."""
+    found = re.fullmatch(rf"{ERROR}(.+?)((?:_\d+)+)", name)
+    return (found[1], tuple(map(int, found[2].split("_")[1:]))) if found else ("", ())
 
 
 def augmented(model: Model, names: Names) -> Model:
@@ -73,14 +136,14 @@ def augmented_stage(stage: Stage, names: Names) -> Stage:
     return Stage(augmented(model, names), motion, tuple(sensors), tuple(modes))
 
 
-def with_drifts(settings: Floats, names: Names, parameters: Any) -> Floats:
-    """Numbers of motion and sensors with the drifts that an augmented model has beside them."""
-    drifts = [(parameters.estimate_drift or {}).get(name, 0.0) for name in names]
-    return np.concatenate([settings, np.tile(drifts, (len(settings), 1))], axis=1)
+def with_walks(settings: Floats, walks: Mapping[str, Walk]) -> Floats:
+    """Numbers of motion and sensors with those that an augmented model has beside them."""
+    numbers = np.array([number for walk in walks.values() for number in walk])
+    return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
 
 def begin(
-    label: str, topic: str, stage: Stage, names: Names, settings: Floats, parameters: Any
+    label: str, topic: str, stage: Stage, walks: Mapping[str, Walk], settings: Floats
 ) -> Callable[[Start], Start]:
     """What makes of the start of an augmented model's filter one from the log's own prior on `topic`.
 
@@ -88,15 +151,15 @@ def begin(
     estimated has no value.
     """
     fields = number_fields(stage.model.parameters)
-    means = np.array([settings[0, fields.index(name)] for name in names])
-    for name, mean in zip(names, means, strict=True):
+    means = np.array([settings[0, fields.index(name)] if name in fields else 0.0 for name in walks])
+    for name, mean in zip(walks, means, strict=True):
         if not np.isfinite(mean):
             raise BadInput(f"estimator {label}: estimate = {name}: give its likely value, {name}=...")
-    variances = np.array([parameters.estimate_sigma[name] ** 2 for name in names])
+    variances = np.array([walk.sigma**2 for walk in walks.values()])
 
     def extended(prior: Ragged) -> Ragged:
         time_ns, mean, covariance = gaussians(prior)
-        runs, t, k = len(mean), covariance.shape[1], len(names)
+        runs, t, k = len(mean), covariance.shape[1], len(walks)
         wider = np.zeros((runs, t + k, t + k))
         wider[:, :t, :t] = covariance
         wider[:, range(t, t + k), range(t, t + k)] = variances
@@ -104,23 +167,25 @@ def begin(
         return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
 
     def begun(start: Start) -> Start:
-        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if names else start
+        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if walks else start
 
     return begun
 
 
 @lru_cache(maxsize=64)
 def _augmented(model: Model, names: Names) -> Model:
-    drifts: dict[str, Any] = {_drift(name): (NonNegativeFloat, 0.0) for name in names}
+    walks: dict[str, Any] = {
+        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in Walk._fields
+    }
     parameters: type[ModelParameters] = create_model(
-        f"{model.parameters.__name__}Augmented", __base__=model.parameters, **drifts
+        f"{model.parameters.__name__}Augmented", __base__=model.parameters, **walks
     )
     modes = model.modes and {
         name: _augmented_motion(model, motion, names) for name, motion in model.modes.items()
     }
     return replace(
         model,
-        state={**model.state, **{name: model.estimable[name] for name in names}},
+        state={**model.state, **{name: _kind(model, name) for name in names}},
         parameters=parameters,
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
@@ -129,16 +194,20 @@ def _augmented(model: Model, names: Names) -> Model:
     )
 
 
-def _drift(name: str) -> str:
-    return f"drift_{name}"
+def _kind(model: Model, name: str) -> Kind:
+    """The kind of a component: the parameter's, or that of what it is the error of."""
+    measured, _ = _error_of(name)
+    if not measured:
+        return model.estimable[name]
+    return next(each.measured[measured] for each in model.sensors if measured in each.measured)
 
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """The motion, in which the parameters stay what they are but for their drift."""
+    """The motion, in which the parameters walk about or come back to what they were given as."""
     n, t = model.size, model.tangent
-    stay = [f"state[{n + index}]" for index in range(len(names))]
-    drifts = [f"parameters.{_drift(name)} ** 2 * duration_s" for name in names]
+    stay = [_stay(model, name, f"state[{n + index}]") for index, name in enumerate(names)]
+    drifts = [_spread(model, name) for name in names]
     given = motion.noise or _no_noise(t)
     state, recorder = trial_state(model.kinds), _recorder(model)
     variances = _entries(len(given(state, 1.0, recorder)))
@@ -154,8 +223,17 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     recorder = _recorder(model)
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, recorder)
+    lost = motion.lost and _reading(
+        model,
+        names,
+        motion.lost,
+        "state, duration_s",
+        "first(state), duration_s",
+        [*_entries(t), *drifts],
+    )
     return replace(
         motion,
+        lost=lost,
         move=_reading(
             model,
             names,
@@ -173,6 +251,24 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     )
 
 
+def _stay(model: Model, name: str, state: str) -> str:
+    """A component of this name after a step; an angle has no mean to come back to."""
+    if _kind(model, name) == "angle":
+        return state
+    mean = f"parameters.{name}" if name in number_fields(model.parameters) else "0.0"
+    kept = f"np.exp(-duration_s / parameters.time_s_{name})"
+    return f"{kept} * {state} + (1.0 - {kept}) * {mean}"
+
+
+def _spread(model: Model, name: str) -> str:
+    """The variance that a step adds to it."""
+    walk = f"parameters.drift_{name} ** 2 * duration_s"
+    if _kind(model, name) == "angle":
+        return walk
+    lost = f"1.0 - np.exp(-2.0 * duration_s / parameters.time_s_{name})"
+    return f"{walk} + ({lost}) * parameters.sigma_{name} ** 2"
+
+
 @lru_cache(maxsize=256)
 def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     arguments, passed = "state", "first(state)"
@@ -181,19 +277,38 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     recorder, about = _recorder(model), (1.0,) * sensor.about_size
     sensor.measure(trial_state(model.kinds), *entering, about, recorder)
-    measured = _entries(len(sensor.measured))
-    measure = _reading(model, names, sensor.measure, f"{arguments}, about", f"{passed}, about", measured)
-    log_likelihood = sensor.log_likelihood and _reading(
+    numbered = [_error_of(name) for name in names]
+    is_numbered = any(measured in sensor.measured for measured, _ in numbered)
+    measured, first_number = _entries(len(sensor.measured)), sensor.about_size
+    for index, (component, numbers) in enumerate(numbered):
+        if component in sensor.measured:
+            same = [f"(about[{first_number + k}] == {number})" for k, number in enumerate(numbers)]
+            place = list(sensor.measured).index(component)
+            measured[place] += f" + 1.0 * {' * '.join(same)} * state[{model.size + index}]"
+    passed_about = "own_about(about)" if is_numbered else "about"
+    measure = _reading(
         model,
         names,
-        sensor.log_likelihood,
-        "state, measured, about",
-        "first(state), measured, about",
-        None,
+        sensor.measure,
+        f"{arguments}, about",
+        f"{passed}, {passed_about}",
+        measured,
+        own_about=tuple_of(sensor.about_size),
     )
+    log_likelihood = None  # one that the model states knows of no errors beside it
+    if sensor.log_likelihood is not None and not is_numbered:
+        log_likelihood = _reading(
+            model,
+            names,
+            sensor.log_likelihood,
+            "state, measured, about",
+            "first(state), measured, about",
+            None,
+        )
     return replace(
         sensor,
         measure=measure,
+        is_numbered=is_numbered,
         log_likelihood=log_likelihood,
         linear=sensor.linear and not recorder.read & set(names),
         jacobian=None,
@@ -229,7 +344,7 @@ def _reading(
 @lru_cache(maxsize=64)
 def _own_parameters(fields: Names, names: Names, size: int) -> Function:
     """`own(state, parameters)`: a model's parameters, the estimated ones from the augmented state."""
-    places = {name: f"state[{size + index}]" for index, name in enumerate(names)}
+    places = {name: f"state[{size + index}]" for index, name in enumerate(names) if name in fields}
     values = ", ".join(places.get(field, f"parameters.{field}") for field in fields)
     text = f"def own(state, parameters):\n    return Settings({values})\n"
     return function_of(text, Settings=settings_type(fields))

@@ -24,6 +24,8 @@ from replay.inference.gaussian import (
     no_innovation,
     reduce_covariance,
     whiten,
+    widen,
+    widening,
     wrap,
 )
 from replay.inference.generate import (
@@ -47,7 +49,7 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
-NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
+NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Stage(NamedTuple):
@@ -81,6 +83,7 @@ class Steps(NamedTuple):
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
+        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -88,6 +91,7 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
+    resumes: bool = False
 
 
 class Note(NamedTuple):
@@ -168,6 +172,9 @@ def gaussian_filter(
     `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
     one run's mean and covariance.
     """
+    lost = stage.motion.lost
+    if lost is not None:
+        predict = _predicting_lost(stage.model, lost, predict)
 
     def predict_run(
         run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
@@ -185,7 +192,32 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
+        resumes=lost is not None,
     )
+
+
+def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
+    """The prediction, which stays where it is and knows less where the control is NaN."""
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        if not np.isnan(control[0]):
+            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+        for row in range(t):
+            for column in range(t):
+                work.product[row, column] = covariance[row, column]
+        add(covariance, lost(read_state(mean), duration_s, parameters))
+        return True
+
+    return predict
 
 
 def _of_run(update: Function) -> Function:
@@ -506,7 +538,8 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components.
+    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
+    in may still count less, see `gaussian.widening`.
     """
     m, tell, correct = (
         len(stage.sensors[number].measured),
@@ -538,19 +571,26 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
+        factor = widening(squared, size, parameters)
         if accepted:
+            widen(innovation, size, factor)
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)
             correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, accepted)
+        note_numbers(note, squared, determinant, size, accepted, factor)
         return ALL_WELL
 
     return update
 
 
-def note_numbers(note: Note, squared: float, determinant: float, size: int, accepted: bool) -> None:
-    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is."""
+def note_numbers(
+    note: Note, squared: float, determinant: float, size: int, accepted: bool, factor: float
+) -> None:
+    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
+
+    The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
+    """
     note.numbers[0] = squared
-    likelihood = -0.5 * (squared + determinant + size * LOG_TWO_PI)
+    likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
     note.numbers[1] = likelihood if accepted else 0.0
     note.numbers[2] = 1.0 if accepted else 0.0
