@@ -145,6 +145,15 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=60.0),
+    "uwb-outdoor": Recipe("uwb-outdoor", part="uwb_outdoor/LOS/Trajectory_B/Case_3", span_s=20.0),
+    "uwb-pose": Recipe(
+        "uwb-pose",
+        estimators={"ekf": load_experiment("uwb-pose", {}, {})[1].estimators["ekf"]},
+        alone=True,
+        part="uwb_lias",
+        span_s=5.0,
+    ),
+    "warehouse-uwb": Recipe("warehouse-uwb", parameters={"duration_s": 5.0}),
     "torus-filter-noise-03": Recipe("torus-filter", parameters=TORUS["noise-03"]),
     "torus-filter-strong-coupling": Recipe("torus-filter", parameters=TORUS["strong-coupling"]),
     "torus-propagation": Recipe(
