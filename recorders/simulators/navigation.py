@@ -345,7 +345,10 @@ def _within(times_s: Floats, spans_s: list[Span]) -> NDArray[np.bool_]:
 def _prior(
     parameters: NavigationParameters, truth: Floats, metadata: dict[str, str], rng: np.random.Generator
 ) -> Stream:
-    """The first Gaussian: the truth with an error, which in orientation is a turn of the body."""
+    """The first Gaussian: the truth with an error; in orientation a turn about up, and a tilt.
+
+    The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
+    """
     told, unit = parameters.prior, parameters.unit
     sigma = np.repeat(
         [
@@ -361,16 +364,23 @@ def _prior(
     error = sigma * rng.normal(size=15)
     mean = truth.copy()
     mean[:6] += error[:6]
-    turned = Rotation.from_quat(truth[6:10], scalar_first=True) * Rotation.from_rotvec(error[6:9])
-    mean[6:10] = turned.as_quat(canonical=True, scalar_first=True)
+    tilt = Rotation.from_rotvec([error[6], error[7], 0.0])
+    turned = Rotation.from_rotvec([0.0, 0.0, error[8]]) * Rotation.from_quat(
+        truth[6:10], scalar_first=True
+    )
+    mean[6:10] = (turned * tilt).as_quat(canonical=True, scalar_first=True)
     mean[10:] = 0.0  # the biases are drawn about zero
+    covariance = np.diag(sigma**2)
+    up = (turned * tilt).inv().apply([0.0, 0.0, 1.0])
+    level = told.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
+    covariance[6:9, 6:9] = level + told.heading_sigma_rad**2 * np.outer(up, up)
     return make_stream(
         "/body/prior",
         schemas.GAUSSIAN_ESTIMATE,
         simulation_stamps_ns([0.0]),
         metadata=metadata | _origin(parameters),
         mean=mean[None],
-        covariance=np.diag(sigma**2).reshape(1, -1),
+        covariance=covariance.reshape(1, -1),
     )
 
 

@@ -154,6 +154,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
         span_s=5.0,
     ),
     "warehouse-uwb": Recipe("warehouse-uwb", parameters={"duration_s": 5.0}),
+    "tuning-mrclam": Recipe("tuning-mrclam", span_s=60.0),
     "torus-filter-noise-03": Recipe("torus-filter", parameters=TORUS["noise-03"]),
     "torus-filter-strong-coupling": Recipe("torus-filter", parameters=TORUS["strong-coupling"]),
     "torus-propagation": Recipe(

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -16,9 +17,11 @@ import pytest
 from pipeline import campaigns
 from pipeline.command_line import main
 from pipeline.executors import Here, Team, crew_of, version_of_code
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.kept import kept_cells
 from recorders.errors import BadInput
+from recorders.log import write_log
+from recorders.recording import record_run
 from replay.judging.sums import BinnedSums
 
 # Three cells, of which the last is small.
@@ -195,11 +198,81 @@ class Dying(Here):
         return super().submit(work, *args, **kwargs)
 
 
+def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
+    """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
+    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    drives, place = tmp_path / "drives", tmp_path / "result"
+    drives.mkdir()
+    logs = [drives / f"{seed}.mcap" for seed in (1, 2)]
+    for seed, log in enumerate(logs):
+        recording, run = record_run("landmarks", {"duration_s": 3.0}, seed)
+        write_log(log, recording.streams, run)
+
+    def replayed(crew=None) -> dict[str, bytes]:
+        experiment = experiment_of_logs(logs, ["ekf"]).with_settings({}, {})
+        run_experiment("drives", experiment, place, logs=1, errors=True, crew=crew)
+        names = sorted(path for path in place.rglob("*") if path.is_file() and path.suffix != ".rrd")
+        return {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
+
+    files = replayed()
+    shutil.rmtree(place)
+    hidden = [drives, unfinished(place)]
+    asked: list[list[Path]] = []
+
+    def sees(files) -> bool:
+        asked.append(list(files))
+        return False
+
+    @contextmanager
+    def elsewhere():
+        yield Team(Elsewhere(hidden), 1, sees)
+
+    assert replayed(elsewhere) == files
+    assert "estimates/run-0000.mcap" in files
+    assert asked == [logs]
+    logs[1].write_bytes(logs[1].read_bytes()[:-100])
+    with pytest.raises(BadInput, match=f"^{re.escape(str(logs[1]))}: .*--recover"):
+        replayed(elsewhere)
+
+
+class Elsewhere(Here):
+    """Works as another machine would, where some folders are not."""
+
+    def __init__(self, hidden: list[Path]) -> None:
+        self.hidden = hidden
+
+    def submit(self, work, /, *args):
+        """What comes back and forth is pickled."""
+        for folder in self.hidden:
+            folder.rename(folder.with_suffix(".away"))
+        try:
+            done = super().submit(pickle.loads(pickle.dumps(work)), *args)
+        finally:
+            for folder in self.hidden:
+                folder.with_suffix(".away").rename(folder)
+        return done
+
+
 def test_a_campaign_without_logs_has_its_timeline(tmp_path):
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": 130})
     run_experiment(name, experiment, tmp_path / "result", logs=0)
     assert (tmp_path / "result" / "timeline.rrd").is_file()
     assert not (tmp_path / "result" / "logs").exists()
+
+
+def test_progress_tells_how_many_runs_how_fast_and_who_works(tmp_path):
+    said: list[tuple[str, int]] = []
+
+    def progress(items, title, total):
+        for item in items:
+            yield item
+            said.append((str(title), total))
+
+    run(tmp_path / "result", runs=130, progress=progress)
+    told = [each for each in said if each[0].startswith("replaying: ")]
+    assert [total for _, total in told] == [2, 2]
+    for done, (text, _) in zip((128, 130), told, strict=True):
+        assert re.fullmatch(rf"replaying: {done} of 130 runs, [1-9]\d* runs/s, 1 worker; cells", text)
 
 
 def test_what_is_not_ours_stays(tmp_path):
