@@ -248,6 +248,13 @@ SCAN_BEARING = _declare(
     _identifier("scan_id"),
     _real("bearing_rad"),
 )
+SCAN_RANGE_BEARING = _declare(
+    "ScanRangeBearing",
+    "One distance and angle of an unordered scan, in the sensor's frame, as those of a radar.",
+    _identifier("scan_id"),
+    _real("range_m"),
+    _real("bearing_rad"),
+)
 SCAN = _declare(
     "Scan",
     "One sweep of a sensor and how many detections it has; none is information too.",
@@ -383,6 +390,12 @@ STARTED = _declare(
     "Started",
     "The estimator assumed something that the log does not say, such as where to begin; the channel's "
     "metadata lists what by number, as JSON.",
+    _identifier("reason"),
+)
+DIAGNOSED = _declare(
+    "Diagnosed",
+    "A diagnosis found that something is wrong from here on; the channel's metadata says what,"
+    " by number, as JSON.",
     _identifier("reason"),
 )
 REWOUND = _declare(

@@ -13,7 +13,7 @@ from recorders.log import Stream
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged
 from replay.engine.measurements import PLANE, read_vectors
-from replay.inference.tracking import Scans, ScanSensor
+from replay.inference.scanning import Scans, ScanSensor
 
 ORIGIN = "origin"
 
@@ -99,9 +99,12 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
 
 def _measured(stream: Stream, kind: ScanSensor) -> Floats:
     """The detections (n, 2); a bearing stands first."""
-    if kind.field == "position_m":
-        return read_vectors(stream, kind.field, PLANE)
-    return np.stack([stream[kind.field], np.zeros(len(stream))], axis=1)
+    if kind.fields == ("position_m",):
+        return read_vectors(stream, "position_m", PLANE)
+    measured = np.zeros((len(stream), 2))
+    for component, field in enumerate(kind.fields):
+        measured[:, component] = stream[field]
+    return measured
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:

@@ -119,7 +119,7 @@ class Beginning:
     ) -> tuple[Ragged, list["_Fact"]]:
         """The priors of all runs, and what is to be told of them."""
         model, runs = self.stage.model, _runs(first)
-        mean, sigma = _unknown(model.state, model.start)
+        mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
         if model.finds_start:
@@ -225,7 +225,7 @@ class Beginning:
     def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
         """The mean and the much wider sigmas of a state that one message tells of."""
         model, sensor = self.stage.model, self.stage.sensors[number]
-        mean, sigma = _unknown(model.state, model.start)
+        mean, sigma = unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
@@ -355,16 +355,16 @@ def _runs(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
-def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
     """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
-    assert start is not None
+    sigmas = start.sigmas if start else {}
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
     for kind, columns in things(kinds):
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([start.sigmas.get(name, np.nan) for name in names])
+    return mean, np.array([sigmas.get(name, np.nan) for name in names])
 
 
 def _first_of(

@@ -14,15 +14,13 @@ import numpy as np
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.blocks import Block, gather, merge_events
 from replay.engine.sources import MemorySource
+from replay.estimators.scan_sensors import KINDS
 from replay.estimators.scans import scans_of
-from replay.estimators.tracker import (
-    KINDS,
-    TARGET,
-    TrackerParameters,
-    find_sensors,
-    settings_of,
-)
-from replay.inference.tracking import Scans, Tracker, Tracks, no_tracks, track_scans
+from replay.estimators.targets import targets_of
+from replay.estimators.tracker import TrackerParameters, find_sensors, settings_of, tracker_of
+from replay.inference.scanning import Scans
+from replay.inference.tracking import track_scans
+from replay.inference.tracks import Tracks, no_tracks
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS, REPEATS = 3, 5
@@ -69,16 +67,17 @@ def main() -> list[Row]:
 def run_ours(scene: Scene, log: MemorySource) -> Tracked:
     """Our tracker on a scene."""
     found = find_sensors(log.topics, ())
-    names, settings = settings_of(log.topics, found, PARAMETERS)
+    targets = targets_of("bench", PARAMETERS, [log.topics[scan] for scan in found.scans])
+    names, settings = settings_of(log.topics, found, PARAMETERS, targets)
     streams = {topic: gather([log.streams[topic]]) for topic in (*found.scans, *found.detections)}
     scans = scans_of(Block(streams, merge_events(streams, "publish_time")), found, KINDS, {})
-    tracker = Tracker(TARGET, KINDS, "jpda", names)
+    tracker = tracker_of(PARAMETERS, targets.stage, names)
     tracks = begun(scene.states[0])
-    _, said = track_scans(tracker, scans, settings, tracks)
+    _, said = track_scans(tracker, scans, settings, targets.newborn, tracks)
     times = []
     for _ in range(REPEATS):
         begin = perf_counter()
-        track_scans(tracker, scans, settings, tracks)
+        track_scans(tracker, scans, settings, targets.newborn, tracks)
         times.append(perf_counter() - begin)
     return Tracked(marginals_of(scans, said, len(scene.states[0])), median(times) / len(scans.time_ns))
 
@@ -86,11 +85,11 @@ def run_ours(scene: Scene, log: MemorySource) -> Tracked:
 def begun(states: np.ndarray) -> Tracks:
     """Confirmed tracks with these states (things, 4)."""
     count = len(states)
-    tracks = no_tracks(1, count, 4, 1)
+    tracks = no_tracks(1, count, (1, 4, 4), 1)
     tracks.used[:] = tracks.met[:] = count
     tracks.time_ns[:] = tracks.seen_ns[:] = SIMULATION_EPOCH_NS
     tracks.number[0] = np.arange(count)
-    tracks.mean[0], tracks.covariance[0] = states, COVARIANCE
+    tracks.mean[0, :, 0], tracks.covariance[0, :, 0] = states, COVARIANCE
     tracks.existence[:], tracks.is_confirmed[:] = 1.0, True
     return tracks
 
@@ -101,7 +100,7 @@ def marginals_of(scans: Scans, said: list[Any], tracks: int) -> list[np.ndarray]
     paired = int(told.end[0, 1])
     counts = scans.end - scans.first
     found = [np.zeros((tracks, 1 + count)) for count in counts]
-    pairs = zip(told.pair[0, :paired], told.probability[0, :paired], strict=True)
+    pairs = zip(told.pair[0, :paired], told.associated[0, :paired], strict=True)
     for (track, scan, detection), probability in pairs:
         found[scan][track, 1 + detection] = probability
     for each in found:

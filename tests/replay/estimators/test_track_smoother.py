@@ -7,25 +7,11 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.estimators.tracker import acceleration_noise, move
-from replay.inference.model import Model, ModelParameters, Motion
+from replay.estimators.targets import TARGET
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, replay, replay_late, sensor
 from tests.replay.inference.replays import outputs
 
-
-class Accelerated(ModelParameters):
-    """What the tracker's motion reads."""
-
-    acceleration_density: float = 0.1
-
-
-TARGET = Model(
-    "the tracker's target",
-    dict.fromkeys(PLANE_MOTION, "linear"),
-    Accelerated,
-    (),
-    Motion(move, acceleration_noise, linear=True),
-)
+MOTION = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
 
 
 @pytest.mark.parametrize("targets", [1, 2])
@@ -81,3 +67,9 @@ def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
     assert len(found["track"]) == 0
     assert found["set"]["elements"].tolist() == [0, 0, 0]
     assert found["set"].publish_time_ns[0] == SIMULATION_EPOCH_NS + 0 * SECOND
+
+
+def test_modes_are_not_smoothed(uncompiled: None):
+    source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
+    with pytest.raises(BadInput, match="smoothed tracks are of targets with one linear motion"):
+        replay(source, smoothed=True, model="vehicle", motion=MOTION)
