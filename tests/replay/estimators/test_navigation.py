@@ -121,9 +121,12 @@ def test_numbers_of_other_units_and_clocks_are_told():
     for columns, told in (
         (
             {"specific_force_mps2": force / 9.80665},
-            "gravity reads 0.98.* m/s2 in the first 1 s; it is 9.8; it looks like g",
+            "gravity reads 0.98.* m/s2 in the first 1 s, where it is 9.8; it looks like g",
         ),
-        ({"specific_force_mps2": 3.0 * force}, "gravity reads 2.* m/s2 in the first 1 s; it is 9.8$"),
+        (
+            {"specific_force_mps2": 3.0 * force},
+            "gravity reads 2.* m/s2 in the first 1 s, where it is 9.8$",
+        ),
         ({"specific_force_mps2": -force}, "points down .* mounting_roll_rad=3.14159"),
         ({"turn_rate_radps": np.degrees(rate)}, "at rest it turns by .* looks like deg/s"),
     ):
