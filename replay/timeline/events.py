@@ -87,6 +87,8 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
     for estimator, stream in scene.outputs_of(case, schemas.STARTED):
         yield Happened(estimator, "INFO", stream.publish_time_ns, sentences_of(stream))
+    for estimator, stream in scene.outputs_of(case, schemas.DIAGNOSED):
+        yield Happened(estimator, "WARN", stream.publish_time_ns, sentences_of(stream))
     for estimator, stream in scene.outputs_of(case, schemas.SKIPPED):
         texts = [f"not used: {reason}" for reason in sentences_of(stream)]
         yield Happened(estimator, "WARN", stream.publish_time_ns, texts)
