@@ -194,6 +194,8 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
+    for _ in told:  # there are no more: progress and team come to their ends
+        pass
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:

@@ -81,12 +81,12 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Share the runs among N processes, of one core each."
+    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, of one core each."
 )
 scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|local:N",
-    help="Share the runs among the workers of a Dask scheduler, or of one with N on this machine.",
+    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
@@ -347,6 +347,8 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
+@workers_option
+@scheduler_option
 @recover_option
 @gap_option
 @json_option
@@ -362,6 +364,28 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     from pipeline.tuning.command import tune_logs
 
     tune_logs(list(logs), **options)
+
+
+@fuselog.command(short_help="Say why an estimator is inconsistent.")
+@click.argument("log", type=ANY_PATH)
+@click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
+@click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
+@click.option("--save", type=FILE, help="A timeline (.rrd) to write, with the sentences as events.")
+@click.option("--model", help="The model to estimate, where several fit the log.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def diagnose(log: Path, **options: Any) -> None:
+    """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
+
+    LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
+    cause first: that without which the log-likelihood gains most.
+    """
+    from pipeline.diagnosing.command import diagnose_log
+
+    diagnose_log(log, **options)
 
 
 @fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
@@ -708,6 +732,38 @@ def sweep(
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     sweep_named(experiment, labels, over, **options)
+
+
+@fuselog.command(short_help="Compare estimators over the same runs, with a verdict on every metric.")
+@click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
+@click.option("--case", help="What trajectory files are of, such as robot2, where a log has several.")
+@click.option(
+    "--margin",
+    type=click.FloatRange(min=0),
+    default=0.02,
+    show_default=True,
+    help="Which share of a metric is no matter.",
+)
+@click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
+@click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
+    """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
+
+    Or estimators over logs: fuselog compare LOG.mcap ... -e ekf -e ukf
+
+    All others are compared with the first, metric by metric over the runs that both have, with
+    intervals of 95 % by the bootstrap over runs.
+    """
+    from pipeline.comparing.command import compare_sides
+
+    compare_sides(list(sides), list(labels), **options)
 
 
 @fuselog.command(short_help="Render results as one self-contained HTML page.")

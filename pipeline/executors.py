@@ -5,7 +5,13 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache, partial
 from importlib import resources
@@ -90,6 +96,14 @@ class Here(Executor):
 def here() -> Iterator[Team]:
     """Nobody but the calling process, whose replay uses all cores."""
     yield Team(Here(), 1)
+
+
+@contextmanager
+def threads() -> Iterator[Team]:
+    """Threads of the calling process, one for each core: for work whose kernels run side by side."""
+    count = os.cpu_count() or 1
+    with ThreadPoolExecutor(count) as pool:
+        yield Team(pool, count)
 
 
 def processes(count: int) -> Crew:

@@ -72,35 +72,73 @@ def _chart(every: pd.DataFrame) -> Chart:
 
 
 def _claims(every: pd.DataFrame) -> list[Claim]:
-    """What the associations are expected to be worth, where all of them were run in all cases."""
-    if not {"jipda", "jpda", "hungarian", "nearest"} <= set(every["estimator"]):
-        return []
-    clutters, probabilities = every["clutter_per_scan"].unique(), every["detection_probability"].unique()
+    """What associations and modes are expected to be worth, where they were run in all cases."""
+    estimators = set(every["estimator"])
     claims = []
-    for label, other in (("jipda", "nearest"), ("jpda", "nearest"), ("jpda", "hungarian")):
-        for clutter in clutters:
-            gained = {
-                f"p_D {probability:g}": difference(
-                    _of(every, clutter, probability), "gospa_m", label, other
-                )
-                for probability in probabilities
-            }
-            statement = f"{label} has a lower GOSPA than {other} at {clutter:g} false detections a scan"
-            claims.append(lower(statement, "expected", "m", gained))
+    if {"jipda", "jpda", "hungarian", "nearest"} <= estimators:
+        claims += _association_claims(every)
+    if {"modes", "drive", "manoeuvre"} <= estimators:
+        claims += _mode_claims(every)
+    return claims
+
+
+def _association_claims(every: pd.DataFrame) -> list[Claim]:
+    clutters = every["clutter_per_scan"].unique()
+    least, most = min(clutters), max(clutters)
+    claims = [
+        lower(
+            f"{label} has a lower GOSPA than {other} at {clutter:g} false detections a scan",
+            "expected",
+            "m",
+            _differences(every, clutter, "gospa_m", label, other),
+        )
+        for label, other in (("jipda", "nearest"), ("jpda", "nearest"), ("jpda", "hungarian"))
+        for clutter in clutters
+    ]
     gained = {
         f"p_D {probability:g}": _change(every, probability, "jpda", "nearest")
-        for probability in probabilities
+        for probability in every["detection_probability"].unique()
     }
-    most, least = max(clutters), min(clutters)
     statement = f"jpda gains more over nearest at {most:g} than at {least:g} false detections a scan"
     claims.append(lower(statement, "expected", "m", gained))
-    gained = {
-        f"p_D {probability:g}": difference(_of(every, most, probability), "switches", "jpda", "nearest")
-        for probability in probabilities
-    }
     statement = f"jpda switches tracks less often than nearest at {most:g} false detections a scan"
-    claims.append(lower(statement, "expected", "", gained))
-    return claims
+    fewer = _differences(every, most, "switches", "jpda", "nearest")
+    return [*claims, lower(statement, "expected", "", fewer)]
+
+
+def _mode_claims(every: pd.DataFrame) -> list[Claim]:
+    least = every["clutter_per_scan"].min()
+    straight = {
+        f"target {number}, {name}": interval
+        for number in (1, 2)
+        for name, interval in _differences(
+            every, least, f"target{number}_rmse_m", "modes", "manoeuvre"
+        ).items()
+    }
+    return [
+        lower(
+            f"modes lower the RMSE of the target that turns, against driving alone, at {least:g}",
+            "expected",
+            "m",
+            _differences(every, least, "target5_rmse_m", "modes", "drive"),
+        ),
+        lower(
+            f"modes lower the RMSE of targets that go straight, against manoeuvring alone, at {least:g}",
+            "expected",
+            "m",
+            straight,
+        ),
+    ]
+
+
+def _differences(
+    every: pd.DataFrame, clutter: float, quantity: str, label: str, other: str
+) -> dict[str, Interval]:
+    """The differences of two estimators at a rate of clutter, by probability of detection."""
+    return {
+        f"p_D {probability:g}": difference(_of(every, clutter, probability), quantity, label, other)
+        for probability in every["detection_probability"].unique()
+    }
 
 
 def _of(every: pd.DataFrame, clutter: float, probability: float) -> pd.DataFrame:

@@ -392,6 +392,12 @@ STARTED = _declare(
     "metadata lists what by number, as JSON.",
     _identifier("reason"),
 )
+DIAGNOSED = _declare(
+    "Diagnosed",
+    "A diagnosis found that something is wrong from here on; the channel's metadata says what,"
+    " by number, as JSON.",
+    _identifier("reason"),
+)
 REWOUND = _declare(
     "Rewound",
     "A late measurement was used after all; so many messages after it were used again.",

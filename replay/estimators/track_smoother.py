@@ -9,7 +9,7 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.blocks import Block, Ragged, join
 from replay.engine.estimator import Recursive
-from replay.inference.model import Model
+from replay.estimators.targets import Targets
 from replay.inference.track_smoothing import smooth_tracks
 
 
@@ -20,11 +20,16 @@ class State(NamedTuple):
     said: tuple[list[Ragged], ...]
 
 
-def smoothing_tracks(tracker: Recursive, model: Model, parameters: Any) -> Recursive:
+def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
     """The tracker, which keeps what it says until the end and says its tracks smoothed.
 
-    `model` is that of its targets, whose motion is linear.
+    Raises BadInput where the motion of its targets is not linear, or they have several.
     """
+    if targets.stage.modes or not targets.stage.motion.linear:
+        raise BadInput(
+            f"estimator {tracker.name}: smoothed tracks are of targets with one linear motion; leave "
+            "out smoothed, or take another model, or one of its modes"
+        )
 
     def start(whole: Mapping[str, Ragged]) -> State:
         return State(tracker.start(dict(whole)), ())
@@ -36,7 +41,7 @@ def smoothing_tracks(tracker: Recursive, model: Model, parameters: Any) -> Recur
     def finish(state: State) -> list[Ragged]:
         outputs = [join(parts) for parts in zip(*filter(None, state.said), strict=True)]
         return [
-            _smoothed(each, model, parameters) if each.stream.topic.endswith("/track") else each
+            _smoothed(each, targets) if each.stream.topic.endswith("/track") else each
             for each in outputs
         ]
 
@@ -50,16 +55,16 @@ def _cannot_rewind(_: int) -> Recursive:
     )
 
 
-def _smoothed(tracks: Ragged, model: Model, parameters: Any) -> Ragged:
+def _smoothed(tracks: Ragged, targets: Targets) -> Ragged:
     """The stream of tracks with smoothed states."""
-    stream, size = tracks.stream, model.size
+    stream, size = tracks.stream, targets.stage.model.size
     run = np.repeat(np.arange(tracks.runs), np.diff(tracks.offsets))
     _, track = np.unique(
         np.stack([run, stream["track_id"].astype(np.int64)]), axis=1, return_inverse=True
     )
     mean, covariance = smooth_tracks(
-        model,
-        parameters,
+        targets.stage,
+        targets.parameters,
         track.ravel(),
         stream.publish_time_ns,
         stream["mean"],

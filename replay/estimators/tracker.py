@@ -16,7 +16,6 @@ begin tracks, bearings only sharpen those that are confirmed. `replay.inference.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -492,8 +491,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
         )
         outputs.append(Ragged(modes, ends))
     of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
-    innovations = _innovations(setup, scans, pair_ends, *of_pairs)
-    return [*outputs, *innovations]
+    return [*outputs, *_innovations(setup, scans, pair_ends, *of_pairs)]
 
 
 def _innovations(
@@ -567,8 +565,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
         return [tracking]
     if settings.errors.names:
         raise BadInput(f"estimator {name}: errors of sensors are not smoothed; leave out one of both")
-    model = replace(targets.stage.model, motion=targets.stage.motion)
-    return [smoothing_tracks(tracking, model, targets.parameters)]
+    return [smoothing_tracks(tracking, targets)]
 
 
 TRACKER = Estimator(

@@ -223,8 +223,17 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     recorder = _recorder(model)
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, recorder)
+    lost = motion.lost and _reading(
+        model,
+        names,
+        motion.lost,
+        "state, duration_s",
+        "first(state), duration_s",
+        [*_entries(t), *drifts],
+    )
     return replace(
         motion,
+        lost=lost,
         move=_reading(
             model,
             names,

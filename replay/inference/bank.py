@@ -48,7 +48,7 @@ class BankParameters(UnscentedParameters, RegressionParameters):
     """
 
     filter: str = "ekf"
-    members: Annotated[int, Field(ge=8, le=720)] = 60
+    members: Annotated[int, Field(ge=8, le=720)] = 36
 
 
 class Belief(NamedTuple):
@@ -198,7 +198,7 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     updates = (
         of_run(weighed_update(stage, number, update)) for number, update in enumerate(inner.updates)
     )
-    return Steps(memory, predict, tuple(updates), estimate, inner.sampled)
+    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes)
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:

@@ -444,7 +444,28 @@ class Filter:
             happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
             happenings = with_control(self.stage, happenings)
         state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
-        return self.follow(state, happenings)
+        state, made = self.follow(state, happenings)
+        return state, [*made, *self.not_driven(happenings)]
+
+    def not_driven(self, happenings: Happenings) -> list[Ragged]:
+        """What was not used since it was measured in a gap of the control, where that may have some."""
+        control = self.stage.model.control
+        if control is None or not control.gap or not _compiled(self.stage, self.method)[1].resumes:
+            return []
+        lost = (happenings.source >= 0) & np.isnan(happenings.data[:, -1])
+        reasons = [
+            f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
+            f"{control.gap}"
+            for _, topic in self.found.sensors
+        ]
+        stream = reason_stream(
+            f"/estimates/{self.name}/skipped",
+            schemas.SKIPPED,
+            happenings.time_ns[lost],
+            happenings.source[lost],
+            reasons,
+        )
+        return [Ragged(stream, ragged_rows(lost, happenings.offsets))]
 
     def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""

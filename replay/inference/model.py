@@ -87,7 +87,7 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         gap: the parameter that says how long, in s, an interpolated control may be silent: what is
-            estimated ends there.
+            estimated ends there, or is unknown until it speaks again, see `Motion.lost`.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
         instead: other topics that the components of these names are taken from where the log has them,
@@ -117,6 +117,9 @@ class Motion:
             space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
             duration; it enters the state through the derivative by the control.
+        lost: (state, duration_s, parameters) -> the variances in the tangent space that are added where
+            the control was silent for longer than its `gap`. The state stays, so that they cover what it
+            may have moved meanwhile; there are no estimates between.
         linear: whether `move` is linear in the state: sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
             they are written by hand, jets give them else.
@@ -128,6 +131,7 @@ class Motion:
     noise: Function | None = None
     noises: int = 0
     control_noise: Function | None = None
+    lost: Function | None = None
     linear: bool = False
     jacobians: Function | None = None
     moments: Function | None = None
@@ -401,6 +405,8 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     if motion.noise is not None:
         wanted = (motion.noises,) if motion.noises else sizes
         _check(where, motion.noise, (state, 1.0, parameters), wanted)
+    if motion.lost is not None:
+        _check(where, motion.lost, (state, 1.0, parameters), (model.tangent,))
     if motion.control_noise is not None:
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 

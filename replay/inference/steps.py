@@ -49,7 +49,7 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
-NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
+NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Stage(NamedTuple):
@@ -83,6 +83,7 @@ class Steps(NamedTuple):
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
+        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -90,6 +91,7 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
+    resumes: bool = False
 
 
 class Note(NamedTuple):
@@ -170,6 +172,9 @@ def gaussian_filter(
     `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
     one run's mean and covariance.
     """
+    lost = stage.motion.lost
+    if lost is not None:
+        predict = _predicting_lost(stage.model, lost, predict)
 
     def predict_run(
         run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
@@ -187,7 +192,32 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
+        resumes=lost is not None,
     )
+
+
+def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
+    """The prediction, which stays where it is and knows less where the control is NaN."""
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        if not np.isnan(control[0]):
+            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+        for row in range(t):
+            for column in range(t):
+                work.product[row, column] = covariance[row, column]
+        add(covariance, lost(read_state(mean), duration_s, parameters))
+        return True
+
+    return predict
 
 
 def _of_run(update: Function) -> Function:

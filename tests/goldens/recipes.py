@@ -144,6 +144,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=60.0),
+    "tuning-mrclam": Recipe("tuning-mrclam", span_s=60.0),
     "torus-filter-noise-03": Recipe("torus-filter", parameters=TORUS["noise-03"]),
     "torus-filter-strong-coupling": Recipe("torus-filter", parameters=TORUS["strong-coupling"]),
     "torus-propagation": Recipe(

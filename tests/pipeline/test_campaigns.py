@@ -209,7 +209,7 @@ def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
         write_log(log, recording.streams, run)
 
     def replayed(crew=None) -> dict[str, bytes]:
-        experiment = experiment_of_logs(logs, ["ekf"], {})
+        experiment = experiment_of_logs(logs, ["ekf"]).with_settings({}, {})
         run_experiment("drives", experiment, place, logs=1, errors=True, crew=crew)
         names = sorted(path for path in place.rglob("*") if path.is_file() and path.suffix != ".rrd")
         return {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
@@ -258,6 +258,21 @@ def test_a_campaign_without_logs_has_its_timeline(tmp_path):
     run_experiment(name, experiment, tmp_path / "result", logs=0)
     assert (tmp_path / "result" / "timeline.rrd").is_file()
     assert not (tmp_path / "result" / "logs").exists()
+
+
+def test_progress_tells_how_many_runs_how_fast_and_who_works(tmp_path):
+    said: list[tuple[str, int]] = []
+
+    def progress(items, title, total):
+        for item in items:
+            yield item
+            said.append((str(title), total))
+
+    run(tmp_path / "result", runs=130, progress=progress)
+    told = [each for each in said if each[0].startswith("replaying: ")]
+    assert [total for _, total in told] == [2, 2]
+    for done, (text, _) in zip((128, 130), told, strict=True):
+        assert re.fullmatch(rf"replaying: {done} of 130 runs, [1-9]\d* runs/s, 1 worker; cells", text)
 
 
 def test_what_is_not_ours_stays(tmp_path):

@@ -1,10 +1,12 @@
 """Tuning: the reference sheet's numbers, what logs cannot tell, and what is refused."""
 
 import os
+import pickle
 import re
 import shlex
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,10 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline.executors import Here
 from pipeline.results import read_result
 from pipeline.tuning.objective import Best
-from tests.replay.inference.scalar import EPOCH_NS, SCALAR, source
+from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
 Fuselog = Callable[..., Any]
@@ -296,6 +299,50 @@ def test_any_number_of_cores_finds_the_same(
         tuned = fl.tune(seen, "ekf", ["sigma_range_m", "bias_range_m"], set={"sigma_range_m": 0.5})
         found.append((tuned.found.optimum.tobytes(), tuned.standard_errors.tobytes()))
     assert found[0] == found[1]
+
+
+class Away(Here):
+    """Does the work as another process would: what comes and goes is pickled."""
+
+    def submit(self, work: Callable[..., Any], /, *args: Any) -> Future[Any]:
+        """The same on copies of everything."""
+        work, args = pickle.loads(pickle.dumps((work, args)))
+        return super().submit(lambda: pickle.loads(pickle.dumps(work(*args))))
+
+
+def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
+    given = {"set": {"sigma_range_m": 0.5}}
+    alone = fl.tune(seen, "ekf", "sigma_range_m", **given)
+    shared = fl.tune(seen, "ekf", "sigma_range_m", executor=Away(), **given)
+    assert shared.found.optimum.tobytes() == alone.found.optimum.tobytes()
+    assert shared.profile.equals(alone.profile)  # computed when the workers have gone
+
+    class Own(ScalarParameters):
+        """Parameters that only this function knows."""
+
+    with pytest.raises(fl.BadInput, match="level: cannot go to another process"):
+        fl.tune(
+            source(np.ones(5)),
+            {"level": fl.modelled(replace(SCALAR, parameters=Own), "ekf")},
+            "sigma_measured",
+            executor=Away(),
+        )
+
+    class Dying(Here):
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.set_exception(BrokenExecutor("it was killed"))
+            return future
+
+    with pytest.raises(fl.BadInput, match=r"tunes ekf died \(it was killed\); try fewer workers"):
+        fl.tune(seen, "ekf", "sigma_range_m", executor=Dying(), **given)
+
+
+@pytest.mark.paper
+def test_processes_tune_as_the_command_says(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    tune = ("tune", world / "log.mcap", "-e", "ekf", "--free", "sigma_range_m", "--json", "--out")
+    shared = fuselog(*tune, tmp_path / "shared", "--workers", "2").json
+    assert shared["parameters"] == fuselog(*tune, tmp_path / "alone").json["parameters"]
 
 
 def test_what_need_not_be_positive_is_found_too() -> None:

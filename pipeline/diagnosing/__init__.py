@@ -1,0 +1,1 @@
+"""Diagnosing: why an estimator is inconsistent, by the faults without which it would not be."""

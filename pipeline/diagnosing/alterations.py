@@ -1,0 +1,143 @@
+"""Faults of logs, put into streams or taken out of them: each is a function of streams and one number.
+
+With the opposite number a fault is undone, but for what is lost. So one set of functions says what a
+diagnosis supposes, and what the experiment puts into logs to be found.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream
+from recorders.models.orientation import compose
+from replay.engine.sources import MemorySource
+
+Alteration = Callable[[Stream, float], Stream]
+STRAY = 20.0  # in the unit of the vector
+_BLOCKS = {"position_m": "covariance_m2", "velocity_mps": "covariance_m2ps2"}  # of vectors that turn
+
+
+def altered(source: MemorySource, topic: str, alteration: Alteration, value: float) -> MemorySource:
+    """The run with one topic altered."""
+    stream = alteration(source.streams[topic], value)
+    return replace(source, streams={**source.streams, topic: stream})
+
+
+def _with(stream: Stream, **columns: NDArray) -> Stream:
+    return replace(stream, columns={**stream.columns, **columns})
+
+
+def shifted(field: str, entry: int | None = None) -> Alteration:
+    """A bias is added to a field, or to one entry of it where that is a vector."""
+    return partial(_shifted, field, entry)
+
+
+def _shifted(field: str, entry: int | None, stream: Stream, by: float) -> Stream:
+    column = stream[field].copy()
+    if entry is None:
+        column += by
+    else:
+        column[:, entry] += by
+    return _with(stream, **{field: column})
+
+
+def spread(field: str) -> Alteration:
+    """A covariance is multiplied, that of standard deviations e^value times as large."""
+    return partial(_spread, field)
+
+
+def _spread(field: str, stream: Stream, logarithm: float) -> Stream:
+    return _with(stream, **{field: stream[field] * np.exp(2.0 * logarithm)})
+
+
+def turned(field: str) -> Alteration:
+    """A vector, and its covariance, are turned about the vertical by an angle in rad."""
+    return partial(_turned, field)
+
+
+def _turned(field: str, stream: Stream, angle: float) -> Stream:
+    n, m = stream[field].shape
+    rotation = np.eye(m)
+    rotation[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    columns = {field: stream[field] @ rotation.T}
+    block = _BLOCKS.get(field, "")
+    if block in stream.columns and stream[block].shape == (n, m * m):
+        covariance = rotation @ stream[block].reshape(n, m, m) @ rotation.T
+        columns[block] = covariance.reshape(n, m * m)
+    return _with(stream, **columns)
+
+
+def delayed(first_ns: int, last_ns: int) -> Alteration:
+    """Stamps are late by so many seconds; none leaves the run, from `first_ns` to `last_ns`."""
+    return partial(_delayed, first_ns, last_ns)
+
+
+def _delayed(first_ns: int, last_ns: int, stream: Stream, by_s: float) -> Stream:
+    stamps_ns = stream.publish_time_ns + round(by_s * 1e9)
+    return replace(stream, publish_time_ns=np.clip(stamps_ns, first_ns, last_ns))
+
+
+def drifted(first_ns: int, last_ns: int) -> Alteration:
+    """The clock of the stamps gains so many seconds a second from the run's begin on."""
+    return partial(_drifted, first_ns, last_ns)
+
+
+def _drifted(first_ns: int, last_ns: int, stream: Stream, rate: float) -> Stream:
+    gained = np.rint((stream.publish_time_ns - first_ns) * rate).astype(np.int64)
+    stamps_ns = stream.publish_time_ns + gained
+    return replace(stream, publish_time_ns=np.clip(stamps_ns, first_ns, last_ns))
+
+
+def heading_turned(stream: Stream, angle: float) -> Stream:
+    """Orientations of a Gaussian estimate are turned about the vertical by an angle in rad."""
+    begin = stream.metadata["kinds"].split(",").index("quaternion")
+    mean, places = stream["mean"].copy(), slice(begin, begin + 4)
+    about = np.array([np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)])
+    mean[:, places] = compose(about, mean[:, places])
+    return _with(stream, mean=mean)
+
+
+def renumbered(field: str, first: int, second: int) -> Alteration:
+    """Two numbers are exchanged."""
+    return partial(_renumbered, field, first, second)
+
+
+def _renumbered(field: str, first: int, second: int, stream: Stream, _: float) -> Stream:
+    number = stream[field]
+    exchanged = np.where(number == first, second, np.where(number == second, first, number))
+    return _with(stream, **{field: exchanged.astype(number.dtype)})
+
+
+def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
+    """The run with the messages of two topics exchanged."""
+    streams: Mapping[str, Stream] = {
+        first: replace(source.streams[second], topic=first),
+        second: replace(source.streams[first], topic=second),
+    }
+    return replace(source, streams={**source.streams, **streams})
+
+
+def thinned(seed: int) -> Alteration:
+    """A share of the stamps is lost, drawn at random, with all their messages."""
+    return partial(_thinned, seed)
+
+
+def _thinned(seed: int, stream: Stream, share: float) -> Stream:
+    stamps_ns, row = np.unique(stream.publish_time_ns, return_inverse=True)
+    is_kept = np.random.default_rng(seed).uniform(size=len(stamps_ns)) >= share
+    return stream.take(is_kept[row])
+
+
+def strayed(seed: int, field: str) -> Alteration:
+    """A share of a vector's messages, drawn at random, is off by up to STRAY in every entry."""
+    return partial(_strayed, seed, field)
+
+
+def _strayed(seed: int, field: str, stream: Stream, share: float) -> Stream:
+    rng = np.random.default_rng(seed)
+    is_off = rng.uniform(size=len(stream)) < share
+    off = rng.uniform(-STRAY, STRAY, stream[field].shape)
+    return _with(stream, **{field: stream[field] + is_off[:, None] * off})

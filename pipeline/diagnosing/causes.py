@@ -1,0 +1,96 @@
+"""The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import cpu_count
+from typing import NamedTuple
+
+from scipy.stats import chi2
+
+from pipeline.diagnosing.hypotheses import Hypothesis
+from pipeline.diagnosing.likelihood import Likelihood, Peak, Trial, interval, peak
+
+FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
+RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
+
+
+class Cause(NamedTuple):
+    """A hypothesis with the number that gains most.
+
+    Attributes:
+        hypothesis: what may be wrong.
+        value: by how much.
+        ends: of the 95 % interval of that.
+        gain: in log-likelihood, after all causes before it.
+        is_rival: whether it is instead of the cause before it, and explains nearly as much.
+    """
+
+    hypothesis: Hypothesis
+    value: float
+    ends: tuple[float, float]
+    gain: float
+    is_rival: bool = False
+
+    @property
+    def words(self) -> str:
+        """What is wrong, by how much, and what that is known by."""
+        said = self.hypothesis.words(self.value, *self.ends)
+        known = f"without this the log-likelihood gains {self.gain:.4g}"
+        return f"{'Or instead, nearly as likely: ' if self.is_rival else ''}{said}; {known}"
+
+
+def least_gain(count: int) -> float:
+    """What the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
+
+    Twice the gain is chi-square of one degree of freedom (Wilks), shared among them (Bonferroni).
+    """
+    return float(chi2.isf(FALSE_ALARMS / max(count, 1), 1)) / 2.0
+
+
+def find_causes(
+    likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
+) -> list[Cause]:
+    """At most so many causes, the likeliest first: each gains most after all before it are undone."""
+    least, found = least_gain(len(tried)), list[Cause]()
+    candidates, now = list(tried), base
+    while candidates and len(found) < most:
+        gain_of = _gains(likelihood, now)
+        with ThreadPoolExecutor(cpu_count()) as threads:
+            peaks = list(threads.map(lambda each, of=gain_of: _peak(of(each), each, least), candidates))
+        ranked = sorted(
+            (pair for pair in zip(peaks, candidates, strict=True) if pair[0].gain > least),
+            key=lambda pair: -pair[0].gain,
+        )
+        if not ranked:
+            break
+        (best, first), *others = ranked
+        found.append(_cause(gain_of(first), best, first))
+        found += [
+            _cause(gain_of(each), at, each)._replace(is_rival=True)
+            for at, each in others
+            if at.gain > best.gain - RIVAL
+        ]
+        now = first.without(now, best.value)
+        candidates = [each for at, each in others if at.gain <= best.gain - RIVAL]
+    return found[:most]
+
+
+Gain = Callable[[float], float]
+
+
+def _gains(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis], Gain]:
+    """For a hypothesis the gain of its number, over a trial."""
+    before = likelihood(now)
+    return lambda each: lambda value: likelihood(each.without(now, value)) - before
+
+
+def _peak(gain: Gain, tried: Hypothesis, least: float) -> Peak:
+    return peak(gain, tried.tried, tried.limit, least)
+
+
+def _cause(gain: Gain, at: Peak, of: Hypothesis) -> Cause:
+    if len(of.tried) == 1:  # it is, or is not
+        return Cause(of, at.value, (at.value, at.value), at.gain)
+    # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
+    scale = abs(at.value) * min(1.0, (2.0 / at.gain) ** 0.5)
+    return Cause(of, at.value, interval(gain, at, scale), at.gain)

@@ -1,0 +1,79 @@
+"""The command `fuselog diagnose`: it prints what is likely wrong, and what to try."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.commands import read_settings, settings_of_estimators
+from pipeline.diagnosing.diagnosis import diagnose
+from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.results import plain
+from pipeline.terminal import print_json, print_metrics, print_table, say, status
+from recorders.errors import BadInput
+from recorders.log import open_log
+from recorders.parameters import parse_settings
+from replay.engine.sources import LogSource
+
+
+def diagnose_log(
+    log: Path,
+    *,
+    label: str | None,
+    out: Path | None,
+    save: Path | None,
+    model: str | None,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Diagnose, write what is asked for, and print sentences, components and metrics."""
+    if out is not None:
+        check_folder(out, {"log": [log]})
+    if save is not None:
+        check_files([(save, TIMELINE)], {"log": [log]})
+    given = parse_settings(settings) | ({} if model is None else {"model": model})
+    if label is not None:
+        chosen = settings_of_estimators([label], given, read_settings(settings_file, [label]))
+        given = chosen[label]
+    elif settings_file is not None:
+        raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
+    with status() as show:
+        show("replaying with one fault undone after another")
+        found = diagnose(
+            LogSource(open_log(log, recover=recover)), label, set=given, gap_limit_s=gap_limit_s
+        )
+    written = [str(found.save(out).folder)] if out is not None else []
+    if save is not None:
+        found.view(save)
+        written.append(str(save))
+    judge = found.replay.judge
+    if as_json:
+        print_json(
+            {
+                "sentences": found.causes.replace({np.nan: None}).to_dict("records"),
+                "components": found.components.replace({np.nan: None}).to_dict("records"),
+                "notes": list(found.notes),
+                "metrics": plain(judge.metrics),
+                "bounds": judge.bounds,
+                "written": written,
+            }
+        )
+        return
+    print_metrics(plain(judge.metrics), judge.bounds)
+    columns = ("component", "mean", "mean square", "beyond 3 sigma", "next", "white by chance")
+    print_table(
+        columns,
+        [
+            [
+                " ".join(filter(None, (row["case"], row["component"]))),
+                *(row[name] for name in ("mean", "mean_square", "beyond_3_sigma")),
+                *(row[name] for name in ("next_correlation", "probability_white")),
+            ]
+            for row in found.components.to_dict("records")
+        ],
+    )
+    for sentence in [*found.told, *found.notes, *written]:
+        say(sentence)

@@ -1,0 +1,381 @@
+"""Why an estimator is inconsistent: its innovations, its errors where there is truth, their causes.
+
+A fault is named by what the log-likelihood gains without it, not by how large it looks: a bearing whose
+noise is stated too small makes the range's innovations too large as well.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.commands import log_of_estimates, stated_estimators
+from pipeline.diagnosing.causes import Cause, find_causes, least_gain
+from pipeline.diagnosing.findings import (
+    Finding,
+    component_table,
+    of_estimates,
+    of_innovations,
+    of_messages,
+)
+from pipeline.diagnosing.hypotheses import Kind, hypotheses
+from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.door import ResultFolder
+from pipeline.ensemble import judge_logs
+from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.replays import Kind as EstimatorKind
+from pipeline.replays import Log, Replay, replay, settings_of, sources_of
+from pipeline.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.studies.localization import summarise, summary_table
+from recorders.errors import BadInput, choices
+from recorders.log import RunMetadata, Schema, Stream, schemas
+from recorders.parameters import merge
+from replay.engine.estimator import Bound, bind
+from replay.engine.failures import reason_stream
+from replay.engine.sources import LogSource, MemorySource
+from replay.judging.evaluation import split_topic
+from replay.judging.metrics import metric_key
+
+MOST_SENTENCES = 5
+MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
+NOTHING = "nothing found"
+SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
+OPEN = {"gate_probability": 1.0}
+PROFILE_BINS = 60
+
+
+class Sentence(NamedTuple):
+    """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
+
+    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so.
+    """
+
+    kind: Kind
+    topic: str
+    words: str
+    time_ns: int | None = None
+    cause: Cause | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis:
+    """What was found.
+
+    Attributes:
+        label: the estimator's.
+        replay: the log replayed with it, as it is set.
+        sentences: what is wrong, at most five, the likeliest cause first.
+        components: a row per measured component; see `component_table`.
+        hypotheses: how many causes were tried, and `least_gain` what the least of those named gains.
+        notes: what one has to know of the diagnosis.
+    """
+
+    label: str
+    replay: Replay
+    sentences: Sequence[Sentence]
+    components: pd.DataFrame
+    hypotheses: int
+    least_gain: float
+    notes: Sequence[str]
+
+    def __repr__(self) -> str:
+        return "\n".join([f"{self.label} over {self.replay.logs[0].name}", *self.told, *self.notes])
+
+    @property
+    def told(self) -> list[str]:
+        """The sentences, numbered; or that nothing was found."""
+        if not self.sentences:
+            why = f"of {self.hypotheses} faults none gains {self.least_gain:.3g} in log-likelihood"
+            return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]
+        return [f"{number}. {each.words}" for number, each in enumerate(self.sentences, start=1)]
+
+    @property
+    def causes(self) -> pd.DataFrame:
+        """A row per sentence: its kind, topic and component, number with its 95 % interval, and gain."""
+        rows = []
+        for each in self.sentences:
+            cause = each.cause
+            rows.append(
+                {
+                    "kind": each.kind,
+                    "topic": each.topic,
+                    "part": cause.hypothesis.part if cause else "",
+                    "value": cause.value if cause else np.nan,
+                    "low": cause.ends[0] if cause else np.nan,
+                    "high": cause.ends[1] if cause else np.nan,
+                    "gain": cause.gain if cause else np.nan,
+                    "sentence": each.words,
+                }
+            )
+        return pd.DataFrame(rows)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row per metric of the replay: estimator, quantity, case, value."""
+        return self.replay.metrics
+
+    @cached_property
+    def profiles(self) -> dict[str, Chart]:
+        """NIS per component over time, by case."""
+        charts: dict[str, Chart] = {}
+        for stream in _outputs(self.replay, schemas.INNOVATION).values():
+            case = split_topic(stream.topic)[1]
+            nis = stream["normalised_innovation_squared"]
+            degrees = np.isfinite(stream["innovation"]).sum(axis=1)
+            used = (degrees > 0) & np.isfinite(nis)
+            times_s = 1e-9 * (stream.publish_time_ns[used] - self.replay.logs[0].epoch_ns)
+            count, edges = np.histogram(times_s, PROFILE_BINS, weights=degrees[used])
+            total, _ = np.histogram(times_s, edges, weights=nis[used])
+            there = count > 0
+            middle_s = 0.5 * (edges[1:] + edges[:-1])[there]
+            panel = Panel(x=Axis(label="time (s)"), y=Axis(label="NIS per component", log=True))
+            panel.series.append(curve(self.label, middle_s, total[there] / count[there], "line+markers"))
+            panel.series.append(level("if consistent", middle_s, 1.0))
+            name = " ".join(filter(None, ("NIS", case)))
+            charts[name.lower().replace(" ", "-")] = Chart(title=name, panels=[panel])
+        return charts
+
+    @property
+    def marks(self) -> dict[str, Stream]:
+        """The sentences as messages by topic, for the timeline: at the stamp where each one began."""
+        log = self.replay.logs[0]
+        cases = list(dict.fromkeys(split_topic(topic)[1] for topic in self.replay.estimates[0].topics))
+        first_ns = log.extent("publish_time")[0]
+        found: dict[str, list[Sentence]] = {}
+        for each in self.sentences:
+            case = next(
+                (case for case in cases if case and each.topic.startswith(f"/{case}/")), cases[0]
+            )
+            found.setdefault(case, []).append(each)
+        marks = {}
+        for case, own in found.items():
+            own = sorted(own, key=lambda each: each.time_ns or first_ns)
+            topic = "/".join(filter(None, ("/estimates", self.label, case, "diagnosis")))
+            marks[topic] = reason_stream(
+                topic,
+                schemas.DIAGNOSED,
+                np.array([each.time_ns or first_ns for each in own], np.int64),
+                np.arange(len(own)),
+                [each.words for each in own],
+            )
+        return marks
+
+    def view(self, save: str | Path) -> None:
+        """Write the timeline of the replay, the sentences among its events, to an .rrd file.
+
+        Raises BadInput where the file cannot be written.
+        """
+        check_files([(Path(save), TIMELINE)], {"log": self.replay.paths})
+        self._draw(Path(save))
+
+    def _draw(self, rrd: Path) -> None:
+        from replay.timeline.show import Drawing
+
+        log, estimates = self.replay.logs[0], self.replay.estimates
+        with Drawing(log.whole(), identity="\n".join(self.told), save=rrd) as drawing:
+            drawing.add(self.marks, [])
+            judge_logs(estimates, [log], {}, gap_limit_s=self.replay.gap_limit_s, drawing=drawing)
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write sentences, tables, figures, metrics and a timeline as a result folder.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        check_folder(place, {"input": self.replay.paths})
+        outcome = summarise(self.replay.judge)
+        outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
+        outcome.figures |= self.profiles
+        outcome.input_sha256 = self.replay.input_sha256
+        settings = {
+            "title": f"{self.label} diagnosed over {self.replay.logs[0].name}",
+            "logs": [log.name for log in self.replay.logs],
+            "estimators": json.loads(json.dumps(self.replay.settings, default=str)),
+            "notes": [*self.told, *self.notes],
+            "gap_limit_s": self.replay.gap_limit_s,
+        }
+        with result_folder(place) as part:
+            self._draw(part / "timeline.rrd")
+            return ResultFolder(place, write_outcome(part, "diagnose", settings, outcome))
+
+
+def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outcome:
+    """The outcome with these tables and its summary in place of its own, those without rows left out."""
+    found = {**tables, "summary": summary_table(outcome.metrics)}
+    return replace(outcome, tables={name: table for name, table in found.items() if len(table)})
+
+
+def diagnose(
+    log: Log,
+    estimator: str | Mapping[str, EstimatorKind] | None = None,
+    *,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+    gap_limit_s: float = 0.2,
+) -> Diagnosis:
+    """Say why an estimator is inconsistent, or that nothing is wrong.
+
+    Faults of the log and of the settings are undone one after the other, each by the number that gains
+    most in log-likelihood; what gains most is named first. A gate is open meanwhile.
+
+    Args:
+        log: a path, a log that was opened, or a recording; or an estimates log beside the log that it
+            is of.
+        estimator: a registered name, or a label of your own with what it stands for, see `replay`; of
+            an estimates log one of its labels, by default its only one.
+        set: parameters of the estimator.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Raises BadInput where the estimator does not fit the log, fails, or gives no innovations.
+
+    >>> from pipeline.door import record
+    >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
+    >>> found.sentences[0].kind, found.sentences[0].topic
+    ('measurement noise', 'sigma_range_m')
+    """
+    [source] = sources_of(log)
+    source, chosen = _asked(source, estimator)
+    [(label, own)] = chosen.items()
+    settings = merge(own, set or {})
+    done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
+    if done.failures:
+        raise BadInput(f"{done.failures[0]}; mend that first")
+    innovations, estimates = (
+        _outputs(done, schema) for schema in (schemas.INNOVATION, schemas.GAUSSIAN_ESTIMATE)
+    )
+    if not innovations:
+        raise BadInput(
+            f"{source.name}: {label} gives no innovations, by which it could be diagnosed; give a "
+            "filter of the same model, such as -e ekf"
+        )
+    bound = bind(label, [source], {"kind": label, **settings})
+    gate = float(getattr(bound[0].parameters, "gate_probability", 1.0))
+    streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
+    notes = []
+    causes: list[Cause] = []
+    tried, least = 0, np.inf
+    if all("log_likelihood" in stream.columns for stream in innovations.values()):
+        opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
+        likelihood = Likelihood(label)
+        part, note = _first_part(source, bound, streamed)
+        notes += note
+        base = Trial(part, opened)
+        alternatives = hypotheses(label, bound, base, likelihood.begin(base))
+        causes = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
+        tried, least = len(alternatives), least_gain(len(alternatives))
+    else:
+        notes.append(
+            f"{label} states no likelihood of its innovations: faults are named by what is unusual alone"
+        )
+    sentences = [_sentence(each) for each in causes]
+    has_outliers = any(each.kind == "outliers" for each in sentences)
+    findings: list[Finding] = [
+        *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
+        *of_messages([source.read([topic])[topic] for topic in streamed], source.epoch_ns),
+        *of_estimates(estimates),
+        *_of_errors(done, label),
+    ]
+    sentences += [Sentence(*each) for each in findings]
+    return Diagnosis(
+        label,
+        done,
+        sentences[:MOST_SENTENCES],
+        component_table(innovations),
+        tried,
+        least,
+        [*notes, *_notes(done, sentences)],
+    )
+
+
+def _asked(
+    source: LogSource | MemorySource, estimator: str | Mapping[str, EstimatorKind] | None
+) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
+    """The log and the one estimator that are asked for; of estimates the log that they are of."""
+    if any(topic.startswith("/estimates/") for topic in source.topics) and isinstance(source, LogSource):
+        stated = stated_estimators(source.log)
+        labels = [estimator] if isinstance(estimator, str) else list(estimator or stated)
+        for label in labels:
+            if label not in stated:
+                raise BadInput(f"{source.name}: no estimates of {label}; {choices(label, stated)}")
+        if len(labels) != 1:
+            raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
+        own = {name: value for name, value in stated[labels[0]].items() if value is not None}
+        return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
+    if estimator is None:
+        raise BadInput(f"{source.name}: holds no estimates; name the estimator to diagnose with -e")
+    chosen = settings_of(estimator)
+    if len(chosen) > 1:
+        raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
+    return source, chosen
+
+
+def _outputs(done: Replay, schema: Schema) -> dict[str, Stream]:
+    """The outputs of a replay that have a schema, by topic."""
+    estimates = done.estimates[0]
+    names = [name for name, topic in estimates.topics.items() if topic.schema_name == schema.full_name]
+    found = estimates.read(names) if names else {}
+    return {name: stream for name, stream in found.items() if len(stream)}
+
+
+def _first_part(
+    source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
+) -> tuple[MemorySource, list[str]]:
+    """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
+    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.whole)])
+    streams = source.read([topic for topic in topics if topic in source.topics])
+    stamps_ns = np.concatenate([streams[topic].publish_time_ns for topic in streamed])
+    notes = []
+    if len(stamps_ns) > MOST_MESSAGES:
+        end_ns = np.partition(stamps_ns, MOST_MESSAGES)[MOST_MESSAGES]
+        for topic in streamed:
+            streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
+        notes.append(
+            f"causes were looked for in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
+            f"{MOST_MESSAGES} of {len(stamps_ns)} messages; all else is of the whole log. For another "
+            "part: fuselog cut"
+        )
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    return MemorySource(streams, run, source.name), notes
+
+
+def _sentence(cause: Cause) -> Sentence:
+    of = cause.hypothesis
+    return Sentence(of.kind, of.topic, f"{cause.words}; try {of.mend(cause.value)}", None, cause)
+
+
+def _of_errors(done: Replay, label: str) -> list[Finding]:
+    """Errors that innovations do not see."""
+    metrics, found = done.judge.metrics, []
+    for key, (_, high) in done.judge.bounds.items():
+        _, quantity, case = split_metric(key)
+        nis = metrics.get(metric_key(label, "nis_per_component", case), np.inf)
+        value = metrics[key]
+        if quantity == "nees" and isinstance(value, float) and value > high and nis < SEEN:
+            found.append(
+                Finding(
+                    "unseen error",
+                    f"/{case}/truth" if case else "/truth",
+                    f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
+                    f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
+                    "the state follows; let a bias be estimated, or see fuselog observability LOG",
+                )
+            )
+    return found
+
+
+def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
+    notes = list(done.judge.unjudged)
+    if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
+        notes.append(
+            "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"
+        )
+    elif len(done.logs) == 1:
+        notes.append("one run: the interval of NEES is that of a single step; give more to fuselog run")
+    if len(sentences) > MOST_SENTENCES:
+        notes.append(f"{len(sentences) - MOST_SENTENCES} more were found; mend these first")
+    return notes

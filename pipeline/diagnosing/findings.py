@@ -1,0 +1,269 @@
+"""What is unusual in innovations and messages, and needs no replay to be seen.
+
+Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import chi2, kurtosis
+
+from pipeline.diagnosing.hypotheses import Kind
+from recorders.log import Stream
+from replay.judging.evaluation import split_topic
+from replay.judging.whiteness import whitened, whiteness
+
+Floats = NDArray[np.float64]
+TAIL = 3.0  # standard deviations
+IMPROBABLE = 1e-4
+WINDOW = 30  # innovations, over which NIS is averaged to see a filter diverge
+LOCKED_OUT = 20  # measurements in a row that a gate keeps out
+KEPT_OUT = 0.05  # of measurements that a gate keeps out, though they are no outliers
+LOST = 0.02  # of the steps of a regular topic, which are longer than usual
+REGULAR = 0.8  # of the steps between stamps that are the usual one, or a multiple of it
+LONG_GAP = 20.0  # usual steps
+REPEATED = 0.001  # of the messages
+SATURATED = 0.005  # of the values that are the greatest, or the least
+FEWEST = 20
+COARSE = 0.5  # quanta above this many standard deviations of the innovation
+FLOOR = 0.1  # of the estimates whose variance is the least
+FLOOR_STEP = 1e-4  # relative, from the least variance to the next
+
+
+class Finding(NamedTuple):
+    """Something unusual: its kind, a topic, a sentence with its evidence, and when it began."""
+
+    kind: Kind
+    topic: str
+    words: str
+    time_ns: int | None = None
+
+
+def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
+    """A row per measured component.
+
+    Of the normalised innovations: how many there are, their mean with its 95 % interval, mean square,
+    the share beyond 3 standard deviations (0.27 % of a Gaussian), the excess kurtosis, the correlation
+    with the next, and how probable a larger Ljung-Box Q is if they are white.
+    """
+    rows = []
+    for topic, stream in innovations.items():
+        for name, column in zip(stream.components, whitened(stream).T, strict=True):
+            known = column[np.isfinite(column)]
+            if len(known) < 2:
+                continue
+            told = whiteness([column])
+            mean, error = float(known.mean()), float(known.std() / np.sqrt(len(known)))
+            rows.append(
+                {
+                    "case": split_topic(topic)[1],
+                    "component": name,
+                    "innovations": len(known),
+                    "mean": mean,
+                    "mean_low": mean - 1.96 * error,
+                    "mean_high": mean + 1.96 * error,
+                    "mean_square": told.mean_square if told.size else np.nan,
+                    "beyond_3_sigma": float(np.mean(np.abs(known) > TAIL)),
+                    "kurtosis": float(kurtosis(known)) if known.std() > 0.0 else np.nan,
+                    "next_correlation": told.correlation[0],
+                    "probability_white": told.probability,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def of_innovations(
+    innovations: Mapping[str, Stream], gate: float, epoch_ns: int, *, has_outliers: bool
+) -> Iterator[Finding]:
+    """What the gate keeps out, and where a filter diverges; `gate` is its probability."""
+    for topic, stream in innovations.items():
+        case = split_topic(topic)[1] or "the estimate"
+        is_in = stream["accepted"] != 0
+        times_ns = stream.publish_time_ns
+        for begin, end in _long_runs(~is_in, LOCKED_OUT):
+            yield Finding(
+                "gate",
+                topic,
+                f"{case}: the gate keeps out all {end - begin} measurements from "
+                f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}: the filter "
+                "has lost its way, and what would bring it back is kept out; --set gate_probability=1, "
+                "or gate_reopens_s=1",
+                int(times_ns[begin]),
+            )
+        share = float(np.mean(~is_in)) if len(stream) else 0.0
+        if share > KEPT_OUT and not has_outliers:
+            yield Finding(
+                "gate",
+                topic,
+                f"{case}: the gate keeps out {100.0 * share:.2g} % of the measurements, where "
+                f"{100.0 * (1.0 - gate):.2g} % are expected, and they are no outliers: noise or errors "
+                "are larger than stated; --set gate_probability=1 until that is mended",
+            )
+        yield from _divergence(topic, case, stream, epoch_ns)
+
+
+def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterator[Finding]:
+    """From when on NIS is too large for good, where it was not so before."""
+    nis = stream["normalised_innovation_squared"]
+    degrees = np.isfinite(stream["innovation"]).sum(axis=1)
+    used = np.flatnonzero((degrees > 0) & np.isfinite(nis))
+    if len(used) < 4 * WINDOW:
+        return
+    ones = np.ones(WINDOW)
+    sums = np.convolve(nis[used], ones, "valid")
+    bounds = chi2.isf(IMPROBABLE, np.convolve(degrees[used], ones, "valid"))
+    is_well = sums <= bounds
+    if is_well[-1] or not is_well.any():
+        return
+    last = int(np.flatnonzero(is_well)[-1])
+    if len(is_well) - last < 2 * WINDOW or np.mean(is_well[: last + 1]) < REGULAR:
+        return
+    row = int(used[min(last + WINDOW, len(used) - 1)])
+    later = used[last + WINDOW :]
+    about = f" of {int(stream['target_id'][row])}" if stream["target_id"][row] else ""
+    yield Finding(
+        "divergence",
+        topic,
+        f"{case}: diverges at {_at(stream.publish_time_ns[row], epoch_ns)}, after the measurement"
+        f"{about}: "
+        f"NIS per component is {nis[later].sum() / degrees[later].sum():.3g} from there on, and was as "
+        "expected before",
+        int(stream.publish_time_ns[row]),
+    )
+
+
+def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
+    """Where flags are set so many times in a row, and more: from and to."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
+
+
+def of_messages(streams: Sequence[Stream], epoch_ns: int) -> Iterator[Finding]:
+    """Lost, repeated and late messages, values that saturate or are coarse."""
+    for stream in streams:
+        if len(stream) >= FEWEST:
+            yield from _of_stamps(stream, epoch_ns)
+            yield from _of_values(stream)
+
+
+def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
+    stamps_ns = np.unique(stream.publish_time_ns)
+    steps = np.diff(stamps_ns)
+    if len(steps) >= FEWEST:
+        usual = float(np.median(steps))
+        multiples = np.rint(steps / usual)
+        is_regular = np.abs(steps / usual - multiples) < 0.2
+        gaps = np.flatnonzero(is_regular & (multiples > 1))
+        if np.mean(is_regular) > REGULAR and len(gaps) > LOST * len(steps):
+            lost = int(np.sum(multiples[gaps] - 1))
+            share = lost / (lost + len(stamps_ns))
+            yield Finding(
+                "lost messages",
+                stream.topic,
+                f"{stream.topic}: {100.0 * share:.2g} % of its messages are lost: {lost} are missing "
+                f"from steps of {usual * 1e-9:.3g} s, in {len(gaps)} gaps; look for them where the "
+                "log is recorded",
+                int(stamps_ns[gaps[0]]),
+            )
+        longest = int(np.argmax(steps))
+        sees_targets = "target_id" in stream.columns  # and is silent where there are none
+        if steps[longest] > LONG_GAP * usual and not sees_targets:
+            yield Finding(
+                "lost messages",
+                stream.topic,
+                f"{stream.topic}: silent for {steps[longest] * 1e-9:.3g} s from "
+                f"{_at(stamps_ns[longest], epoch_ns)} on, where {usual * 1e-9:.3g} s are usual",
+                int(stamps_ns[longest]),
+            )
+    repeated = _repeated(stream)
+    if repeated > REPEATED * len(stream):
+        yield Finding(
+            "stamps",
+            stream.topic,
+            f"{stream.topic}: {repeated} messages are there twice, with equal stamp and content, and "
+            "count twice; leave them out where the log is written",
+        )
+    in_order = stream.publish_time_ns[np.argsort(stream.log_time_ns, kind="stable")]
+    behind = np.maximum.accumulate(in_order) - in_order
+    if np.mean(behind > 0) > REPEATED:
+        yield Finding(
+            "stamps",
+            stream.topic,
+            f"{stream.topic}: {int(np.sum(behind > 0))} messages came after newer ones, up to "
+            f"{behind.max() * 1e-9:.3g} s behind; in the order of arrival replay with --late rewind:"
+            f"{np.ceil(behind.max() * 1e-8) / 10:.2g}",
+        )
+
+
+def _repeated(stream: Stream) -> int:
+    """How many messages equal the one before in stamp and content."""
+    same = np.diff(stream.publish_time_ns) == 0
+    for column in stream.columns.values():
+        step = column[1:] == column[:-1]
+        same &= step if step.ndim == 1 else step.all(axis=1)
+    return int(same.sum())
+
+
+def _of_values(stream: Stream) -> Iterator[Finding]:
+    for entry in stream.schema:
+        if entry.kind not in ("real", "vector") or entry.name.startswith("covariance"):
+            continue
+        column = stream[entry.name]
+        for place, values in enumerate(column.reshape(len(column), -1).T):
+            known = values[np.isfinite(values)]
+            distinct = np.unique(known)
+            if len(distinct) < FEWEST:
+                continue
+            name = entry.name if column.ndim == 1 else f"{entry.name}[{place}]"
+            for extreme, what in ((distinct[0], "least"), (distinct[-1], "greatest")):
+                count = int(np.sum(known == extreme))
+                usual = len(known) / len(distinct)
+                if count > max(SATURATED * len(known), 5.0 * usual, 5.0):
+                    yield Finding(
+                        "values",
+                        stream.topic,
+                        f"{stream.topic}: {name} saturates: {count} values are {extreme:.6g}, the "
+                        f"{what}; leave these out where the log is written",
+                    )
+            steps = np.diff(distinct)
+            quantum = float(np.median(steps))
+            is_coarse = len(distinct) < 0.5 * len(known) and np.allclose(
+                steps / quantum, np.rint(steps / quantum), atol=1e-3
+            )
+            noise = float(np.median(np.abs(np.diff(known)))) / 0.954  # of white noise: 0.954 sigma
+            if is_coarse and quantum > COARSE * noise:
+                yield Finding(
+                    "values",
+                    stream.topic,
+                    f"{stream.topic}: {name} is rounded to {quantum:.3g}, more than half of its noise; "
+                    "state a noise that holds the rounding, or record more digits",
+                )
+
+
+def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Variances that stop at a floor."""
+    for topic, stream in estimates.items():
+        if len(stream) < FEWEST or not stream.components:
+            continue
+        size = round(stream["covariance"].shape[1] ** 0.5)
+        variances = np.diagonal(stream["covariance"].reshape(-1, size, size), axis1=1, axis2=2)
+        for place, column in enumerate(variances.T):
+            distinct = np.unique(column[np.isfinite(column)])
+            if len(distinct) < 2 or distinct[0] <= 0.0:
+                continue
+            share = float(np.mean(column == distinct[0]))
+            if share > FLOOR and distinct[1] > distinct[0] * (1.0 + FLOOR_STEP):
+                yield Finding(
+                    "covariance floor",
+                    topic,
+                    f"{split_topic(topic)[1] or topic}: the variance of component {place} is "
+                    f"{distinct[0]:.3g} in {100.0 * share:.2g} % of the estimates, and never smaller: a "
+                    "floor that no measurement gets below",
+                )
+
+
+def _at(time_ns: int, epoch_ns: int) -> str:
+    return f"{(int(time_ns) - epoch_ns) * 1e-9:.4g} s"

@@ -1,0 +1,383 @@
+"""The study of diagnosing: faults put into logs and settings, and how often a diagnosis names them.
+
+Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame. What
+removing a fault gains in log-likelihood says whether it can be seen at all: of ten faults in three
+scenarios some cannot, as a delay of the only sensor of a vehicle that nothing else moves.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.claims import Claim, judged
+from pipeline.diagnosing import alterations as alter
+from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
+from pipeline.diagnosing.hypotheses import Kind
+from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.ensemble import hash_streams
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Outcome
+from recorders.parameters import merge
+from recorders.recording import record_run
+from replay.engine.sources import MemorySource, memory_source
+
+WORTH = 10.0  # of log-likelihood: a fault whose removal gains less is not counted
+FIRST, FIRST_TWO, CLEAN, COVERED = 0.80, 0.95, 0.90, 0.90  # what the shares have to be
+DEGREE = np.pi / 180.0
+QUANTITIES = (
+    "worth",
+    "counted",
+    "first_share",
+    "first_two_share",
+    "covered_share",
+    "named_share",
+    "nothing_share",
+)
+CLEAN_RUN = "none"
+
+
+class Fault(NamedTuple):
+    """A fault, and what a diagnosis should say.
+
+    Attributes:
+        kind, topic: what is named; any topic where that is empty.
+        value: of its number, which its 95 % interval should hold; None where there is none.
+        record: the recorder's parameters that make it.
+        settings: those of the estimator.
+        alteration: of the topic `altered`, by `by`.
+        exchanged: two topics whose messages stand for each other.
+    """
+
+    kind: Kind | None = None
+    topic: str = ""
+    value: float | None = None
+    record: Mapping[str, Any] = {}
+    settings: Mapping[str, Any] = {}
+    altered: str = ""
+    alteration: Callable[[MemorySource, int], alter.Alteration] | None = None
+    by: float = 0.0
+    exchanged: tuple[str, str] | None = None
+
+
+class Scenario(NamedTuple):
+    """What is recorded, the estimator, and the faults by name."""
+
+    recorder: str
+    parameters: Mapping[str, Any]
+    estimator: str
+    faults: Mapping[str, Fault]
+
+
+def _plain(alteration: alter.Alteration) -> Callable[[MemorySource, int], alter.Alteration]:
+    return lambda _source, _seed: alteration
+
+
+def _drift(source: MemorySource, _: int) -> alter.Alteration:
+    return alter.drifted(*source.extent("publish_time"))
+
+
+def _landmark_numbers(source: MemorySource, seed: int) -> alter.Alteration:
+    numbers = source.streams["/landmarks"]["landmark_id"]
+    first, second = np.random.default_rng(seed).choice(numbers, 2, replace=False).tolist()
+    return alter.renumbered("landmark_id", first, second)
+
+
+SEEN, FIX, VELOCITY = "/robot1/range_bearing", "/body/fix", "/body/velocity"
+NOISE: Kind = "measurement noise"
+BIAS: Kind = "bias or turned frame"
+LOST: Kind = "lost messages"
+SCENARIOS = {
+    "landmarks": Scenario(
+        "landmarks",
+        {"speed_mps": 2.0},
+        "ekf",
+        {
+            "R": Fault(
+                NOISE, "sigma_bearing_rad", np.log(3.0), settings={"sigma_bearing_rad": 0.02 / 3.0}
+            ),
+            "Q": Fault(
+                "process noise",
+                "turn_noise_density",
+                np.log(3.0),
+                settings={"turn_noise_density": 0.01 / 3.0},
+            ),
+            "bias": Fault(BIAS, SEEN, 0.1, record={"range_bearing": {"bias_range_m": 0.1}}),
+            "delay": Fault("delay", SEEN, 0.05, record={"range_bearing": {"stamp_offset_s": 0.05}}),
+            "outliers": Fault("outliers", record={"range_bearing": {"outlier_probability": 0.02}}),
+            "drift": Fault("clock drift", altered=SEEN, alteration=_drift, by=1e-4),
+            "numbers": Fault(
+                "exchanged numbers", "/landmarks", altered="/landmarks", alteration=_landmark_numbers
+            ),
+            "heading": Fault(
+                "start",
+                "/robot1/prior",
+                altered="/robot1/prior",
+                alteration=_plain(alter.shifted("mean", 2)),
+                by=0.5,
+            ),
+            "frame": Fault(
+                BIAS, SEEN, 2.0 * DEGREE, record={"range_bearing": {"bias_bearing_rad": 2.0 * DEGREE}}
+            ),
+            "loss": Fault(
+                LOST, SEEN, altered=SEEN, alteration=lambda _, seed: alter.thinned(seed), by=0.2
+            ),
+        },
+    ),
+    "navigation": Scenario(
+        "navigation",
+        {"duration_s": 60.0, "unit": {"rate_hz": 50.0, "force_noise_density": 0.02}},
+        "ekf",
+        {
+            "R": Fault(
+                NOISE,
+                FIX,
+                np.log(3.0),
+                altered=FIX,
+                alteration=_plain(alter.spread("covariance_m2")),
+                by=-np.log(3.0),
+            ),
+            "Q": Fault(
+                "process noise",
+                "force_noise_density",
+                np.log(5.0),
+                settings={"force_noise_density": 0.02 / 5.0},
+            ),
+            "bias": Fault(
+                BIAS,
+                VELOCITY,
+                0.3,
+                altered=VELOCITY,
+                alteration=_plain(alter.shifted("velocity_mps", 0)),
+                by=0.3,
+            ),
+            "delay": Fault("delay", FIX, 0.05, record={"gnss": {"delay_s": 0.05}}),
+            "outliers": Fault(
+                "outliers",
+                altered=FIX,
+                alteration=lambda _, seed: alter.strayed(seed, "position_m"),
+                by=0.02,
+            ),
+            "drift": Fault("clock drift", altered=FIX, alteration=_drift, by=1e-4),
+            "heading": Fault(
+                "start",
+                "/body/prior",
+                altered="/body/prior",
+                alteration=_plain(alter.heading_turned),
+                by=0.5,
+            ),
+            "frame": Fault(
+                BIAS,
+                VELOCITY,
+                2.0 * DEGREE,
+                altered=VELOCITY,
+                alteration=_plain(alter.turned("velocity_mps")),
+                by=2.0 * DEGREE,
+            ),
+            "loss": Fault(
+                LOST, FIX, altered=FIX, alteration=lambda _, seed: alter.thinned(seed), by=0.2
+            ),
+        },
+    ),
+    "vehicles": Scenario(
+        "vehicles",
+        {"stochastic": True},
+        "vehicle-kalman",
+        {
+            "R": Fault(
+                NOISE,
+                "/vehicle2/fix",
+                np.log(3.0),
+                altered="/vehicle2/fix",
+                alteration=_plain(alter.spread("covariance_m2")),
+                by=-np.log(3.0),
+            ),
+            "Q": Fault(
+                "process noise",
+                "acceleration_sigma_mps2",
+                np.log(4.0),
+                settings={"acceleration_sigma_mps2": 0.5 / 4.0},
+            ),
+            "bias": Fault(
+                BIAS,
+                "/vehicle2/fix",
+                3.0,
+                altered="/vehicle2/fix",
+                alteration=_plain(alter.shifted("position_m", 0)),
+                by=3.0,
+            ),
+            "delay": Fault(
+                "delay",
+                "/vehicle2/fix",
+                0.05,
+                altered="/vehicle2/fix",
+                alteration=lambda source, _: alter.delayed(*source.extent("publish_time")),
+                by=0.05,
+            ),
+            "outliers": Fault(
+                "outliers",
+                altered="/vehicle2/fix",
+                alteration=lambda _, seed: alter.strayed(seed, "position_m"),
+                by=0.02,
+            ),
+            "drift": Fault("clock drift", altered="/vehicle2/fix", alteration=_drift, by=1e-4),
+            "numbers": Fault("exchanged numbers", exchanged=("/vehicle1/fix", "/vehicle2/fix")),
+            "heading": Fault(
+                "start",
+                "/vehicle3/prior",
+                altered="/vehicle3/prior",
+                alteration=_plain(alter.shifted("mean", 3)),
+                by=-6.0,
+            ),
+            "frame": Fault(
+                BIAS,
+                "/vehicle2/fix",
+                2.0 * DEGREE,
+                altered="/vehicle2/fix",
+                alteration=_plain(alter.turned("position_m")),
+                by=2.0 * DEGREE,
+            ),
+            "loss": Fault(
+                LOST,
+                "/vehicle2/fix",
+                altered="/vehicle2/fix",
+                alteration=lambda _, seed: alter.thinned(seed),
+                by=0.2,
+            ),
+        },
+    ),
+}
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    rows: list[dict[str, Any]] = []
+    clean: list[MemorySource] = []
+    for name, scenario in SCENARIOS.items():
+        for fault_name, fault in {CLEAN_RUN: Fault(), **scenario.faults}.items():
+            title = f"{name}: {fault_name}"
+            for run in setting.progress(range(experiment.runs), title, experiment.runs):
+                source, faulty = _recorded(scenario, fault, experiment.seed, run)
+                found = diagnose(faulty, scenario.estimator, set=merge(fault.settings, OPEN))
+                row = {"scenario": name, "fault": fault_name, "run": run}
+                rows.append(
+                    {**row, "worth": _worth(scenario, fault, source, faulty), **_said(fault, found)}
+                )
+                if fault_name == CLEAN_RUN:
+                    clean.append(source)
+    runs = pd.DataFrame(rows)
+    faults = runs.groupby(["scenario", "fault"], sort=False).apply(_summary).reset_index()
+    outcome = Outcome(tables={"faults": faults, "diagnosed": runs}, figures={"faults": _chart(faults)})
+    for summary in faults.to_dict("records"):
+        case = f"{summary['scenario']}-{summary['fault']}"
+        for quantity in QUANTITIES:
+            outcome.metrics[f"diagnosis.{quantity}.{case}"] = summary[quantity]
+    outcome.claims = _claims(runs)
+    outcome.input_sha256 = hash_streams(clean)
+    return outcome
+
+
+def _recorded(
+    scenario: Scenario, fault: Fault, seed: int, run: int
+) -> tuple[MemorySource, MemorySource]:
+    """A run without a fault, and the same with it."""
+    parameters = merge(scenario.parameters, fault.record)
+    source = memory_source(*record_run(scenario.recorder, scenario.parameters, seed, run))
+    faulty = memory_source(*record_run(scenario.recorder, parameters, seed, run))
+    if fault.alteration is not None:
+        alteration = fault.alteration(faulty, run)
+        faulty = alter.altered(faulty, fault.altered, alteration, fault.by)
+    if fault.exchanged is not None:
+        faulty = alter.exchanged(faulty, *fault.exchanged)
+    return source, faulty
+
+
+def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: MemorySource) -> float:
+    """What removing the fault gains in log-likelihood; nothing where its measurements are fewer."""
+    likelihood = Likelihood(scenario.estimator)
+    settings = {"kind": scenario.estimator, **OPEN}
+    likelihood.begin(Trial(faulty, merge(settings, fault.settings)))
+    with_it = likelihood(Trial(faulty, merge(settings, fault.settings)))
+    return max(likelihood(Trial(source, settings)) - with_it, 0.0)
+
+
+def _said(fault: Fault, found: Diagnosis) -> dict[str, Any]:
+    """What the diagnosis said, and whether it is right."""
+    is_right = [
+        each.kind == fault.kind and (not fault.topic or each.topic == fault.topic)
+        for each in found.sentences
+    ]
+    first = found.sentences[0] if found.sentences else None
+    named = next((each for each, right in zip(found.sentences, is_right, strict=True) if right), None)
+    covers = np.nan
+    if named is not None and named.cause is not None and fault.value is not None:
+        low, high = named.cause.ends
+        covers = float(low <= fault.value <= high)
+    return {
+        "sentences": len(found.sentences),
+        "first_kind": first.kind if first else "",
+        "first_topic": first.topic if first else "",
+        "is_first": any(is_right[:1]),
+        "is_in_first_two": any(is_right[:2]),
+        "covers": covers,
+    }
+
+
+def _summary(rows: pd.DataFrame) -> pd.Series:
+    """Over the runs: how many are worth it, and of these how often the fault is named, and covered."""
+    counted = rows[rows["worth"] >= WORTH]
+    return pd.Series(
+        {
+            "worth": rows["worth"].median(),
+            "counted": float(len(counted)),
+            "first_share": counted["is_first"].mean(),
+            "first_two_share": counted["is_in_first_two"].mean(),
+            "covered_share": counted["covers"].mean(),
+            "named_share": rows["is_in_first_two"].mean(),
+            "nothing_share": (rows["sentences"] == 0).mean(),
+        }
+    )
+
+
+def _claims(runs: pd.DataFrame) -> list[Claim]:
+    """What a diagnosis has to do; thresholds were set before any of these runs was seen."""
+    clean = runs[runs["fault"] == CLEAN_RUN]
+    counted = runs[runs["worth"] >= WORTH]
+    known = counted.dropna(subset=["covers"])
+    sizes = known[known["fault"].isin(["R", "Q", "delay"])]
+    conditions = (
+        ("a fault whose removal gains 10 or more is named first", counted["is_first"], FIRST),
+        ("it is named first or second", counted["is_in_first_two"], FIRST_TWO),
+        ("nothing is found in a clean run", clean["sentences"] == 0, CLEAN),
+        ("scales of noise and delays lie in their 95 % intervals", sizes["covers"], COVERED),
+    )
+    return [
+        judged(
+            claim,
+            f"in {100 * least:.0f} %",
+            f"in {100 * share.mean():.1f} % of {len(share)}",
+            bool(share.mean() >= least),
+        )
+        for claim, share, least in conditions
+    ]
+
+
+def _chart(faults: pd.DataFrame) -> Chart:
+    """How often each fault that can be seen is named first."""
+    names = list(dict.fromkeys(faults["fault"]))
+    panel = Panel(
+        x=Axis(label="fault: " + ", ".join(f"{place} {name}" for place, name in enumerate(names))),
+        y=Axis(label="named first", limits=(0.0, 1.05)),
+    )
+    for scenario, rows in faults.groupby("scenario", sort=False):
+        places = [names.index(name) for name in rows["fault"]]
+        panel.series.append(curve(str(scenario), places, rows["first_share"], "line+markers"))
+    panel.series.append(level("80 %", list(range(len(names))), FIRST))
+    return Chart(
+        title="faults that are named first, of those worth 10 in log-likelihood", panels=[panel]
+    )
+
+
+DIAGNOSIS = Study("how often a diagnosis names the fault that was put into a log", study)
