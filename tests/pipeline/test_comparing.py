@@ -108,6 +108,16 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     assert found.groups[0][1].sizes == {("nees", "robot1"): 3.0}
 
 
+def test_a_result_of_logs_is_replayed_from_them(
+    logs: list[Path], fuselog: Fuselog, tmp_path: Path
+) -> None:
+    assert fuselog("run", *logs[:2], "-e", "ekf", "-e", "ukf", "--out", tmp_path / "own").code == 0
+    found = fl.compare(tmp_path / "own")
+    assert "log_likelihood" in set(found.table["quantity"])
+    assert set(found.table["runs"]) == {2}
+    assert not [note for note in found.notes if "as the result has them" in note]
+
+
 def test_a_trajectory_is_compared_like_estimates(
     estimates: Path, fuselog: Fuselog, tmp_path: Path
 ) -> None:
@@ -120,7 +130,7 @@ def test_a_trajectory_is_compared_like_estimates(
     own = fl.compare(log, estimators=["ekf", "ukf"]).table.query("quantity == 'position_rmse_m'").iloc[0]
     assert row["difference"] == pytest.approx(own["difference"], rel=1e-6)
     assert row["verdict"] == "unclear"
-    assert "takes 5 runs or more, and there is 1 run" in found.sentences[0]
+    assert "takes 5 runs or more, and this is of 1 run" in found.sentences[0]
     assert "nees" not in set(found.table["quantity"])
     found.draw(tmp_path / "both.rrd")
     other = fl.compare(file, file, truth=file).table
