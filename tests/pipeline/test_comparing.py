@@ -1,9 +1,9 @@
 """Comparing: what two sides are made of, what is said of them, what is refused."""
 
-import json
 import re
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pytest
 import rerun.blueprint as rrb
 
 import fuselog as fl
+from pipeline.comparing.comparing import _unlike
 from replay.timeline.side_by_side import _alone
 
 Fuselog = Callable[..., Any]
@@ -146,7 +147,15 @@ def test_what_is_not_alike_is_said(logs: list[Path], estimates: Path, fuselog: F
     assert "only estimates has 2 runs, left out: landmarks, seed 2, run 6" in notes
     assert "estimator.sigma_range_m" in notes
     assert {row["runs"] for row in said.json["differences"]} == {6}
-    json.dumps(said.json)
+
+
+def test_different_truths_are_said(estimates: Path) -> None:
+    [[first, second]] = fl.compare(estimates, estimators=["ekf", "ukf"]).groups
+    run = next(iter(second.truths))
+    assert not [note for note in _unlike(first, second) if "truths" in note]
+    moved = replace(second, truths={**second.truths, run: "another"})
+    [note] = [note for note in _unlike(first, moved) if "truths" in note]
+    assert note == f"ekf and ukf have different truths in 1 run: {run}"
 
 
 @pytest.mark.parametrize(
