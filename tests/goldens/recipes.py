@@ -18,8 +18,8 @@ from recorders.parameters import merge
 from recorders.recording import import_run, record_run
 from replay.engine.sources import MemorySource, memory_source
 
-# Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive that
-# this is in.
+# Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive
+# that this is in.
 DATA = {
     "ais": ("solent_ais.csv.xz", ""),
     "autoferry": ("autoferry", "autoferry.tar.xz"),
