@@ -7,6 +7,8 @@ from pipeline.charts import band as band
 from pipeline.charts import curve as curve
 from pipeline.claims import Claim as Claim
 from pipeline.claims import judged as judged
+from pipeline.comparing.comparing import Differences as Differences
+from pipeline.comparing.comparing import compare as compare
 from pipeline.diagnosing.diagnosis import Diagnosis as Diagnosis
 from pipeline.diagnosing.diagnosis import diagnose as diagnose
 from pipeline.door import ResultFolder as ResultFolder

@@ -11,15 +11,19 @@ import logging
 import pickle
 import shutil
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain, islice
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any, NamedTuple
 
 from pipeline.ensemble import KEPT_BYTES, Pass, parts_of, require_memory
-from pipeline.executors import Crew, Here, here, version_of_code
-from pipeline.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.executors import Crew, Team, here, states_of, version_of_code
+from pipeline.experiment import Experiment, Logs, Record, Setting, load_scenario
 from pipeline.kept import Kept
 from pipeline.runner import Runner
 from recorders.errors import BadInput
@@ -30,7 +34,8 @@ ATTEMPTS = 3
 _LOG = logging.getLogger("fuselog")
 
 
-class Cell(NamedTuple):
+@dataclass(frozen=True)
+class Cell:
     """The runs from `first` to `end` of an experiment.
 
     Attributes:
@@ -51,18 +56,21 @@ class Cell(NamedTuple):
     place: Path
 
     @property
-    def writes(self) -> bool:
-        """Whether there will be files."""
-        return self.draws or self.logs > 0 or self.errors
+    def runs(self) -> int:
+        """How many there are."""
+        return self.end - self.first
 
     @property
+    def files(self) -> list[Path]:
+        """The logs that it reads."""
+        return self.experiment.files[self.first : self.end]
+
+    @cached_property
     def key(self) -> str:
         """A hash of what decides about the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
-        states = [file.stat() for file in self.experiment.files[self.first : self.end]]
-        data = [(state.st_size, state.st_mtime_ns) for state in states]
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
-        said = [experiment, data, runs, str(self.place.absolute()), version_of_code()]
+        said = [experiment, states_of(self.files), runs, str(self.place), version_of_code()]
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
@@ -74,7 +82,7 @@ class Cell(NamedTuple):
 
     def packed(self, folder: Path) -> bytes:
         """The same as bytes, which any process can take; BadInput where a metric stands against that."""
-        if self.writes:
+        if self.draws or self.logs or self.errors:
             shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
             folder.mkdir()
         done = self.work_off(folder)
@@ -87,6 +95,68 @@ class Cell(NamedTuple):
             ) from error
 
 
+class Sent(NamedTuple):
+    """A cell for a machine with other files: logs go there, and what is written comes back, as bytes.
+
+    Attributes:
+        cell: what there is to do.
+        logs: those of the cell that the machine does not see, by their paths without links.
+    """
+
+    cell: Cell
+    logs: Sequence[tuple[Path, bytes]]
+
+    def packed(self) -> tuple[bytes, dict[str, bytes]]:
+        """What `Cell.packed` gives, and the files that it writes, by their paths in its folder."""
+        with TemporaryDirectory() as scratch:
+            root, folder = Path(scratch).resolve() / "root", Path(scratch) / "files"
+            try:
+                left = self._unpacked(root).packed(folder)
+            except BadInput as error:
+                raise BadInput(str(error).replace(str(root), "")) from error
+            written = (path for path in folder.rglob("*") if path.is_file())
+            return left, {path.relative_to(folder).as_posix(): path.read_bytes() for path in written}
+
+    def _unpacked(self, root: Path) -> Cell:
+        """The cell with its logs, and its result's place, in a folder as if that were the root."""
+        if not self.logs:
+            return self.cell
+
+        def below(path: Path) -> Path:
+            return root / path.relative_to(path.anchor)
+
+        experiment, files = self.cell.experiment, list(map(str, self.cell.experiment.files))
+        for number, (path, content) in enumerate(self.logs, self.cell.first):
+            files[number] = str(below(path))
+            below(path).parent.mkdir(parents=True, exist_ok=True)
+            below(path).write_bytes(content)
+        moved = experiment.model_copy(update={"logs": Logs(files=files)})
+        return replace(self.cell, experiment=moved, place=below(self.cell.place))
+
+
+@dataclass
+class Pace:
+    """How a campaign goes, as its progress shows it.
+
+    Attributes:
+        runs: of all cells.
+        done: those of the cells that are merged.
+        worked_off: those of them that no earlier campaign had kept.
+        workers: how many work at once.
+    """
+
+    runs: int
+    done: int = 0
+    worked_off: int = 0
+    workers: int = 0
+    _begun_s: float = field(default_factory=perf_counter)
+
+    def __str__(self) -> str:
+        rate = self.worked_off / (perf_counter() - self._begun_s)
+        workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
+        return f"replaying: {self.done} of {self.runs} runs, {rate:.0f} runs/s, {workers}; cells"
+
+
 def judge(experiment: Experiment, setting: Setting) -> Pass:
     """Replay and judge all runs of an experiment, cell by cell; its files go to the setting's folder.
 
@@ -95,7 +165,7 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
     cells = cells_of(experiment, setting)
     if len(cells) == 1 or setting.kept is None:  # nothing to share, and nothing to go on with
         return cells[0].work_off(setting.folder, setting).check()
-    (done,) = judge_all([experiment], setting)
+    (done,) = _merged([cells], setting)
     setting.kept.hand_over([cell.key for cell in cells], setting.folder)
     return done
 
@@ -105,12 +175,16 @@ def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[P
 
     Files stay where cells are kept.
     """
+    return _merged([cells_of(experiment, setting) for experiment in experiments], setting)
+
+
+def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]:
+    """What each part of the cells leaves, merged in their order."""
     assert setting.kept is not None
-    parts = [cells_of(experiment, setting) for experiment in experiments]
     cells = list(chain.from_iterable(parts))
-    runs = sum(experiment.runs for experiment in experiments)
-    results = work_off(cells, setting.crew or here, setting.kept)
-    told = iter(setting.progress(results, f"replaying {runs} runs", len(cells)))
+    pace = Pace(sum(cell.runs for cell in cells))
+    results = work_off(cells, setting.crew or here, setting.kept, pace)
+    told = iter(setting.progress(results, pace, len(cells)))
     for part in parts:
         whole = next(told)
         hashes = hashlib.sha256(whole.input_sha256.encode())
@@ -120,6 +194,8 @@ def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[P
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
+    for _ in told:  # there are no more: progress and team come to their ends
+        pass
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
@@ -134,11 +210,12 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
     for now in parts_of(experiment.runs):
         logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
         draws = setting.draws and now.start == 0
-        cells.append(Cell(experiment, now.start, now.stop, logs, draws, setting.errors, setting.place))
+        place = setting.place.resolve()
+        cells.append(Cell(experiment, now.start, now.stop, logs, draws, setting.errors, place))
     return cells
 
 
-def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept) -> Iterator[Pass]:
+def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Iterator[Pass]:
     """What cells leave, in their order; those that are kept are not worked off again.
 
     Memory holds what is handed out and what comes in. Raises BadInput where the workers of a cell died
@@ -154,16 +231,17 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept) -> Iterator[Pass]:
     following = 0
     while following < len(cells):
         with crew() as team:
-            pending: dict[Future[bytes], int] = {}
+            pace.workers = team.workers
+            begin = _beginner(team, [cells[number] for number in waiting], kept)
+            pending: dict[Future[Any], int] = {}
             lost: BaseException | None = None
             while following < len(cells) and lost is None:
                 while waiting and len(pending) < team.workers:
                     number = waiting.popleft()
-                    cell, folder = cells[number], kept.place_of(keys[number])
-                    worker = team.executor if team.shares_files or not cell.writes else Here()
-                    pending[worker.submit(cell.packed, folder)] = number
+                    pending[begin(cells[number])] = number
                 left = kept.read(keys[following])
                 if left is not None:
+                    pace.done += cells[following].runs
                     yield left
                     following += 1
                     continue
@@ -171,9 +249,13 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept) -> Iterator[Pass]:
                     error = future.exception()
                     if isinstance(error, team.lost):
                         lost = error
-                    else:
-                        number = pending.pop(future)
+                        continue
+                    number = pending.pop(future)
+                    pace.worked_off += cells[number].runs
+                    if team.sees is None:
                         kept.write(keys[number], future.result())
+                    else:
+                        kept.write(keys[number], *future.result())
             if lost is not None:  # and with it all others of some executors
                 died.update(pending.values())
                 waiting.extendleft(sorted(pending.values(), reverse=True))
@@ -184,3 +266,17 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept) -> Iterator[Pass]:
                         f"runs {cell.first} to {cell.end - 1}: the process that worked on them died "
                         f"{times} times ({lost}); try fewer workers, or --workers 1 to see why"
                     )
+
+
+def _beginner(team: Team, cells: Sequence[Cell], kept: Kept) -> Callable[[Cell], Future[Any]]:
+    """What hands a cell to the team; logs that its workers do not see go with it."""
+    sees, submit = team.sees, team.executor.submit
+    if sees is None:
+        return lambda cell: submit(cell.packed, kept.place_of(cell.key))
+    carries = not sees([file for cell in cells for file in cell.files])
+
+    def send(cell: Cell) -> Future[Any]:
+        paths = [file.resolve() for file in cell.files] if carries else []
+        return submit(Sent(cell, [(path, path.read_bytes()) for path in paths]).packed)
+
+    return send

@@ -131,7 +131,7 @@ def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
 def _model(name: str, model: Model) -> Entry:
     facts = {"state": _listed(model.state)}
     for sensor in model.all_sensors:
-        of = f" of {sensor.about.topic}" if sensor.about else ""
+        of = f" of {', '.join(each.topic for each in sensor.maps)}" if sensor.maps else ""
         taken = " or ".join(serving(sensor.schema))
         facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({taken})"
     for control in [model.control, *model.control.instead] if model.control else []:

@@ -81,12 +81,12 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Share the runs among N processes, of one core each."
+    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, of one core each."
 )
 scheduler_option = click.option(
     "--scheduler",
     metavar="ADDRESS|local:N",
-    help="Share the runs among the workers of a Dask scheduler, or of one with N on this machine.",
+    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
@@ -347,6 +347,8 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
+@workers_option
+@scheduler_option
 @recover_option
 @gap_option
 @json_option
@@ -500,11 +502,11 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
-@fuselog.command(short_help="Write a log's streams as TUM, KITTI, CSV, Parquet or Foxglove files.")
+@fuselog.command(short_help="Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.")
 @click.argument("path", type=ANY_PATH)
 @click.option(
     "--to",
-    type=click.Choice(["tum", "kitti", "csv", "parquet", "foxglove"]),
+    type=click.Choice(["tum", "kitti", "mot", "csv", "parquet", "foxglove"]),
     required=True,
     help="The format.",
 )
@@ -519,8 +521,9 @@ def evaluate(
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    To tum and kitti go the estimates and truths that state a position, as trajectories; to csv and
-    parquet any stream, as a table; to foxglove one log of the messages that Foxglove and Rerun show.
+    To tum and kitti go the estimates and truths that state a position, as trajectories; to mot tracks
+    and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a table; to
+    foxglove one log of the messages that Foxglove and Rerun show.
     """
     from pipeline.exporting import export as export_log
 
@@ -729,6 +732,38 @@ def sweep(
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     sweep_named(experiment, labels, over, **options)
+
+
+@fuselog.command(short_help="Compare estimators over the same runs, with a verdict on every metric.")
+@click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
+@click.option("--case", help="What trajectory files are of, such as robot2, where a log has several.")
+@click.option(
+    "--margin",
+    type=click.FloatRange(min=0),
+    default=0.02,
+    show_default=True,
+    help="Which share of a metric is no matter.",
+)
+@click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
+@click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
+    """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
+
+    Or estimators over logs: fuselog compare LOG.mcap ... -e ekf -e ukf
+
+    All others are compared with the first, metric by metric over the runs that both have, with
+    intervals of 95 % by the bootstrap over runs.
+    """
+    from pipeline.comparing.command import compare_sides
+
+    compare_sides(list(sides), list(labels), **options)
 
 
 @fuselog.command(short_help="Render results as one self-contained HTML page.")

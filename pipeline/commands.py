@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.executors import crew_of
-from pipeline.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
+from pipeline.experiment import Stated, experiment_of_logs, read_experiment, run_experiment
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import (
     ErrorTables,
@@ -43,7 +43,7 @@ from recorders.log import Companions, Log, NotMcap, open_log
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import parse_json, read_toml
 from replay.engine.estimator import find_estimator
-from replay.engine.sources import LogSource
+from replay.engine.sources import LogSource, Source
 from replay.judging.judge import Judge
 from replay.judging.metrics import find_metrics
 from replay.judging.trajectories import Comparison
@@ -234,7 +234,7 @@ def evaluate_logs(
     for each in opened:
         if not any(topic.startswith("/estimates/") for topic in each.topics):
             raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
-    places = logs or [source_path(each) for each in opened]
+    places = logs or [log_of_estimates(each) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
     sources = [LogSource(open_log(path, recover=recover)) for path in places]
@@ -325,7 +325,7 @@ def evaluate_trajectory(
         say(str(path))
 
 
-def source_path(estimates: Log) -> Path:
+def log_of_estimates(estimates: Log) -> Path:
     """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
     named = estimates.run.notes.get("log") if estimates.run else None
     if named is None:
@@ -336,7 +336,7 @@ def source_path(estimates: Log) -> Path:
     return path
 
 
-def stated_estimators(estimates: Log) -> dict[str, Any]:
+def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
     """Parameters by label, in the order of the replay; none where the log does not say."""
     notes = estimates.run.notes if estimates.run else {}
     try:
@@ -432,7 +432,7 @@ def _draw_log(
     estimates = source = LogSource(log)
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
-        source = LogSource(open_log(source_path(log), recover=recover))
+        source = LogSource(open_log(log_of_estimates(log), recover=recover))
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
@@ -462,9 +462,12 @@ def run_named(
     settings: Sequence[str],
 ) -> None:
     """Run an experiment, or replay logs as one, and print its metrics and claims."""
-    label, experiment = _experiment_of(named, labels, over, settings_file, parse_settings(settings))
+    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
+    label, experiment = stated.name, stated.with_settings(values, over)
     if experiment.logs and data is not None and named[0].endswith(".mcap"):
         raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
+    if workers is not None or scheduler is not None:
+        experiment.require_campaign("leave out --workers and --scheduler")
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
@@ -482,25 +485,21 @@ def run_named(
     say(f"{folder}: logs, estimates, tables, figures, result.json")
 
 
-def _experiment_of(
+def _stated_experiment(
     named: Sequence[str],
     labels: Sequence[str],
     over: Mapping[str, Any],
     settings_file: Path | None,
-    values: Mapping[str, Any],
-) -> tuple[str, Experiment]:
-    """The experiment of a name or a TOML file, or that of logs, with settings; and what it is called."""
+    settings: Sequence[str],
+) -> tuple[Stated, dict[str, Any]]:
+    """The experiment of a name or a TOML file, or that of logs, and the settings that go over it."""
     files = [Path(each) for each in named if each.endswith(".mcap")]
-    if files:
-        if len(files) < len(named) or over.keys() & {"runs", "seed"}:
-            raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
-        values = merge(read_settings(settings_file, labels), values)
-        experiment = experiment_of_logs(files, labels, {**values, **over})
-        return experiment.title, experiment
-    if len(named) > 1 or labels:
+    if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
+        raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
+    if not files and (len(named) > 1 or labels):
         raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
-    estimators = load_experiment(named[0], {}, {})[1].estimators
-    return load_experiment(named[0], merge(read_settings(settings_file, estimators), values), over)
+    stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
+    return stated, merge(read_settings(settings_file, stated.labels), parse_settings(settings))
 
 
 def sweep_named(
@@ -520,18 +519,15 @@ def sweep_named(
 ) -> None:
     """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
     overs = [parse_over(text) for text in swept]
-    values = parse_settings(settings)
-
-    def at(point: Mapping[str, Any]) -> Experiment:
-        return _experiment_of(named, labels, over, settings_file, merge(values, nested(point)))[1]
-
-    label, experiment = _experiment_of(named, labels, over, settings_file, values)
+    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
+    experiment = stated.with_settings(values, over)
     points = points_of(overs, samples, sampling, experiment.seed)
-    folder = out or Path("out") / f"{label}-sweep"
+    at = [stated.with_settings(merge(values, nested(point)), over) for point in points]
+    folder = out or Path("out") / f"{stated.name}-sweep"
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs})
     crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
-    result = run_sweep(label, overs, points, list(map(at, points)), folder, crew=crew, progress=progress)
+    result = run_sweep(stated.name, overs, points, at, folder, crew=crew, progress=progress)
     if as_json:
         print_json(result.model_dump(mode="json"))
         return

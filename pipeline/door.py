@@ -18,7 +18,7 @@ import pandas as pd
 from pipeline import catalog
 from pipeline.catalog import Entry
 from pipeline.executors import crew_of, of_executor
-from pipeline.experiment import load_experiment, load_scenario, run_experiment
+from pipeline.experiment import load_experiment, load_scenario, read_experiment, run_experiment
 from pipeline.outputs import LOG, check_files, check_folder
 from pipeline.results import Result
 from pipeline.studies.localization import summary_table
@@ -153,6 +153,8 @@ def run(
     """
     over = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
     name, found = load_experiment(str(experiment), set or {}, over)
+    if workers > 1 or scheduler is not None or executor is not None:
+        found.require_campaign("leave out workers, scheduler and executor")
     folder = Path("out", name) if out is None else Path(out)
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []
@@ -191,17 +193,16 @@ def sweep(
 
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
-    stated = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    given = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
     overs = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
     points = points_of(overs)
-    at = [load_experiment(str(experiment), merge(set or {}, nested(point)), stated) for point in points]
-    name = at[0][0]
-    folder = Path("out", f"{name}-sweep") if out is None else Path(out)
+    stated = read_experiment(str(experiment))
+    found = [stated.with_settings(merge(set or {}, nested(point)), given) for point in points]
+    folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
-    found = [each for _, each in at]
     runs_in_all = sum(each.runs for each in found)
     crew = crew_of(workers, scheduler, runs_in_all) if executor is None else of_executor(executor)
-    return ResultFolder(folder, run_sweep(name, overs, points, found, folder, crew=crew))
+    return ResultFolder(folder, run_sweep(stated.name, overs, points, found, folder, crew=crew))
 
 
 class Catalog(Mapping[str, Entry]):

@@ -43,10 +43,11 @@ KEPT_BYTES = 8 * TIME_BINS
 
 Item = TypeVar("Item")
 Settings = Mapping[str, Mapping[str, Any]]
-Progress = Callable[[Iterable[Any], str, int | None], Iterable[Any]]
+# Is given items, what is done with them (asked again as it goes), and how many there are.
+Progress = Callable[[Iterable[Any], object, int | None], Iterable[Any]]
 
 
-def no_progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[Any]:  # noqa: ARG001
+def no_progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:  # noqa: ARG001
     """The progress bar of programs that show none."""
     return items
 

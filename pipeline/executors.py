@@ -4,10 +4,16 @@ import hashlib
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
@@ -32,13 +38,14 @@ class Team(NamedTuple):
     Attributes:
         executor: hands work to them.
         workers: how many work at once.
-        shares_files: whether they see the files of this process.
+        sees: of workers that may be on other machines, whether all of them see these files as this
+            process does; None on this machine, where they may write files too.
         lost: what a future raises whose worker died.
     """
 
     executor: Executor
     workers: int
-    shares_files: bool = True
+    sees: Callable[[Sequence[Path]], bool] | None = None
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
@@ -91,6 +98,14 @@ def here() -> Iterator[Team]:
     yield Team(Here(), 1)
 
 
+@contextmanager
+def threads() -> Iterator[Team]:
+    """Threads of the calling process, one for each core: for work whose kernels run side by side."""
+    count = os.cpu_count() or 1
+    with ThreadPoolExecutor(count) as pool:
+        yield Team(pool, count)
+
+
 def processes(count: int) -> Crew:
     """So many processes on this machine, each on one core; they end with this one, however that ends."""
 
@@ -135,6 +150,7 @@ def dask(scheduler: str) -> Crew:
     @contextmanager
     def begin() -> Iterator[Team]:
         try:
+            from dask import config
             from distributed import Client, KilledWorker
         except ImportError:
             mend = "pip install 'fuselog[dask]'"
@@ -151,7 +167,9 @@ def dask(scheduler: str) -> Crew:
                 ) from None
             _check_code(scheduler, client)
             workers = sum(client.nthreads().values())
-            yield Team(client.get_executor(pure=False), workers, False, (KilledWorker,))
+            sees = None if scheduler.startswith("local:") else partial(_all_see, client)
+            stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
+            yield Team(client.get_executor(pure=False), workers, sees, (KilledWorker,))
 
     return begin
 
@@ -187,6 +205,25 @@ def _check_code(scheduler: str, client: Any) -> None:
             raise BadInput(
                 f"--scheduler {scheduler}: worker {worker} has other code than this; install the same"
             )
+
+
+def _all_see(client: Any, files: Sequence[Path]) -> bool:
+    """Whether all workers see files as this process does."""
+    own = states_of(files)
+    return not files or all(found == own for found in client.run(states_of, files).values())
+
+
+def states_of(files: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Size and time of the last change of files; None of one that is not seen."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            state = file.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((state.st_size, state.st_mtime_ns))
+    return found
 
 
 @cache

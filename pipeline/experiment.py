@@ -2,11 +2,11 @@
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
@@ -89,6 +89,16 @@ class Experiment(Parameters):
         return self
 
     @property
+    def is_campaign(self) -> bool:
+        """Whether its study judges the runs and no more, so that others may work on parts of them."""
+        return self.study == "localization"
+
+    def require_campaign(self, mend: str) -> None:
+        """Raise BadInput where it is none."""
+        if not self.is_campaign:
+            raise BadInput(f"{self.title}: its study, {self.study}, does more than judge; {mend}")
+
+    @property
     def files(self) -> list[Path]:
         """The logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
@@ -141,6 +151,37 @@ def shipped(kind: str) -> dict[str, Path]:
         return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
+class Stated(NamedTuple):
+    """What an experiment is before settings go over it.
+
+    Attributes:
+        name: what it is called.
+        source: what it was read from, as messages name it.
+        values: its entries.
+        folder: what its files count from.
+    """
+
+    name: str
+    source: str
+    values: Mapping[str, Any]
+    folder: Path
+
+    @property
+    def labels(self) -> Collection[str]:
+        """The labels of its estimators."""
+        return self.with_settings({}, {}).estimators
+
+    def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
+        """The experiment with settings and then `over` over it; see `load_experiment`."""
+        where = f"experiment {self.source}"
+        own = _settings_of_experiment(build(Experiment, self.values, where), settings)
+        experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        if experiment.logs is None:
+            return experiment
+        files = _found(experiment.logs.files, self.folder, where)
+        return experiment.model_copy(update={"logs": Logs(files=files)})
+
+
 def load_experiment(
     name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
 ) -> tuple[str, Experiment]:
@@ -149,44 +190,33 @@ def load_experiment(
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
     the scenario's or importer's parameters: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`.
     """
+    stated = read_experiment(name)
+    return stated.name, stated.with_settings(settings, over)
+
+
+def read_experiment(name: str) -> Stated:
+    """An experiment by its shipped name or its TOML file, without settings."""
     known = shipped("experiments")
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
     path = known.get(name, Path(name))
-    return path.stem, _with_settings(name, read_toml(path), settings, over, path.parent)
+    return Stated(path.stem, name, read_toml(path), path.parent)
 
 
-def experiment_of_logs(
-    logs: Sequence[Path], labels: Sequence[str], settings: Mapping[str, Any]
-) -> Experiment:
-    """The experiment that replays logs through estimators, as they are but for settings.
+def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
+    """The experiment that replays logs through estimators as they are.
 
-    Raises BadInput where no estimator is named, or a setting belongs nowhere.
+    Raises BadInput where no estimator is named.
     """
     if not labels:
         raise BadInput(f"{logs[0]}: say what to replay it with, such as -e ekf")
+    title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
     values = {
-        "title": logs[0].stem if len(logs) == 1 else f"{len(logs)} logs",
+        "title": title,
         "logs": {"files": [str(log) for log in logs]},
         "estimators": {label: {} for label in labels},
     }
-    return _with_settings(str(logs[0]), values, settings, {}, Path())
-
-
-def _with_settings(
-    name: str,
-    values: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    over: Mapping[str, Any],
-    folder: Path,
-) -> Experiment:
-    where = f"experiment {name}"
-    own = _settings_of_experiment(build(Experiment, values, where), settings)
-    experiment = build(Experiment, {**merge(values, own), **over}, where)
-    if experiment.logs is None:
-        return experiment
-    files = _found(experiment.logs.files, folder, where)
-    return experiment.model_copy(update={"logs": Logs(files=files)})
+    return Stated(title, str(logs[0]), values, Path())
 
 
 def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:

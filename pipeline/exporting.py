@@ -1,6 +1,7 @@
 """Logs exported for other tools: estimates and truths as trajectories, any stream as a table.
 
-A log is read once, block by block, so that memory does not grow with it. No file is ever replaced.
+A log is read once, block by block, so that memory does not grow with it, but for tracks, which are told
+frame by frame. No file is ever replaced.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 from urllib.parse import quote
 
+from pipeline.mot import mot_files
 from pipeline.outputs import Kind, check_files, check_folder
 from recorders.atomic import whole_file, whole_folder
 from recorders.errors import BadInput, UnknownName, choices
@@ -16,10 +18,11 @@ from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_em
 from recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from replay.judging.trajectories import trajectory_of
 
-To = Literal["tum", "kitti", "csv", "parquet", "foxglove"]
+To = Literal["tum", "kitti", "mot", "csv", "parquet", "foxglove"]
 SUFFIXES: dict[To, str] = {
     "tum": ".txt",
     "kitti": ".txt",
+    "mot": ".txt",
     "csv": ".csv",
     "parquet": ".parquet",
     "foxglove": ".mcap",
@@ -47,14 +50,16 @@ def export(
     topics: Sequence[str] = (),
     recover: bool = False,
 ) -> Exported:
-    """Export topics of a log: "tum" and "kitti" trajectories, "csv" and "parquet" tables, or "foxglove".
+    """Export topics of a log: trajectories, tracks, tables or what Foxglove shows.
 
     Args:
         path: the log, or estimates log.
-        to: the format; trajectories are of estimates and truths that state a position; "foxglove" is
-            one log of what its viewers can show, see `pipeline.foxglove`.
-        out: the folder of the files, by default named after the log; of one topic, or to "foxglove", the
-            file.
+        to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
+            position; "mot" has a file of each tracker's tracks and one of all truths, see
+            `pipeline.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what its viewers
+            can show, see `pipeline.foxglove`.
+        out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
+            "foxglove", the file.
         topics: which; none stands for all that fit.
         recover: read what is whole of a log that was cut off or damaged.
 
@@ -64,6 +69,8 @@ def export(
         raise BadInput(f"no format '{to}' to export to; {choices(to, get_args(To))}")
     log = open_log(path, recover=recover)
     notes = [log.loss_statement] if log.loss_statement else []
+    if to == "mot":
+        return _export_frames(log, topics, Path(out or f"{log.path.stem}-mot"), notes)
     chosen = _chosen(log, to, topics, notes)
     if to == "foxglove":
         return _export_companions(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
@@ -128,6 +135,19 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
     if without:
         notes.append(f"Foxglove has no message for, left out: {', '.join(without)}")
     return Exported({topic: place for topic, messages in written.items() if messages}, notes)
+
+
+def _export_frames(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """A folder of tracks and truths, frame by frame."""
+    files = mot_files(log, topics)
+    names = {name: f"{quote(name, safe=' ')}{SUFFIXES['mot']}" for name in files}
+    check_folder(place, {"log": [log.path]})
+    with whole_folder(place, _refuse) as part:
+        for name, (_, lines) in files.items():
+            text = "".join(f"{line}\n" for line in lines)
+            (part / names[name]).write_text(text, encoding="utf-8", newline="\n")
+    exported = {topic: place / names[name] for name, (of, _) in files.items() for topic in of}
+    return Exported(exported, notes)
 
 
 def _new(to: To) -> Kind:

@@ -13,7 +13,7 @@ import os
 import pickle
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -75,8 +75,14 @@ class Kept:
         left = self._left(key)
         return None if left is None else pickle.loads(left)
 
-    def write(self, key: str, left: bytes) -> None:
-        """Keep what a cell left, pickled, when its files are written."""
+    def write(self, key: str, left: bytes, written: Mapping[str, bytes] | None = None) -> None:
+        """Keep what a cell left, pickled, and what it wrote where that is not in its place already."""
+        place = self.place_of(key)
+        if written:
+            shutil.rmtree(place, ignore_errors=True)  # of a driver that was killed
+        for name, content in (written or {}).items():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_bytes(content)
         files = [path.relative_to(self.folder).as_posix() for path in self._files(key)]
         write_checked(self.folder / f"{key}{_SUFFIX}", pickle.dumps((left, files)), "a cell")
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
 from pipeline.claims import Claim
@@ -33,10 +33,17 @@ out = _console(stderr=False)
 err = _console(stderr=True)
 
 
-def progress(items: Iterable[Any], title: str, total: int | None) -> Iterable[Any]:
-    """Pass items through with a progress bar on standard error; none where nobody watches."""
-    with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
-        yield from bar.track(items, total=total, description=title)
+def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:
+    """Pass items through with a progress bar on standard error; none where nobody watches.
+
+    The title is asked again after every item, as it may say how the work goes.
+    """
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(str(title), total=total)
+        for item in items:
+            yield item
+            bar.update(task, advance=1, description=str(title))
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.charts import Axis, Chart, Panel, curve, level
-from pipeline.commands import source_path, stated_estimators
+from pipeline.commands import log_of_estimates, stated_estimators
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.findings import (
     Finding,
@@ -305,7 +305,7 @@ def _asked(
         if len(labels) != 1:
             raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
-        return sources_of(source_path(source.log))[0], {labels[0]: own}
+        return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
     if estimator is None:
         raise BadInput(f"{source.name}: holds no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)

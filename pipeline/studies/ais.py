@@ -59,7 +59,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
     ]
     if not tables:
         raise BadInput("no tracks to judge: the log has no identities, or no estimator tells tracks")
-    return pd.concat(tables).rename(columns={"thing": "mmsi"})
+    return pd.concat(tables).rename(columns={"target": "mmsi"})
 
 
 def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Chart:
@@ -96,9 +96,9 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
 
 def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:
     own = kept(vessels[vessels["estimator"] == options.estimator], reports=options.more_reports_than)
-    if own.things == 0:
+    if own.targets == 0:
         return []
-    who = f"{own.things} vessels with more than {options.more_reports_than} reports"
+    who = f"{own.targets} vessels with more than {options.more_reports_than} reports"
     return [
         judged(
             f"{options.kept_share:.0%} of {who} keep one track for {KEPT_SHARE:.0%} of their reports",

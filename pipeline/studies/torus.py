@@ -248,8 +248,8 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
         WrappedNormal(np.zeros(2), given.prior_sigma_rad**2 * np.eye(2)), torus_grid(cells)
     )
     state = np.broadcast_to(prior / prior.sum(), (len(logs), cells, cells))
-    _, means = run_torus_grid_filter(model, state, offsets, measured)
-    squared = (wrap_angle(means - truth) ** 2).mean(axis=1)
+    found = run_torus_grid_filter(model, state, offsets, measured)
+    squared = (wrap_angle(found.mean - truth) ** 2).mean(axis=1)
     return np.sqrt(np.add.reduceat(squared, offsets[:-1]) / np.diff(offsets))
 
 

@@ -29,6 +29,8 @@ def tune_logs(
     held_out: Sequence[Path],
     folds: int,
     out: Path,
+    workers: int | None,
+    scheduler: str | None,
     model: str | None,
     recover: bool,
     gap_limit_s: float,
@@ -58,6 +60,8 @@ def tune_logs(
             validate=[LogSource(open_log(path, recover=recover)) for path in held_out],
             folds=folds,
             gap_limit_s=gap_limit_s,
+            workers=workers,
+            scheduler=scheduler,
             on_best=tell,
         )
     saved = found.save(out)

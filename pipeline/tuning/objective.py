@@ -1,19 +1,20 @@
 """What a tuning minimises: logs replayed with other parameters, and what their replays cost.
 
 Every log is replayed by itself; a point costs what the sums over all logs do, in their order. Logs and
-points are shared among threads, whose kernels run side by side.
+points are shared among threads, whose kernels run side by side, or among the workers of a team.
 """
 
-import os
+import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.executors import Team, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
@@ -144,6 +145,10 @@ class Best(NamedTuple):
     cost: float
 
 
+def silent(_: Best) -> None:
+    """Tell nobody of the search."""
+
+
 @dataclass
 class Objective:
     """The cost of parameter values over logs.
@@ -155,6 +160,7 @@ class Objective:
         by: what it goes by.
         gap_limit_s: the truth is not interpolated over longer gaps.
         on_best: is told of the best point after every batch.
+        team: who replays; without one threads of this process.
         best: of all points until now.
     """
 
@@ -164,16 +170,20 @@ class Objective:
     runs: Sequence[Run]
     by: By
     gap_limit_s: float
-    on_best: Callable[[Best], None]
+    on_best: Callable[[Best], None] = silent
+    team: Team | None = None
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
-    _told: dict[int, int] = field(default_factory=dict)
+    _told: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
-        """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements."""
-        tried = [(point, run) for point in points for run in self.runs]
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            sums = iter(list(threads.map(self._sums, *zip(*tried, strict=True))))
-        costs = np.array([self._cost([next(sums) for _ in self.runs]) for _ in points])
+        """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements.
+
+        Raises BadInput where a worker dies.
+        """
+        sums = self._shared(points)
+        costs = np.array(
+            [self._cost([of_run[number] for of_run in sums]) for number in range(len(points))]
+        )
         least = int(np.argmin(costs))
         best = Best(self.best.evaluations + len(points), points[least], float(costs[least]))
         if self.best.cost <= best.cost:
@@ -182,11 +192,39 @@ class Objective:
         self.on_best(best)
         return costs
 
+    def _shared(self, points: Floats) -> list[list[Sums | None]]:
+        """Of every run what it tells at each point, by all who work, each for some of the points."""
+        with threads() if self.team is None else nullcontext(self.team) as team:
+            parts = np.array_split(points, min(team.workers, len(points)))
+            alone = self._without_runs()
+            working = [
+                [team.executor.submit(alone.sums, part, run, told) for part in parts]
+                for run, told in zip(self.runs, self._told, strict=True)
+            ]
+            try:
+                return [[sums for part in of_run for sums in part.result()] for of_run in working]
+            except team.lost as error:
+                raise BadInput(
+                    f"a process that tunes {self.label} died ({error}); try fewer workers"
+                ) from error
+
+    def _without_runs(self) -> "Objective":
+        """What workers need besides a run."""
+        return replace(self, runs=(), on_best=silent, team=None)
+
     def begin(self, start: Floats) -> None:
         """Note what every log tells at the start (k,).
 
-        Raises BadInput where a run fails there, or the log lacks what is minimised.
+        Raises BadInput where a run fails there, the log lacks what is minimised, or the estimator
+        cannot go to other processes that are to work.
         """
+        if self.team is not None:
+            try:
+                pickle.dumps(self._without_runs())
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                raise BadInput(
+                    f"{self.label}: cannot go to another process ({error}); tune it without workers"
+                ) from error
         for run in self.runs:
             outputs = self.outputs(start, run)
             failures = _failures(outputs)
@@ -201,20 +239,23 @@ class Objective:
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
                 )
-            self._told[id(run.ensemble)] = _count(outputs)
+            self._told.append(_count(outputs))
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """What the estimator makes of a log with these values (k,), by topic; BadInput as `replay`."""
         chosen = with_values(self.settings, self.names, values)
         return collect(replay(run.ensemble, bind(self.label, run.ensemble, chosen)))
 
-    def _sums(self, values: Floats, run: Run) -> Sums | None:
-        """What a log tells at these values; None where not all of it was used."""
+    def sums(self, points: Floats, run: Run, told: int) -> list[Sums | None]:
+        """What a log tells at each point (n, k); None where it gave another number of messages."""
+        return [self._sums(point, run, told) for point in points]
+
+    def _sums(self, values: Floats, run: Run, told: int) -> Sums | None:
         try:
             outputs = self.outputs(values, run)
         except BadInput:  # as of a batch that does not converge
             return None
-        if _failures(outputs) or _count(outputs) != self._told[id(run.ensemble)]:
+        if _failures(outputs) or _count(outputs) != told:
             return None
         return self._measured(run, outputs)
 

@@ -21,6 +21,8 @@ Cost = Callable[[Floats], Floats]
 
 STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
+FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
+LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
 FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches
 UNIT = 10.0  # standard errors that it has alone
@@ -142,10 +144,48 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
     return tried[np.argmin(cost(coordinates.values(tried)))]
 
 
-def minimum(
+def least(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
     """Where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
+
+    In coordinates. A descent from far off can end in another minimum than the least, such as one in
+    which two modes have changed their parts. So it begins, and ends, where no change of a single
+    parameter by one of `FACTORS` costs less.
+    """
+    point = _scanned(cost, coordinates, start)
+    while True:
+        ended, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
+        point = _scanned(cost, coordinates, ended)
+        if point is ended or not has_converged:
+            return ended, has_converged
+
+
+def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
+    """A point (k,) from which no change of one positive parameter costs less: the start, or another."""
+    low, high = coordinates.bounds
+    changes = np.concatenate(
+        [
+            np.log(FACTORS)[:, None] * along
+            for along, each in zip(np.eye(len(start)), coordinates.free, strict=True)
+            if each.is_positive
+        ]
+        or [np.empty((0, len(start)))]
+    )
+    point = start
+    while True:
+        points = np.clip(np.array([point, *(point + changes)]), low, high)
+        costs = cost(coordinates.values(points))
+        best = int(np.argmin(costs))
+        if costs[best] > costs[0] - LEAST_GAIN:
+            return point
+        point = points[best]
+
+
+def _minimum(
+    cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
+) -> tuple[Floats, bool]:
+    """The minimum (k,) that the cost falls to from a start (k,), and whether the search came to its end.
 
     In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """

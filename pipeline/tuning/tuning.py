@@ -5,12 +5,15 @@ chapter 7.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pipeline.executors import crew_of, of_executor
 from pipeline.replays import Kind, Log, settings_of, sources_of
 from pipeline.tuning.confidence import confidence
 from pipeline.tuning.objective import (
@@ -20,6 +23,7 @@ from pipeline.tuning.objective import (
     Objective,
     Run,
     in_memory,
+    silent,
     with_values,
 )
 from pipeline.tuning.outcome import START, TUNED, Found, Source, Tuning
@@ -27,8 +31,8 @@ from pipeline.tuning.search import (
     Free,
     coordinates_of,
     curvature,
+    least,
     least_of_grid,
-    minimum,
 )
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
@@ -38,10 +42,6 @@ from replay.engine.estimator import Bound, bind
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
 OPEN = {"gate_probability": 1.0}
-
-
-def silent(_: Best) -> None:
-    """Tell nobody of the search."""
 
 
 def tune(
@@ -56,6 +56,9 @@ def tune(
     validate: Log | Sequence[Log] = (),
     folds: int = 0,
     gap_limit_s: float = 0.2,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
     on_best: Callable[[Best], None] = silent,
 ) -> Tuning:
     """Search the parameters of an estimator that explain logs best.
@@ -72,6 +75,9 @@ def tune(
         validate: logs that are held out, to judge the values by.
         folds: cut the logs into so many parts, and judge what all others give by each.
         gap_limit_s: the truth is not interpolated over longer gaps.
+        workers: processes that share points and logs, as for `run`; by default threads of this one.
+        scheduler: as for `run`.
+        executor: as for `run`.
         on_best: is told of the best values again and again.
 
     Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
@@ -103,19 +109,26 @@ def tune(
     opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
     names = [each.name for each in searched]
 
-    def objective(runs: Sequence[Run]) -> Objective:
-        made = Objective(label, opened, names, runs, by, gap_limit_s, on_best)
-        made.begin(start)
-        return made
+    crew = of_executor(executor) if executor else None
+    if workers is not None or scheduler is not None:
+        crew = crew_of(workers, scheduler, len(sources))
+    with crew() if crew else nullcontext() as team:
 
-    whole, beyond = objective(runs), objective(others) if others else None
-    found = _search(whole, searched, grid)
-    compared = np.array([start, found.optimum])
-    rows = []
-    for fold in range(folds):
-        left_out = runs[fold::folds]
-        rest = [run for number, run in enumerate(runs) if number % folds != fold]
-        rows.append(_row_of_fold(fold, objective(left_out), objective(rest), searched, grid))
+        def objective(runs: Sequence[Run]) -> Objective:
+            made = Objective(label, opened, names, runs, by, gap_limit_s, on_best, team)
+            made.begin(start)
+            return made
+
+        whole, beyond = objective(runs), objective(others) if others else None
+        found = _search(whole, searched, grid)
+        compared = np.array([start, found.optimum])
+        costs, held_out_costs = whole(compared), beyond(compared) if beyond else None
+        rows = []
+        for fold in range(folds):
+            left_out = runs[fold::folds]
+            rest = [run for number, run in enumerate(runs) if number % folds != fold]
+            rows.append(_row_of_fold(fold, objective(left_out), objective(rest), searched, grid))
+    whole.team = None
     return Tuning(
         label,
         sources,
@@ -126,8 +139,8 @@ def tune(
         },
         whole,
         found,
-        costs=whole(compared),
-        held_out_costs=beyond(compared) if beyond else None,
+        costs=costs,
+        held_out_costs=held_out_costs,
         folds=pd.DataFrame(rows),
         gate=_gate(bound) if opened is not settings else 1.0,
     )
@@ -203,7 +216,7 @@ def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
         if grid > 1:
             point = least_of_grid(objective, coordinates, grid)
         is_smooth = CRITERIA[objective.by].is_smooth
-        point, has_converged = minimum(objective, coordinates, point, is_smooth=is_smooth)
+        point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
         inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
         told = None
         if objective.by == "likelihood" and inner:

@@ -40,9 +40,9 @@ class PlaceSensor(Parameters):
     """What a sensor of places is taken to be like; its channels state it to trackers.
 
     The error has `sigma_m` along the line of sight, and across it also `sigma_across_rad` of the range.
-    Detections are where a thing was `lag_s` ago. The probability of a detection holds up to
+    Detections are where a target was `lag_s` ago. The probability of a detection holds up to
     `near_range_m`, falls linearly to `far_detection_probability` at `far_range_m` and is that beyond.
-    Detections within `joined_within_m` of one another are of one thing.
+    Detections within `joined_within_m` of one another are of one target.
     """
 
     sigma_m: PositiveFloat

@@ -248,6 +248,13 @@ SCAN_BEARING = _declare(
     _identifier("scan_id"),
     _real("bearing_rad"),
 )
+SCAN_RANGE_BEARING = _declare(
+    "ScanRangeBearing",
+    "One distance and angle of an unordered scan, in the sensor's frame, as those of a radar.",
+    _identifier("scan_id"),
+    _real("range_m"),
+    _real("bearing_rad"),
+)
 SCAN = _declare(
     "Scan",
     "One sweep of a sensor and how many detections it has; none is information too.",

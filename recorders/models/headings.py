@@ -1,8 +1,4 @@
-"""Two headings that turn with each other, x+ = x + c (cos x2, sin x1) + drift, and angles modulo 2 pi.
-
-The system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation",
-2016, section IV. Component-first: scalars and arrays alike.
-"""
+"""Systems of two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
 
 import numpy as np
 
@@ -12,5 +8,19 @@ from recorders.models.planar import Component
 def turn_together(
     x1: Component, x2: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """The next headings (rad, not wrapped) without noise."""
+    """Two headings that turn with each other, x+ = x + c (cos x2, sin x1) + drift, without noise.
+
+    The system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular
+    Estimation", 2016, section IV.
+    """
     return x1 + coupling * np.cos(x2) + drift1, x2 + coupling * np.sin(x1) + drift2
+
+
+def turn_on(
+    direction: Component, turn: Component, coupling: Component, drift1: Component, drift2: Component
+) -> tuple[Component, Component]:
+    """A direction, and its turn from one step to the next, of which a part remains; without noise.
+
+    The turn is an angle too: by how much more than half a turn cannot be told from the other way round.
+    """
+    return direction + turn + drift1, coupling * np.sin(turn) + drift2

@@ -35,11 +35,12 @@ class Opening:
 
     Attributes:
         topics: those whose first messages it is handed.
-        find: what there is to start from; by the clock by which the replay stamps estimates.
+        find: (first messages, the topics that `start` needs whole, clock) -> what there is to start
+            from; by the clock by which the replay stamps estimates.
     """
 
     topics: tuple[str, ...]
-    find: Callable[[Mapping[str, Ragged], Clock], Opened]
+    find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Opened]
 
 
 @dataclass(frozen=True)

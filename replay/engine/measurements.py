@@ -14,6 +14,7 @@ from replay.engine.components import Components, match_components, match_tangent
 
 Floats = NDArray[np.float64]
 PLANE: Components = {"x_m": "linear", "y_m": "linear"}
+SPACE: Components = {**PLANE, "z_m": "linear"}
 # What the numbers of a field are where the channel does not say, by how many there are.
 _IMPLIED = {
     ("position_m", 2): "x_m,y_m",

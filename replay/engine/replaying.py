@@ -114,7 +114,12 @@ def replay(
 
 
 def _open(
-    ensemble: Ensemble[Source], order: Clock, stamps: Clock, told: list[Ragged], bound: Bound
+    ensemble: Ensemble[Source],
+    order: Clock,
+    stamps: Clock,
+    told: list[Ragged],
+    bound: Bound,
+    whole: Mapping[str, Ragged],
 ) -> dict[str, Ragged]:
     """What an estimator starts from that is found in the first messages; `told` gets what it says."""
     if not isinstance(bound, Recursive) or bound.opening is None:
@@ -123,7 +128,7 @@ def _open(
     nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
     first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
     with code_of(bound.name):
-        found = bound.opening.find(first, stamps)
+        found = bound.opening.find(first, whole, stamps)
     told += found.told
     return found.whole
 
@@ -132,7 +137,7 @@ def _start(
     estimators: Sequence[Bound],
     watches: Sequence[Watch],
     wholes: Sequence[Mapping[str, Ragged]],
-    opening: Callable[[Bound], dict[str, Ragged]],
+    opening: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
 ) -> tuple[list[Any], dict[str, BadInput]]:
     """The states of recursions and what batches are given; _REFUSED where there is none.
 
@@ -144,7 +149,7 @@ def _start(
     for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
         told = told_of.setdefault(bound.name.partition("/")[0], [])
         try:
-            given, unable = start_of_runs({**whole, **opening(bound)}, bound.priors)
+            given, unable = start_of_runs({**whole, **opening(bound, whole)}, bound.priors)
             watch.exclude(unable)
             with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))

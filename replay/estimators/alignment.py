@@ -13,11 +13,13 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import Stream
-from recorders.models.inertial import from_mounting, product, rotation
+from recorders.models.inertial import from_mounting, into_body, product, rotation
 from replay.engine.arrays import Floats, Integers
 from replay.inference.model import ModelParameters, Started
 
 STANDARD_GRAVITY_MPS2 = 9.80665
+LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
+SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 _NS = 1e-9
 
@@ -32,12 +34,19 @@ class AlignmentParameters(ModelParameters):
     biases.
 
     The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about left, of
-    roll about forward. A message was measured its topic's delay before its stamp.
+    roll about forward. An axis measures 1 + its scale times what is there, and the bias. A message was
+    measured its topic's delay before its stamp.
     """
 
     mounting_roll_rad: float = 0.0
     mounting_pitch_rad: float = 0.0
     mounting_yaw_rad: float = 0.0
+    force_scale_x: float = 0.0
+    force_scale_y: float = 0.0
+    force_scale_z: float = 0.0
+    gyro_scale_x: float = 0.0
+    gyro_scale_y: float = 0.0
+    gyro_scale_z: float = 0.0
     fix_delay_s: float = 0.0
     velocity_delay_s: float = 0.0
     inertial_delay_s: float = 0.0
@@ -68,6 +77,20 @@ def mounted(sample: Any, parameters: Any) -> Any:
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
+def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
+    """The specific force of the body by samples of the unit, force and rate, of this bias."""
+    x, y, z = mounted(samples[:3], parameters)
+    sx, sy, sz = parameters.force_scale_x, parameters.force_scale_y, parameters.force_scale_z
+    return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
+
+
+def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
+    """The turn rate of the body, see `specific_force`."""
+    x, y, z = mounted(samples[3:], parameters)
+    sx, sy, sz = parameters.gyro_scale_x, parameters.gyro_scale_y, parameters.gyro_scale_z
+    return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
+
+
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
 
@@ -86,9 +109,10 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     fix_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
     usable = (fix_ns >= begin_ns) & (fix_ns <= samples.time_ns[-1])
     if not usable.any():
+        later_s = (fix_ns[0] - begin_ns) * _NS if len(fix) else np.nan
         raise BadInput(
-            f"no message of {fix.topic} within the span of {streams['inertial'].topic}; do their clocks "
-            "agree? fix_delay_s and inertial_delay_s move them"
+            f"no message of {fix.topic} within the span of {streams['inertial'].topic}, and it begins "
+            f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
         )
     first = int(np.flatnonzero(usable)[0])
     tilt = _tilt(samples, streams["inertial"].topic, parameters)
@@ -103,7 +127,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
         ],
         3,
     )
-    sigma[8], heading, how = np.pi, 0.0, "levelled, its heading unknown"
+    heading_sigma, heading, how = np.pi, 0.0, "levelled, its heading unknown"
     if moving is not None and len(moving):
         velocity_ns = moving.publish_time_ns - round(parameters.velocity_delay_s / _NS)
         row = int(np.argmin(np.abs(velocity_ns - fix_ns[first])))
@@ -111,15 +135,16 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
         mean[10:13] = _bias(samples, streams["inertial"].topic, moving, row, parameters)
         found = _heading(samples, int(fix_ns[first]), moving, row, tilt, mean[10:13], parameters)
         if found is not None:
-            sigma[8], heading, how = (
-                parameters.heading_sigma_rad,
-                found,
-                "levelled, its heading the course",
-            )
+            heading_sigma, heading = parameters.heading_sigma_rad, found
+            how = "levelled, its heading the course"
+        how += _leap(samples, moving, row, parameters)
     roll, pitch = tilt
     tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
-    return Started(int(fix_ns[first]), mean, np.diag(sigma**2), how)
+    covariance, up = np.diag(sigma**2), np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
+    more = heading_sigma**2 - parameters.tilt_sigma_rad**2
+    covariance[6:9, 6:9] += more * np.outer(up, up)
+    return Started(int(fix_ns[first]), mean, covariance, how)
 
 
 def _samples(inertial: Stream, parameters: Any) -> _Samples:
@@ -148,8 +173,8 @@ def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]
     if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
         in_g = "; it looks like g: import it with that unit" if 0.8 < length < 1.25 else ""
         raise BadInput(
-            f"topic {topic}: the specific force of the first {parameters.level_s:g} s is {length:.3g}, "
-            f"where gravity is 9.8 m/s2{in_g}"
+            f"topic {topic}: gravity reads {length:.3g} m/s2 in the first {parameters.level_s:g} s; "
+            f"it is 9.8{in_g}"
         )
     if z < -0.5 * length:
         raise BadInput(
@@ -183,6 +208,29 @@ def _bias(samples: _Samples, topic: str, moving: Stream, row: int, parameters: A
             "like deg/s: import it with that unit"
         )
     return bias
+
+
+def _leap(samples: _Samples, moving: Stream, row: int, parameters: Any) -> str:
+    """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
+    moved = _first_above(moving, row, parameters.still_mps)
+    level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / _NS)
+    if moved is None:
+        return ""
+    change = samples.force - samples.force[level].mean(axis=0)
+    noise = 5.0 * change[level].std(axis=0) + SMALLEST_CHANGE_MPS2
+    sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
+    if not len(sets_off):
+        return ""
+    moved_ns = moving.publish_time_ns[moved] - round(parameters.velocity_delay_s / _NS)
+    later_s = float(moved_ns - samples.time_ns[sets_off[0]]) * _NS
+    if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
+        return ""
+    shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
+    return (
+        f"; {moving.topic} sets off {later_s:.3g} s after the unit: if one clock has the "
+        f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
+        f"inertial_delay_s={shift_s:g} moves the unit's"
+    )
 
 
 def _heading(

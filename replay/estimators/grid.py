@@ -4,6 +4,7 @@ They approximate no density, only the domain, and show what any filter of the sa
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,29 @@ from scipy import sparse
 from recorders.models.headings import turn_together
 from replay.distributions import bingham, wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal
+from replay.distributions.wrapped_normal_kernels import UNIFORM
 from replay.engine.arrays import Floats, Integers
 from replay.estimators.bingham import BinghamNoise, Steps
-from replay.estimators.torus import HeadingModel
+from replay.estimators.torus import HeadingModel, Motion
 
 # Cells that a transition reaches with less than this part of its peak are left out.
 _NEGLIGIBLE = 1e-12
+
+
+class GridEstimates(NamedTuple):
+    """What a filter on a grid over the torus says.
+
+    Attributes:
+        state: probabilities (runs, n, n) after the last row.
+        mean: circular means (rows, 2) of the estimates of all rows.
+        predicted: the same, before their measurements.
+        log_density: logarithms (rows,) of the densities that measurements were predicted with.
+    """
+
+    state: Floats
+    mean: Floats
+    predicted: Floats
+    log_density: Floats
 
 
 def run_axis_grid_filter(noise: BinghamNoise, state: Floats, steps: Steps) -> tuple[Floats, Floats]:
@@ -57,32 +75,35 @@ def run_torus_grid_filter(
     state: Floats,
     offsets: Integers,
     measurement: Floats,
-) -> tuple[Floats, Floats]:
+    motion: Motion = turn_together,
+) -> GridEstimates:
     """The reference for `run_toroidal_filter`.
 
     Args:
         model: see there.
         state: probabilities (runs, n, n) at the angles of `torus_grid(n)`.
         offsets: (runs + 1,).
-        measurement: (rows, 2), rad; NaN for a row that is only a prediction.
-
-    Returns:
-        The state after the last row, and the circular means (rows, 2) of the estimates of all rows.
+        measurement: (rows, 2), rad; NaN for a row that is only a prediction, and for a second angle that
+            is not measured.
+        motion: of the angles.
     """
     n = state.shape[1]
     grid = torus_grid(n).reshape(-1, 2)
-    transition = _transition(model, grid)
+    transition = _transition(model, grid, motion)
     probability = state.reshape(-1, n * n).copy()
-    means = np.empty(measurement.shape)
+    predicted, means = np.empty((2, *measurement.shape))
+    log_density = np.empty(len(measurement))
     for runs, rows in _in_step(offsets):
-        prior = (transition @ probability[runs].T).T
-        seen = WrappedNormal(measurement[rows, None, :], model.measurement)
-        missing = np.isnan(measurement[rows, :1])
-        posterior = prior * np.where(missing, 1.0, wrapped_normal.density(seen, grid))
-        posterior /= posterior.sum(axis=1, keepdims=True)
-        probability[runs] = posterior
-        means[rows] = np.angle((posterior[..., None] * np.exp(1j * grid)).sum(axis=1))
-    return probability.reshape(state.shape), means
+        prior = np.ascontiguousarray((transition @ probability[runs].T).T)  # sums round by the layout
+        posterior = prior * _likelihood(model, measurement[rows], grid)
+        total = posterior.sum(axis=1, keepdims=True)
+        probability[runs] = posterior / total
+        log_density[rows] = np.log(total[:, 0])
+        predicted[rows], means[rows] = (
+            np.angle((each[..., None] * np.exp(1j * grid)).sum(axis=1))
+            for each in (prior, probability[runs])
+        )
+    return GridEstimates(probability.reshape(state.shape), means, predicted, log_density)
 
 
 def torus_grid(n: int) -> Floats:
@@ -96,9 +117,20 @@ def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> Floats:
     return np.exp(bingham.log_density(distribution, points))
 
 
-def _transition(model: HeadingModel, grid: NDArray) -> sparse.csr_array:
+def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
+    """The densities (rows, cells) of measurements in every cell; of one angle where the other is NaN."""
+    missing = np.isnan(measured)
+    sigmas = np.where(missing, np.sqrt(UNIFORM), np.sqrt(np.diag(model.measurement)))
+    correlation = model.measurement[0, 1] / np.sqrt(np.prod(np.diag(model.measurement)))
+    covariance = sigmas[:, :, None] * sigmas[:, None, :] * np.eye(2)
+    covariance[:, [0, 1], [1, 0]] = (correlation * sigmas.prod(axis=1) * ~missing.any(axis=1))[:, None]
+    seen = WrappedNormal(np.nan_to_num(measured)[:, None], covariance[:, None])
+    return wrapped_normal.density(seen, grid) * (2.0 * np.pi) ** missing.sum(axis=1, keepdims=True)
+
+
+def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> sparse.csr_array:
     """Probabilities of the next cell (rows) given the last one (columns)."""
-    moved = np.stack(turn_together(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
+    moved = np.stack(motion(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
     reached = np.stack(
         [wrapped_normal.density(WrappedNormal(each, model.system), grid) for each in moved], axis=1
     )

@@ -19,11 +19,16 @@ from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
 from replay.engine.components import components_of
 from replay.engine.tangent import Kind
-from replay.estimators.alignment import AlignmentParameters, align, mounted
+from replay.estimators.alignment import AlignmentParameters, align, specific_force, turn_rate
+from replay.estimators.navigation_sensors import carried_sensors
 from replay.inference.model import Control, Model, Motion, Sensor, Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
+SCALES: Mapping[str, Kind] = {
+    f"{of}_scale_{axis}": "linear" for of in ("force", "gyro") for axis in "xyz"
+}
+WHEEL: Mapping[str, Kind] = {"wheel_scale": "linear", **{f"axle_{axis}_m": "linear" for axis in "xyz"}}
 STATE = components_of(NAVIGATION)
 POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6])
 
@@ -33,8 +38,11 @@ class NavigationParameters(AlignmentParameters):
 
     Noise densities are per square root of hertz, those of the biases' random walks per square root of a
     second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
-    the body's axes. Gravity and the turn of the earth are those of the plane's origin. Where the unit is
-    silent for longer than `inertial_gap_s`, all is unknown.
+    the body's axes; the axle is where wheels are. The magnetic field is that of the place, along east,
+    north, up. Gravity and the turn of the earth are those of the plane's origin.
+
+    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body
+    may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
     """
 
     force_noise_density: NonNegativeFloat | None = None
@@ -44,10 +52,28 @@ class NavigationParameters(AlignmentParameters):
     origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     origin_altitude_m: float | None = None
     inertial_gap_s: PositiveFloat = 1.0
+    gap_acceleration_mps2: PositiveFloat = 2.0
+    gap_turn_radps: PositiveFloat = 0.2
+    gap_tilt_rad: PositiveFloat = 0.1
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     lever_z_m: float = 0.0
+    axle_x_m: float | None = None
+    axle_y_m: float | None = None
+    axle_z_m: float | None = None
+    wheel_scale: float = 0.0
+    field_east_ut: float | None = None
+    field_north_ut: float | None = None
+    field_up_ut: float | None = None
+    range_delay_s: float = 0.0
     sigma_velocity_mps: PositiveFloat | None = None
+    sigma_heading_rad: PositiveFloat | None = None
+    sigma_height_m: PositiveFloat | None = None
+    sigma_wheel_mps: PositiveFloat | None = None
+    sigma_slip_mps: PositiveFloat = 0.1
+    sigma_standing_mps: PositiveFloat = 0.01
+    sigma_field_ut: PositiveFloat | None = None
+    sigma_range_m: PositiveFloat | None = None
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.9999986
     gate_reopens_s: PositiveFloat | None = 1.0
 
@@ -60,12 +86,10 @@ def read_inertial(stream: Stream) -> Floats:
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
     """The state after a step with the mean of both ends' samples."""
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
-    fx, fy, fz = mounted(control[:3], parameters)
-    wx, wy, wz = mounted(control[3:], parameters)
     moved = strapdown(
         (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
-        (fx - bx, fy - by, fz - bz),
-        (wx - gx, wy - gy, wz - gz),
+        specific_force(control, (bx, by, bz), parameters),
+        turn_rate(control, (gx, gy, gz), parameters),
         duration_s,
         (parameters.origin_latitude_deg, parameters.origin_altitude_m),
     )
@@ -84,6 +108,16 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
     return placed + moved + turned + gyro + accelerometer
 
 
+def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that a gap of the unit adds: of where it may have gone and turned meanwhile."""
+    speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
+    gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
+    moved = (speed_squared + 0.25 * gained) * duration_s**2
+    tilted = parameters.gap_tilt_rad**2
+    turned = (parameters.gap_turn_radps * duration_s) ** 2
+    return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
+
+
 def position(state: Components, about: Any, parameters: Any) -> Components:
     """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
@@ -95,9 +129,9 @@ def position(state: Components, about: Any, parameters: Any) -> Components:
 def velocity(state: Components, samples: Components, parameters: Any) -> Components:
     """How fast the end of the lever arm moves, which turns with the body."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
-    wx, wy, wz = mounted(samples[3:], parameters)
+    rate = turn_rate(samples, (gx, gy, gz), parameters)
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
-    x, y, z = into_plane((qw, qx, qy, qz), cross((wx - gx, wy - gy, wz - gz), lever))
+    x, y, z = into_plane((qw, qx, qy, qz), cross(rate, lever))
     return vx + x, vy + y, vz + z
 
 
@@ -120,6 +154,9 @@ HANDHELD = {
     "gyro_bias_density": 2e-6,
     "origin_latitude_deg": 45.0,
     "origin_altitude_m": 0.0,
+    "axle_x_m": 0.0,
+    "axle_y_m": 0.0,
+    "axle_z_m": 0.0,
 }
 UNIT = Control(
     "inertial",
@@ -156,9 +193,11 @@ INERTIAL = Model(
             delay="velocity_delay_s",
             control=UNIT,
         ),
+        *carried_sensors(UNIT),
     ),
-    Motion(move, move_noise),
+    Motion(move, move_noise, lost=lost),
     control=UNIT,
     start=Start({}, HANDHELD, find=align),
-    estimable={**LEVER, **MOUNTING},
+    estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
+    upright=True,
 )

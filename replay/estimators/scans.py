@@ -13,7 +13,7 @@ from recorders.log import Stream
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged
 from replay.engine.measurements import PLANE, read_vectors
-from replay.inference.tracking import Scans, ScanSensor
+from replay.inference.scanning import Scans, ScanSensor
 
 ORIGIN = "origin"
 
@@ -25,6 +25,11 @@ class Found(NamedTuple):
     scans: tuple[str, ...]
     detections: tuple[str, ...]
     origins: tuple[str, ...]
+
+    @property
+    def sensors(self) -> list[str]:
+        """Their names: what their topics begin with."""
+        return [scan.rpartition("/")[0].strip("/") for scan in self.scans]
 
 
 class Fix(NamedTuple):
@@ -99,9 +104,12 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
 
 def _measured(stream: Stream, kind: ScanSensor) -> Floats:
     """The detections (n, 2); a bearing stands first."""
-    if kind.field == "position_m":
-        return read_vectors(stream, kind.field, PLANE)
-    return np.stack([stream[kind.field], np.zeros(len(stream))], axis=1)
+    if kind.fields == ("position_m",):
+        return read_vectors(stream, "position_m", PLANE)
+    measured = np.zeros((len(stream), 2))
+    for component, field in enumerate(kind.fields):
+        measured[:, component] = stream[field]
+    return measured
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:

@@ -1,9 +1,9 @@
-"""Filters for two headings that turn together, x+ = turn_together(x) + w and z = x + v, modulo 2 pi.
+"""Filters for two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
 
 The recursive toroidal filter that Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate
 Circular Estimation", 2016, announce, and beside it the unscented Kalman filter with their UKF samples.
 All take an ensemble as ragged rows, run r owning offsets[r]:offsets[r + 1]; a row is a prediction, then
-an update with its measurement (2,) unless that is NaN.
+an update with its measurement (2,) unless that is NaN, or with its first angle where the second is.
 """
 
 import math
@@ -16,23 +16,32 @@ from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
 from recorders.models.headings import turn_together
-from recorders.models.planar import wrap_angle
+from recorders.models.planar import Component, wrap_angle
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import (
     WrappedNormal,
     make_wrapped_normal,
     require_central_weight,
 )
-from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+from replay.distributions.wrapped_normal_kernels import (
+    TURN,
+    UNIFORM,
+    fit_product,
+    fit_samples,
+    five_samples,
+)
 from replay.engine.arrays import Floats, Integers
 from replay.engine.compile import compile_over_runs
+
+# A variance (rad^2) of a measurement that moves a Gaussian by less than its rounding.
+_VAGUE = 1e18
 
 
 class HeadingModel(NamedTuple):
     """The system and its noise.
 
     Attributes:
-        coupling_rad: c in `turn_together`.
+        coupling_rad: c in the motion.
         drift_rad: what is added in every step, (2,).
         system: covariance of w, (2, 2), rad^2.
         measurement: covariance of v, (2, 2), rad^2.
@@ -42,6 +51,10 @@ class HeadingModel(NamedTuple):
     drift_rad: Floats
     system: Floats
     measurement: Floats
+
+
+# One of `recorders.models.headings`: two angles, coupling and drifts -> the next two.
+Motion = Callable[..., tuple[Component, Component]]
 
 
 def make_heading_model(
@@ -62,6 +75,7 @@ def run_toroidal_filter(
     offsets: Integers,
     measurement: Floats,
     *,
+    motion: Motion = turn_together,
     central_weight: float = 0.2,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     """The recursive toroidal filter.
@@ -74,6 +88,7 @@ def run_toroidal_filter(
         state: the distributions before the first row, batch axis (runs,).
         offsets: (runs + 1,).
         measurement: (rows, 2), rad.
+        motion: of the angles.
         central_weight: w5 of the five samples.
 
     Returns:
@@ -81,7 +96,7 @@ def run_toroidal_filter(
         fails is NaN from there on.
     """
     require_central_weight(central_weight)
-    return _run(_toroidal_step, model, state, offsets, measurement, central_weight)
+    return _run(_toroidal_step, motion, model, state, offsets, measurement, central_weight)
 
 
 def run_unscented_filter(
@@ -90,6 +105,7 @@ def run_unscented_filter(
     offsets: Integers,
     measurement: Floats,
     *,
+    motion: Motion = turn_together,
     wrapped: bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
     """The unscented Kalman filter with the paper's five equally weighted samples.
@@ -97,11 +113,12 @@ def run_unscented_filter(
     Args as `run_toroidal_filter`, and
         wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.
     """
-    return _run(_unscented_step, model, state, offsets, measurement, wrapped)
+    return _run(_unscented_step, motion, model, state, offsets, measurement, wrapped)
 
 
 def _run(
     step: Callable[..., None],
+    motion: Motion,
     model: HeadingModel,
     state: WrappedNormal,
     offsets: Integers,
@@ -113,12 +130,12 @@ def _run(
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
     rows = np.ascontiguousarray(measurement)
-    _over_runs(step)(len(offsets) - 1, model, option, offsets, rows, state, estimates)
+    _over_runs(step, motion)(len(offsets) - 1, model, option, offsets, rows, state, estimates)
     return state, estimates
 
 
 @cache
-def _over_runs(step: Callable[..., None]) -> Callable[..., None]:
+def _over_runs(step: Callable[..., None], motion: Motion) -> Callable[..., None]:
     """The compiled loop of a filter: `step` at every row, its state written down."""
 
     def run_once(
@@ -131,7 +148,7 @@ def _over_runs(step: Callable[..., None]) -> Callable[..., None]:
         estimates: WrappedNormal,
     ) -> None:
         for row in range(offsets[run], offsets[run + 1]):
-            step(model, option, measurement[row], state, run)
+            step(motion, model, option, measurement[row], state, run)
             estimates.mean[row] = state.mean[run]
             estimates.covariance[row] = state.covariance[run]
 
@@ -139,23 +156,36 @@ def _over_runs(step: Callable[..., None]) -> Callable[..., None]:
 
 
 def _toroidal_step(
-    model: HeadingModel, central_weight: float, z: NDArray, state: WrappedNormal, run: int
+    motion: Motion,
+    model: HeadingModel,
+    central_weight: float,
+    z: NDArray,
+    state: WrappedNormal,
+    run: int,
 ) -> None:
     mean, covariance = state.mean[run], state.covariance[run]
     x, weights = five_samples(mean, covariance, central_weight)
-    _move(model, x)
+    _move(motion, model, x)
     _store(fit_samples(x, weights), mean, covariance)
     covariance += model.system
     if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
         # no distribution: NaN stays, all later rows of the run are NaN as well
         mean[:], covariance[:] = np.nan, np.nan
     elif not math.isnan(z[0]):
-        _store(fit_product(mean, covariance, z, model.measurement), mean, covariance)
+        measured, noise = _measured(z, model.measurement, UNIFORM)
+        _store(fit_product(mean, covariance, measured, noise), mean, covariance)
 
 
-def _move(model: HeadingModel, x: NDArray) -> None:
+def _measured(z: NDArray, noise: NDArray, vague: float) -> tuple[NDArray, NDArray]:
+    """A measurement and its covariance; that of a missing angle is so wide that it tells nothing."""
+    if not math.isnan(z[1]):
+        return z, noise
+    return np.array([z[0], 0.0]), np.array([[noise[0, 0], 0.0], [0.0, vague]])
+
+
+def _move(motion: Motion, model: HeadingModel, x: NDArray) -> None:
     for n in range(len(x)):
-        x[n, 0], x[n, 1] = turn_together(
+        x[n, 0], x[n, 1] = motion(
             x[n, 0], x[n, 1], model.coupling_rad, model.drift_rad[0], model.drift_rad[1]
         )
 
@@ -168,11 +198,11 @@ def _store(
 
 
 def _unscented_step(
-    model: HeadingModel, wrapped: bool, z: NDArray, state: WrappedNormal, run: int
+    motion: Motion, model: HeadingModel, wrapped: bool, z: NDArray, state: WrappedNormal, run: int
 ) -> None:
     mean, covariance = state.mean[run], state.covariance[run]
     x = _sigma_points(mean, covariance)
-    _move(model, x)
+    _move(motion, model, x)
     if not wrapped:
         x %= TURN
     for k in range(2):  # scalar loops: arrays would take longer than what is in them
@@ -186,10 +216,11 @@ def _unscented_step(
                 spread += (x[n, i] - mean[i]) * (x[n, j] - mean[j])
             covariance[i, j] = covariance[j, i] = spread / len(x) + model.system[i, j]
     if not math.isnan(z[0]):
+        measured, noise = _measured(z, model.measurement, _VAGUE)
         innovation = np.empty(2)
         for k in range(2):
-            innovation[k] = wrap_angle(z[k] - mean[k]) if wrapped else z[k] - mean[k]
-        condition(mean, covariance, innovation, model.measurement)
+            innovation[k] = wrap_angle(measured[k] - mean[k]) if wrapped else measured[k] - mean[k]
+        condition(mean, covariance, innovation, noise)
     for k in range(2):
         mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
 

@@ -4,10 +4,15 @@
     tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
     tracker:jpda        all maps, weighted
     tracker:jipda       all maps, weighted, and how probable it is that each track exists
+    tracker:pmbm        the same, where any detection may be the first one of a target: the Poisson
+                        multi-Bernoulli mixture, of which after each scan the marginals are kept, the
+                        tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015). Targets
+                        that were never detected are a uniform Poisson process of steady density
 
-Targets keep their velocity but for white acceleration; sensors are those that state what they are like
-on the channels of their scans, see `PLACES` and `BEARINGS`. Places begin tracks, bearings only sharpen
-those that are confirmed. What is in `replay.inference.tracking` does the work.
+Targets keep their velocity but for white acceleration, or move as any registered model with a position
+says; where it has several modes, each track is an interacting multiple model. Sensors are those that
+state what they are like on the channels of their scans, see `replay.estimators.scan_sensors`. Places
+begin tracks, bearings only sharpen those that are confirmed. `replay.inference.tracking` does the work.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,42 +21,42 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
-from recorders.models.constant_velocity import noise_moments
-from recorders.models.planar import Component, Components
-from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
-from replay.engine.measurements import PLANE
+from replay.engine.results import innovation_stream, named
+from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.estimators.sensor_errors import BY_SORT, Errors, errors_of, with_errors
+from replay.estimators.targets import Targets, targets_of
+from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
-from replay.inference.model import Model, ModelParameters, Motion
-from replay.inference.tracking import (
-    NEVER,
-    Scans,
-    ScanSensor,
-    Told,
-    Tracker,
-    Tracks,
-    in_time,
-    no_tracks,
-    of_last,
-    take_scans,
-    track_scans,
-)
+from replay.inference.scanning import Scans, in_time, measuring, take_scans
+from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
+from replay.inference.tracks import NEVER, Tracks, no_tracks
 
 UNUSED = (
     "there is no room for more tracks; give --set most_tracks=...",
     "the scan came after a younger one; give --late rewind:SECONDS",
 )
+# What sets apart the two that go by existence and have the associations of jpda.
+EXISTING: dict[str, dict[str, float]] = {
+    "jipda": {},
+    "pmbm": {
+        "undetected_per_m2": 1e-6,
+        "confirming_existence": 0.5,
+        "keeping_existence": 0.5,
+        "ending_existence": 0.001,
+    },
+}
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
@@ -61,27 +66,52 @@ class TrackerParameters(Parameters):
     What is None is what the channel of a sensor's scans states; given here, it holds for all sensors.
     `sensors` are those to use, such as ["radar", "lidar"]; where it is empty all are.
 
-    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks.
-    With hits_needed = 0 they are managed by their existence; else by hits, and their existence is
-    `birth_existence` until they are confirmed.
+    `model` is a registered one with a position, whose numbers `motion` gives by name; a model with modes
+    has all of them, or the one that `mode` names. Without it targets keep their velocity.
+
+    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks;
+    or, where there are `undetected_per_m2` targets that were never detected, with any that may be one of
+    these, by how probable that is. What becomes of them `management` says: "existence" goes by the
+    probability of their targets'; "hits" by `hits_needed` in the first `chances`; "score" by the
+    log-likelihood ratio of target and clutter, tested so that `false_confirmation` and
+    `missed_confirmation` are the probabilities of errors. With hits or score, a track's existence is
+    `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
+    `confirming_existence` on until it falls below `keeping_existence`, and ends below
+    `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
+
+    With `registration_sigma_m` or `_rad`, a sensor has a constant error in all it measures, which the
+    tracks estimate together; with `correlated_sigma_m` or `_rad` one of its own for every track, which
+    is another one after `correlation_s`. Both are components of the tracks' states.
+
+    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
+    detections that its track ever had.
     """
 
-    association: Literal["nearest", "hungarian", "jpda", "jipda"] = "jipda"
+    association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
+    management: Literal["existence", "hits", "score"] | None = None
     sensors: tuple[str, ...] = ()
+    model: str | None = None
+    mode: str | None = None
+    motion: dict[str, float] = {}
     acceleration_density: PositiveFloat = 0.1
     birth_sigma_mps: PositiveFloat = 3.0
     birth_distance_m: NonNegativeFloat = 30.0
     birth_existence: Probability | None = None
+    undetected_per_m2: NonNegativeFloat = 0.0
     confirming_existence: Probability = 0.97
+    keeping_existence: Annotated[float, Field(ge=0, lt=1)] = 0.0
     ending_existence: Probability = 0.02
     survival_s: PositiveFloat = 60.0
-    hits_needed: NonNegativeInt | None = None
+    hits_needed: PositiveInt = 4
     chances: PositiveInt = 6
+    false_confirmation: Probability = 1e-5
+    missed_confirmation: Probability = 1e-4
     silence_s: PositiveFloat = 10.0
     tentative_silence_s: PositiveFloat = 6.0
     same_within_m: NonNegativeFloat = 10.0
     same_within_mps: NonNegativeFloat = 2.0
     most_tracks: PositiveInt = 100
+    smoothed: bool = False
 
     gate_probability: Probability | None = None
     sigma_m: PositiveFloat | None = None
@@ -89,10 +119,16 @@ class TrackerParameters(Parameters):
     lag_s: float | None = None
     bias_x_m: float | None = None
     bias_y_m: float | None = None
+    bias_range_m: float | None = None
     near_range_m: NonNegativeFloat | None = None
     far_range_m: NonNegativeFloat | None = None
     far_detection_probability: Probability | None = None
     clutter_per_m2: PositiveFloat | None = None
+    far_clutter_factor: PositiveFloat | None = None
+    sector_from_rad: float | None = None
+    sector_to_rad: float | None = None
+    sector_detection_factor: Probability | None = None
+    sector_clutter_factor: PositiveFloat | None = None
     joined_within_m: NonNegativeFloat | None = None
     sigma_rad: PositiveFloat | None = None
     sigma_across_m: NonNegativeFloat | None = None
@@ -102,171 +138,38 @@ class TrackerParameters(Parameters):
     blind_from_rad: float | None = None
     blind_to_rad: float | None = None
     interval_s: NonNegativeFloat | None = None
+    registration_sigma_m: NonNegativeFloat | None = None
+    registration_sigma_rad: NonNegativeFloat | None = None
+    correlated_sigma_m: NonNegativeFloat | None = None
+    correlated_sigma_rad: NonNegativeFloat | None = None
+    correlation_s: PositiveFloat | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Existence is what jipda is about; the others count hits."""
-        by_existence = values.get("association", "jipda") == "jipda"
-        own = {"hits_needed": 0, "birth_existence": 0.05}
-        if not by_existence:
-            own = {"hits_needed": 4, "birth_existence": 0.135}
-        return {**own, **values}
-
-
-# The motion
-
-
-def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Constant velocity."""
-    x, vx, y, vy = state
-    return x + duration_s * vx, vx, y + duration_s * vy, vy
-
-
-def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
-    place, mixed, velocity = noise_moments(parameters.acceleration_density, duration_s)
-    return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
-
-
-TARGET = Model(
-    "a target in the plane that keeps its velocity",
-    dict.fromkeys(PLANE_MOTION, "linear"),
-    ModelParameters,
-    (),
-    Motion(move, acceleration_noise, linear=True),
-    needs_sensor=False,
-)
+        """Existence is what jipda and pmbm are about; the others count hits."""
+        association = values.get("association", "jipda")
+        goes_by_existence = association in EXISTING
+        given = values.get("management")
+        if goes_by_existence and given not in (None, "existence"):
+            raise ValueError(f"{association} goes by existence; management = {given} goes with jpda")
+        management = given or ("existence" if goes_by_existence else "hits")
+        if values.get("undetected_per_m2") and management != "existence":
+            raise ValueError("undetected_per_m2 goes with management = existence")
+        likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
+        return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
 
 # Sensors
 
 
-def away(state: Components, origin: Any) -> tuple[Any, Any]:
-    """Where a target is from a sensor."""
-    return state[0] - origin[0], state[2] - origin[1]
-
-
-def is_blind(state: Components, origin: Any, parameters: Any) -> bool:
-    """Whether a target is in the sector, anticlockwise from one angle to another, that is not seen."""
-    if np.isnan(parameters.blind_from_rad):
-        return False
-    x, y = away(state, origin)
-    turned = (np.arctan2(y, x) - parameters.blind_from_rad) % (2.0 * np.pi)
-    return turned < (parameters.blind_to_rad - parameters.blind_from_rad) % (2.0 * np.pi)
-
-
-def place_of(state: Components, origin: Any, parameters: Any) -> Components:
-    """Where a target is from the sensor, `lag_s` ago, as a sensor says that is out by its bias."""
-    x, y = away(state, origin)
-    lag_s = parameters.lag_s
-    return x - lag_s * state[1] + parameters.bias_x_m, y - lag_s * state[3] + parameters.bias_y_m
-
-
-def place_noise(state: Components, origin: Any, parameters: Any) -> Components:
-    """The lower triangle of a place's covariance: wider across the line of sight than along it."""
-    x, y = away(state, origin)
-    along, across = parameters.sigma_m**2, parameters.sigma_across_rad**2
-    return along + across * y * y, -across * x * y, along + across * x * x
-
-
-def place_detection(state: Components, origin: Any, parameters: Any) -> Component:
-    """Falls linearly between two ranges."""
-    if is_blind(state, origin, parameters):
-        return 0.0
-    near, far = parameters.detection_probability, parameters.far_detection_probability
-    range_m = np.hypot(*away(state, origin))
-    if range_m <= parameters.near_range_m:
-        return near
-    if range_m >= parameters.far_range_m:
-        return far
-    share = (range_m - parameters.near_range_m) / (parameters.far_range_m - parameters.near_range_m)
-    return near + share * (far - near)
-
-
-def place_clutter(parameters: Any) -> Component:
-    """Per m^2."""
-    return parameters.clutter_per_m2
-
-
-def place_birth(detection: Any, origin: Any, parameters: Any) -> tuple[Components, Components]:
-    """A target where it was detected, of any velocity."""
-    state = detection[0] + origin[0], 0.0, detection[1] + origin[1], 0.0
-    xx, xy, yy = place_noise(state, origin, parameters)
-    velocity = parameters.birth_sigma_mps**2
-    return state, (xx, 0.0, velocity, xy, 0.0, yy, 0.0, 0.0, 0.0, velocity)
-
-
-def bearing_of(state: Components, origin: Any, parameters: Any) -> Components:
-    """Anticlockwise from the x axis, as a sensor says that is turned by its bias."""
-    x, y = away(state, origin)
-    return (np.arctan2(y, x) + parameters.bias_rad,)
-
-
-def bearing_noise(state: Components, origin: Any, parameters: Any) -> Components:
-    """The variance of a bearing; it does not matter much where on a hull it points when that is far."""
-    across = parameters.sigma_across_m / np.hypot(*away(state, origin))
-    return (parameters.sigma_rad**2 + across**2,)
-
-
-def bearing_detection(state: Components, origin: Any, parameters: Any) -> Component:
-    """The same at all ranges."""
-    return 0.0 if is_blind(state, origin, parameters) else parameters.detection_probability
-
-
-def bearing_clutter(parameters: Any) -> Component:
-    """Per rad."""
-    return parameters.clutter_per_rad
-
-
-PLACES = ScanSensor(
-    "detection",
-    schemas.DETECTION,
-    "position_m",
-    dict.fromkeys(PLANE, "linear"),
-    place_of,
-    place_noise,
-    place_detection,
-    place_clutter,
-    place_birth,
-)
-BEARINGS = ScanSensor(
-    "bearing",
-    schemas.SCAN_BEARING,
-    "bearing_rad",
-    {"bearing_rad": "angle"},
-    bearing_of,
-    bearing_noise,
-    bearing_detection,
-    bearing_clutter,
-)
-KINDS = (PLACES, BEARINGS)
-# What a channel need not state, by kind: none of what it does not say is there.
-UNSTATED: dict[str, float] = {
-    "sigma_across_rad": 0.0,
-    "lag_s": 0.0,
-    "bias_x_m": 0.0,
-    "bias_y_m": 0.0,
-    "joined_within_m": 0.0,
-    "sigma_across_m": 0.0,
-    "bias_rad": 0.0,
-    "interval_s": 0.0,
-    "blind_from_rad": np.nan,
-    "blind_to_rad": np.nan,
-    "near_range_m": np.inf,
-    "far_range_m": np.inf,
-    "far_detection_probability": np.nan,
-    "gate_probability": 0.99,
-}
-FOREIGN = {PLACES.leaf: ("sigma_rad", "clutter_per_rad"), BEARINGS.leaf: ("sigma_m", "clutter_per_m2")}
-
-
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
-    """The sensors with scans and places or bearings.
+    """The sensors with scans and places, bearings, or both range and bearing.
 
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
     rows = []
+    _check_scans(topics, wanted)
     for scan in topics.values():
         prefix, _, leaf = scan.name.rpartition("/")
         if leaf != "scan" or scan.schema_name != schemas.SCAN.full_name:
@@ -289,33 +192,61 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
                 f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
                 "not there; record the sensor's own position"
             )
-    if rows and 0 not in found.kinds:
+    if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
             "only bearings: they begin no tracks, since they do not say how far a target is; take a "
-            "sensor of places with them"
+            "sensor of places, or of ranges with bearings, with them"
         )
     return found
 
 
+def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
+    """Raise BadInput where detections are of scans that nobody recorded."""
+    for seen in topics.values():
+        prefix, _, leaf = seen.name.rpartition("/")
+        is_wanted = not wanted or prefix.strip("/") in wanted
+        if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
+            raise BadInput(
+                f"topic {seen.name}: detections without scans; record {prefix}/scan "
+                f"({schemas.SCAN.full_name}), which says how many each scan has, also where that is none"
+            )
+
+
+class Settings(NamedTuple):
+    """What the loop reads, a row for every sensor; and the errors that sensors have beside noise."""
+
+    names: tuple[str, ...]
+    numbers: Floats
+    errors: Errors
+
+
 def settings_of(
-    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters
-) -> tuple[tuple[str, ...], Floats]:
-    """What the loop reads, by name, and for every sensor (sensors, names)."""
-    names = number_fields(TrackerParameters)
-    rows = []
-    for kind, scan in zip(found.kinds, found.scans, strict=True):
-        values = {}
+    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters, targets: Targets
+) -> Settings:
+    """What parameters and channels say of the sensors and targets."""
+    names, own = number_fields(TrackerParameters), targets.parameters._asdict()
+    kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
+    for kind, scan in zip(kinds, found.scans, strict=True):
+        values = {name: number for name, number in own.items() if name not in names}
         for name in names:
             given = getattr(parameters, name)
-            if given is None and name in FOREIGN[KINDS[kind].leaf]:
+            if name in FOREIGN[kind.leaf]:
                 given = np.nan
             if given is None:
                 needed = name not in UNSTATED
                 given = stated([topics[scan]], name, TrackerParameters, needed=needed)
             values[name] = UNSTATED.get(name, np.nan) if np.isnan(given) else float(given)
-        gate = float(chi2.ppf(values["gate_probability"], len(KINDS[kind].measured)))
-        rows.append([*values.values(), gate])
-    return (*names, "gate"), np.array(rows)
+        values["gate"] = float(chi2.ppf(values["gate_probability"], len(kind.measured)))
+        by_sensor.append(values)
+    errors = errors_of(found.sensors, kinds, by_sensor)
+    of_errors = {f"{name}_sigma": sigma for name, sigma in zip(errors.names, errors.sigma, strict=True)}
+    of_errors |= {
+        f"{name}_s": each for name, each in zip(errors.names, errors.correlation_s, strict=True)
+    }
+    for values, first in zip(by_sensor, errors.first, strict=True):
+        places = np.where(first < 0, -1.0, targets.stage.model.size + first)
+        values |= {f"{sort}_at": place for sort, place in zip(BY_SORT, places, strict=True)} | of_errors
+    return Settings(tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors)
 
 
 # The estimator
@@ -328,15 +259,18 @@ class Setup(NamedTuple):
     found: Found
     tracker: Tracker
     settings: Floats
+    newborn: Newborn
     most_tracks: int
 
     def no_tracks(self, runs: int) -> Tracks:
         """Runs in which nothing was met yet."""
-        return no_tracks(runs, self.most_tracks, TARGET.size, len(self.found.scans))
+        first, count = self.tracker.shared
+        shared = self.newborn.covariance[first : first + count, first : first + count]
+        return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
     def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
         """The tracks after some scans, and what is said of them."""
-        return track_scans(self.tracker, scans, self.settings, tracks)
+        return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
 
 class State(NamedTuple):
@@ -455,11 +389,11 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
 
     `repeated` is how many scans after a late one, the last of which these are of, were used again.
     """
-    topic, found = f"/estimates/{setup.name}", setup.found
+    topic, found, model = f"/estimates/{setup.name}", setup.found, setup.tracker.stage.model
     used = np.flatnonzero(told.confirmed != NEVER)
     counts, time_ns = told.confirmed[used], scans.time_ns[used]
     offsets = np.searchsorted(used, scans.offsets)
-    metadata = state_metadata(PLANE_MOTION)
+    metadata = named(model.state)
 
     def filled(column: NDArray, which: int) -> NDArray:
         ends = told.end[:, which]
@@ -470,7 +404,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
     pair = filled(told.pair, 1)
     scan = pair[:, 1]
     pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
-    sensors = ",".join(each.rpartition("/")[0].strip("/") for each in found.scans)
+    sensors = ",".join(found.sensors)
     approximated = np.flatnonzero(told.approximated)
     late = told.confirmed == NEVER
     unused = np.repeat(np.arange(len(late)), told.turned_away + late)
@@ -489,7 +423,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
                 metadata=metadata,
                 track_id=filled(told.number, 0),
                 mean=filled(told.mean, 0),
-                covariance=filled(told.covariance, 0).reshape(rows, TARGET.size**2),
+                covariance=filled(told.covariance, 0).reshape(rows, model.tangent**2),
             ),
             ends,
         ),
@@ -512,7 +446,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
                 sensor_id=scans.sensor[scan],
                 scan_id=scans.number[scan],
                 detection=pair[:, 2],
-                probability=filled(told.probability, 1),
+                probability=filled(told.associated, 1),
             ),
             pair_ends,
         ),
@@ -545,7 +479,68 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
             np.minimum(scans.offsets, repeated),
         ),
     )
-    return [Ragged(stream, bounds) for stream, bounds in streams]
+    outputs = [Ragged(stream, bounds) for stream, bounds in streams]
+    if setup.tracker.stage.modes:
+        modes = make_stream(
+            f"{topic}/modes",
+            schemas.MODE_PROBABILITIES,
+            track_ns,
+            metadata=named(dict.fromkeys(model.modes or (), "linear")),
+            probability=filled(told.probability, 0),
+        )
+        outputs.append(Ragged(modes, ends))
+    of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
+    innovations = _innovations(setup, scans, pair_ends, *of_pairs)
+    return [*outputs, *innovations]
+
+
+def _innovations(
+    setup: Setup,
+    scans: Scans,
+    ends: Integers,
+    pair: Integers,
+    probability: Floats,
+    white: Floats,
+    factor: Floats,
+) -> Iterator[Ragged]:
+    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
+    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
+    track, scan = pair[order, 0], pair[order, 1]
+    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
+    likeliest = np.sort(order[is_first])
+    for sensor, (kind, topic) in enumerate(zip(setup.found.kinds, setup.found.scans, strict=True)):
+        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
+        measured = KINDS[kind].measured
+        size = len(measured)
+        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
+        stream = innovation_stream(
+            f"/estimates/{setup.name}{topic.removesuffix('/scan')}/innovation",
+            scans.time_ns[pair[rows, 1]],
+            measured,
+            "",
+            target_id=pair[rows, 0],
+            accepted=np.ones(len(rows), np.int64),
+            innovation=np.einsum("nij,nj->ni", root, whitened),
+            covariance=root @ root.transpose(0, 2, 1),
+            squared=(whitened**2).sum(axis=1),
+        )
+        yield Ragged(stream, np.searchsorted(rows, ends))
+
+
+def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
+    """The parts that the parameters ask for."""
+    stage, shared = targets.stage, settings.errors.shared
+    sensors = tuple(measuring(stage.model, kind) for kind in KINDS)
+    association = "jpda" if parameters.association in EXISTING else parameters.association
+    assert parameters.management is not None
+    return Tracker(
+        stage._replace(sensors=sensors),
+        KINDS,
+        association,
+        parameters.management,
+        settings.names,
+        (stage.model.size - len(settings.errors.names), shared),
+    )
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
@@ -553,22 +548,29 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     found = find_sensors(topics, parameters.sensors)
     if not found.scans:
         return []
-    names, settings = settings_of(topics, found, parameters)
-    association = parameters.association.replace("jipda", "jpda")
-    tracker = Tracker(TARGET, KINDS, association, names)
-    setup = Setup(name, found, tracker, settings, parameters.most_tracks)
+    scans = [topics[scan] for scan in found.scans]
+    targets = targets_of(f"estimator {name}", parameters, scans)
+    settings = settings_of(topics, found, parameters, targets)
+    targets = with_errors(f"estimator {name}", targets, settings.errors)
+    tracker = tracker_of(parameters, targets, settings)
+    setup = Setup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
     seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
     read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
 
     def rewinding(back_ns: int) -> Recursive:
         return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
 
-    return [Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)]
+    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    if not parameters.smoothed:
+        return [tracking]
+    if settings.errors.names:
+        raise BadInput(f"estimator {name}: errors of sensors are not smoothed; leave out one of both")
+    return [smoothing_tracks(tracking, targets)]
 
 
 TRACKER = Estimator(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (places), or .../bearing beside those",
+    "per sensor .../scan and .../detection (places) or .../range_bearing, or .../bearing beside those",
     TrackerParameters,
     _bind,
     variant="association",

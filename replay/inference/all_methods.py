@@ -5,6 +5,7 @@ from typing import Any
 
 from recorders.errors import BadInput, choices
 from replay.engine.estimator import Estimator, set_by_variant
+from replay.inference.bank import BANK
 from replay.inference.bound import POSTERIOR_BOUND
 from replay.inference.estimators import modelled_by
 from replay.inference.imm import INTERACTING
@@ -17,6 +18,7 @@ METHODS: Mapping[str, Method] = {
     **FILTERS,
     "smoother": SMOOTHING,
     "imm": INTERACTING,
+    "bank": BANK,
     "particles": BOOTSTRAP,
     "bound": POSTERIOR_BOUND,
 }

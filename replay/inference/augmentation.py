@@ -2,17 +2,17 @@
 
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
-has the parameter's value for a mean, and stands beside the log's; between measurements it is a random
-walk. Methods see a model as any other.
+has the parameter's value for a mean, and stands beside the log's; between measurements it moves as
+`replay.inference.walks` says. Methods see a model as any other. Errors about the points of a map are
+added in the same way, see `replay.inference.point_errors`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import NonNegativeFloat, create_model
 
 from recorders.errors import BadInput, choices
 from replay.engine.arrays import Floats, Function
@@ -21,66 +21,113 @@ from replay.engine.priors import gaussians
 from replay.engine.results import gaussian_stream
 from replay.inference.binding import Recorder, number_fields, settings_type
 from replay.inference.generate import function_of, tuple_of
-from replay.inference.model import Model, ModelParameters, Motion, Sensor, trial_state
+from replay.inference.model import Model, Motion, Sensor, trial_state
+from replay.inference.point_errors import (
+    Errors,
+    PointError,
+    motion_with_errors,
+    point_errors,
+    sensor_with_errors,
+    with_point_errors,
+)
 from replay.inference.steps import Stage
+from replay.inference.walks import Walk, kept, spread, with_walk_parameters
 
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]
 
 
-def estimated(label: str, model: Model, parameters: Any) -> Names:
-    """The parameters that are to be estimated, as the settings say.
+class Added(NamedTuple):
+    """What is estimated beside the state: parameters, then errors about points, and how each moves."""
 
-    Raises BadInput where the model does not let one of them, one stands twice, or has no sigma.
+    parameters: Names
+    errors: Errors
+    walks: tuple[Walk, ...]
+
+    @property
+    def names(self) -> Names:
+        """The components, in their order."""
+        return self.parameters + tuple(each.name for each in self.errors)
+
+
+def estimated(label: str, model: Model, parameters: Any) -> Added:
+    """What is to be estimated beside the state, as the settings say.
+
+    Raises BadInput where the model does not let one of it, one stands twice, or has no sigma.
     """
-    names: Names = tuple(parameters.estimate or ())
-    sigmas, drifts = parameters.estimate_sigma or {}, parameters.estimate_drift or {}
-    for number, name in enumerate(names):
-        where = f"estimator {label}: estimate = {name}"
-        if name not in model.estimable:
-            known = choices(name, model.estimable)
+    asked = parameters.estimate or []
+    options = {
+        "estimate_sigma": parameters.estimate_sigma or {},
+        "estimate_drift": parameters.estimate_drift or {},
+        "estimate_time_s": parameters.estimate_time_s or {},
+    }
+    for option, given in options.items():
+        for name in given.keys() - set(asked):
+            raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
+    named: dict[str, Walk] = {}
+    errors: dict[PointError, Walk] = {}
+    for asks in asked:
+        where = f"estimator {label}: estimate = {asks}"
+        own = point_errors(where, model, asks)
+        if not own and asks not in model.estimable:
+            known = choices(asks, model.estimable)
             raise BadInput(f"{where}: is no parameter that this model lets be estimated; {known}")
-        if name in names[:number]:
+        if asks in named or not errors.keys().isdisjoint(own):
             raise BadInput(f"{where}: stands there twice; name it once")
-        if name not in sigmas:
+        sigma, drift, time_s = (given.get(asks) for given in options.values())
+        if sigma is None:
             raise BadInput(
                 f"{where}: how well is it known beforehand? give its standard deviation, "
-                f"estimate_sigma.{name}=..."
+                f"estimate_sigma.{asks}=..."
             )
-    for option, given in (("estimate_sigma", sigmas), ("estimate_drift", drifts)):
-        for name in given.keys() - set(names):
-            raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
-    return names
+        if time_s is not None and model.estimable.get(asks) == "angle":
+            raise BadInput(
+                f"{where}: is an angle, which has no mean to come back to; give "
+                f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
+            )
+        walk = Walk(sigma, drift or 0.0, time_s or np.inf)
+        if own:
+            errors |= dict.fromkeys(own, walk)
+        else:
+            named[asks] = walk
+    return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
 
 
-def augmented(model: Model, names: Names) -> Model:
-    """The model with these parameters in its state; the model itself where there are none.
+def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
+    """The model with these parameters and errors in its state; the model itself where there are none.
 
     >>> from replay.estimators.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
     ['x_m', 'y_m', 'heading_rad', 'bias_range_m']
     """
-    return _augmented(model, names) if names else model
+    model = _augmented(model, names) if names else model
+    return with_point_errors(model, errors) if errors else model
 
 
-def augmented_stage(stage: Stage, names: Names) -> Stage:
+def augmented_stage(stage: Stage, added: Added) -> Stage:
     """The same of a model as a method takes it."""
-    if not names:
-        return stage
-    model = stage.model
-    sensors = (_augmented_sensor(model, sensor, names) for sensor in stage.sensors)
-    motion, *modes = (_augmented_motion(model, each, names) for each in (stage.motion, *stage.modes))
-    return Stage(augmented(model, names), motion, tuple(sensors), tuple(modes))
+    names, errors = added.parameters, added.errors
+    if names:
+        model, sensors = stage.model, stage.sensors
+        motions = [_augmented_motion(model, each, names) for each in (stage.motion, *stage.modes)]
+        sensors = tuple(_augmented_sensor(model, each, names) for each in sensors)
+        stage = Stage(_augmented(model, names), motions[0], sensors, tuple(motions[1:]))
+    if errors:
+        model, sensors = stage.model, stage.sensors
+        motions = [motion_with_errors(model, each, errors) for each in (stage.motion, *stage.modes)]
+        sensors = tuple(sensor_with_errors(model, each, errors) for each in sensors)
+        stage = Stage(with_point_errors(model, errors), motions[0], sensors, tuple(motions[1:]))
+    return stage
 
 
-def with_drifts(settings: Floats, names: Names, parameters: Any) -> Floats:
-    """Numbers of motion and sensors with the drifts that an augmented model has beside them."""
-    drifts = [(parameters.estimate_drift or {}).get(name, 0.0) for name in names]
-    return np.concatenate([settings, np.tile(drifts, (len(settings), 1))], axis=1)
+def with_walks(settings: Floats, added: Added) -> Floats:
+    """Numbers of motion and sensors with those that an augmented model has beside them."""
+    numbers = np.ravel(added.walks)
+    return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
 
 def begin(
-    label: str, topic: str, stage: Stage, names: Names, settings: Floats, parameters: Any
+    label: str, topic: str, stage: Stage, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
     """What makes of the start of an augmented model's filter one from the log's own prior on `topic`.
 
@@ -88,15 +135,17 @@ def begin(
     estimated has no value.
     """
     fields = number_fields(stage.model.parameters)
-    means = np.array([settings[0, fields.index(name)] for name in names])
-    for name, mean in zip(names, means, strict=True):
+    means = np.array(
+        [settings[0, fields.index(name)] if name in fields else 0.0 for name in added.names]
+    )
+    for name, mean in zip(added.names, means, strict=True):
         if not np.isfinite(mean):
             raise BadInput(f"estimator {label}: estimate = {name}: give its likely value, {name}=...")
-    variances = np.array([parameters.estimate_sigma[name] ** 2 for name in names])
+    variances = np.array([walk.sigma**2 for walk in added.walks])
 
     def extended(prior: Ragged) -> Ragged:
         time_ns, mean, covariance = gaussians(prior)
-        runs, t, k = len(mean), covariance.shape[1], len(names)
+        runs, t, k = len(mean), covariance.shape[1], len(added.walks)
         wider = np.zeros((runs, t + k, t + k))
         wider[:, :t, :t] = covariance
         wider[:, range(t, t + k), range(t, t + k)] = variances
@@ -104,24 +153,20 @@ def begin(
         return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
 
     def begun(start: Start) -> Start:
-        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if names else start
+        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if added.walks else start
 
     return begun
 
 
 @lru_cache(maxsize=64)
 def _augmented(model: Model, names: Names) -> Model:
-    drifts: dict[str, Any] = {_drift(name): (NonNegativeFloat, 0.0) for name in names}
-    parameters: type[ModelParameters] = create_model(
-        f"{model.parameters.__name__}Augmented", __base__=model.parameters, **drifts
-    )
     modes = model.modes and {
         name: _augmented_motion(model, motion, names) for name, motion in model.modes.items()
     }
     return replace(
         model,
         state={**model.state, **{name: model.estimable[name] for name in names}},
-        parameters=parameters,
+        parameters=with_walk_parameters(model.parameters, names),
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
@@ -129,16 +174,12 @@ def _augmented(model: Model, names: Names) -> Model:
     )
 
 
-def _drift(name: str) -> str:
-    return f"drift_{name}"
-
-
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """The motion, in which the parameters stay what they are but for their drift."""
+    """The motion, in which the parameters walk about or come back to what they were given as."""
     n, t = model.size, model.tangent
-    stay = [f"state[{n + index}]" for index in range(len(names))]
-    drifts = [f"parameters.{_drift(name)} ** 2 * duration_s" for name in names]
+    stay = [_stay(model, name, f"state[{n + index}]") for index, name in enumerate(names)]
+    drifts = [spread(name) for name in names]
     given = motion.noise or _no_noise(t)
     state, recorder = trial_state(model.kinds), _recorder(model)
     variances = _entries(len(given(state, 1.0, recorder)))
@@ -154,8 +195,17 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     recorder = _recorder(model)
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, recorder)
+    lost = motion.lost and _reading(
+        model,
+        names,
+        motion.lost,
+        "state, duration_s",
+        "first(state), duration_s",
+        [*_entries(t), *drifts],
+    )
     return replace(
         motion,
+        lost=lost,
         move=_reading(
             model,
             names,
@@ -171,6 +221,13 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         jacobians=None,
         moments=None,
     )
+
+
+def _stay(model: Model, name: str, state: str) -> str:
+    """A component of this name after a step; an angle has no mean to come back to."""
+    if model.estimable[name] == "angle":
+        return state
+    return f"{kept(name)} * {state} + (1.0 - {kept(name)}) * parameters.{name}"
 
 
 @lru_cache(maxsize=256)

@@ -64,7 +64,7 @@ class Found(NamedTuple):
 def roles_of(model: Model) -> list[str]:
     """The topics that a model asks for, by the names that it has for them."""
     control = [model.control, *model.control.instead] if model.control else []
-    maps = [sensor.about.topic for sensor in model.all_sensors if sensor.about]
+    maps = [each.topic for sensor in model.all_sensors for each in sensor.maps]
     sensors = [sensor.topic for sensor in model.all_sensors]
     drives = [each.topic for each in control]
     return list(dict.fromkeys([model.prior, model.truth, *drives, *maps, *sensors]))
@@ -134,15 +134,20 @@ def _found(model: Model, here: _Here) -> Found | None:
         for sensor in model.all_sensors
         if (topic := here.topic(sensor.topic, sensor.schema)) is not None
         and topic.metadata.get("system", model.system) == model.system
-        and (sensor.about is None or here.topic(sensor.about.topic, sensor.about.schema) is not None)
+        and all(here.topic(each.topic, each.schema) is not None for each in sensor.maps)
     )
     parts = {each.topic for each in model.all_sensors}
-    parts |= {each.about.topic for each in model.all_sensors if each.about}
-    starts_alone = model.start is not None and model.start.find is None
-    is_alone = starts_alone and control is not None and not any(map(here.has, parts))
+    parts |= {of.topic for each in model.all_sensors for of in each.maps}
+    is_alone = (
+        model.start is not None
+        and not model.finds_start
+        and control is not None
+        and not any(map(here.has, parts))
+    )
     if not sensors and model.needs_sensor and not is_alone:
         return None
-    if not has_prior and sensors and not any(measures_state(model, sensor) for sensor, _ in sensors):
+    tells = model.finds_start or any(measures_state(model, sensor) for sensor, _ in sensors)
+    if not has_prior and sensors and not tells:
         return None
     instead = tuple(
         (each, topic)
@@ -209,7 +214,7 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
 
     parts = []
     sensing = [sensor for sensor in model.all_sensors if here.has(sensor.topic)]
-    starts = not sensing or any(measures_state(model, sensor) for sensor in sensing)
+    starts = not sensing or model.finds_start or any(measures_state(model, each) for each in sensing)
     if model.start is None or here.has(model.prior) or not starts:
         words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
         if is_here:
@@ -218,7 +223,7 @@ def parts_of(model: Model, here: _Here) -> list[Part]:
     if model.control is not None:
         parts.append(part(model.control.topic, model.control.schema))
     seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
-    maps = {sensor.about.topic: sensor.about for sensor in seeing if sensor.about}
+    maps = {each.topic: each for sensor in seeing for each in sensor.maps}
     parts += [part(topic, each.schema) for topic, each in maps.items()]
     sensors = [part(each.topic, each.schema, model.system) for each in model.all_sensors]
     if sensors and model.needs_sensor:

@@ -29,7 +29,7 @@ from replay.inference.augmentation import (
     augmented_stage,
     begin,
     estimated,
-    with_drifts,
+    with_walks,
 )
 from replay.inference.binding import (
     Found,
@@ -217,12 +217,12 @@ def bind_model(
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
-    names = estimated(label, model, parameters)
-    lacking = method.lacks(augmented(model, names))
-    if names and lacking:
+    added = estimated(label, model, parameters)
+    lacking = method.lacks(augmented(model, added.parameters, added.errors))
+    if added.names and lacking:
         raise BadInput(
-            f"estimator {label}: with estimate = {', '.join(names)} the model lacks {lacking}, which "
-            "this method needs"
+            f"estimator {label}: with estimate = {', '.join(parameters.estimate)} the model lacks "
+            f"{lacking}, which this method needs"
         )
     renamed = parameters.topics or {}
     _check_topics(label, model, topics, renamed)
@@ -230,10 +230,10 @@ def bind_model(
         found = found._replace(origin=_origin_of(label, model, found, topics))
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        stage = augmented_stage(own, names)
+        stage = augmented_stage(own, added)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)
-        settings = with_drifts(numbers, names, parameters)
+        settings = with_walks(numbers, added)
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
@@ -243,7 +243,7 @@ def bind_model(
         opening = Beginning(name, found, own, numbers, assumed).opening
         whole = filtering.whole(topics)
         priors = {found.prior.name: model.state}
-        begun = begin(label, found.prior.name, own, names, numbers, parameters)
+        begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
         made = replace(made, opening=opening)
@@ -389,7 +389,7 @@ class Filter:
 
     def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
         """The topics of a log that it starts from: the prior, where there is one, and the maps."""
-        maps = (sensor.about.topic for sensor in self.stage.sensors if sensor.about)
+        maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
@@ -401,7 +401,7 @@ class Filter:
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
         carried = Carried(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
-        maps = {each.about.topic: each.about for each in self.stage.sensors if each.about}
+        maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
         points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
         waiting = None
         if model.control is not None and model.control.interpolated:  # what drives from there on
@@ -443,7 +443,28 @@ class Filter:
             happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
             happenings = with_control(self.stage, happenings)
         state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
-        return self.follow(state, happenings)
+        state, made = self.follow(state, happenings)
+        return state, [*made, *self.not_driven(happenings)]
+
+    def not_driven(self, happenings: Happenings) -> list[Ragged]:
+        """What was not used since it was measured in a gap of the control, where that may have some."""
+        control = self.stage.model.control
+        if control is None or not control.gap or not _compiled(self.stage, self.method)[1].resumes:
+            return []
+        lost = (happenings.source >= 0) & np.isnan(happenings.data[:, -1])
+        reasons = [
+            f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
+            f"{control.gap}"
+            for _, topic in self.found.sensors
+        ]
+        stream = reason_stream(
+            f"/estimates/{self.name}/skipped",
+            schemas.SKIPPED,
+            happenings.time_ns[lost],
+            happenings.source[lost],
+            reasons,
+        )
+        return [Ragged(stream, ragged_rows(lost, happenings.offsets))]
 
     def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""

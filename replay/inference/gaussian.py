@@ -4,7 +4,7 @@ Means lie in the state's own space, covariances in its tangent space and are sym
 Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -118,6 +118,44 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
         squared += difference[i] * difference[i]
         determinant *= factor[i, i]
     return squared, 2.0 * np.log(determinant)
+
+
+def widening(squared: float, size: int, parameters: Any) -> float:
+    """How many times larger the covariance of an innovation counts, of a NIS and so many components.
+
+    To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
+    a Kalman update still. 1 where no option of `replay.inference.model.ModelParameters` is given: those
+    are NaN then. The largest of those given holds:
+
+    - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
+    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
+      Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
+    - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
+
+    >>> from types import SimpleNamespace
+    >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
+    >>> widening(36.0, 1, SimpleNamespace(**given)), widening(8.0, 1, SimpleNamespace(**given))
+    (4.0, 1.0)
+    """
+    factor = 1.0
+    if squared > parameters.inflate_nis:
+        factor = squared / parameters.inflate_nis
+    if parameters.student_freedom > 0.0:
+        freedom = parameters.student_freedom
+        factor = max(factor, (freedom + squared) / (freedom + size))
+    if squared > parameters.switch_nis:
+        half = 0.5 * (1.0 + squared / parameters.switch_nis)
+        factor = max(factor, half * half)
+    return factor
+
+
+def widen(innovation: Innovation, size: int, factor: float) -> None:
+    """Make the covariance of a whitened innovation so many times larger."""
+    root = np.sqrt(factor)
+    for i in range(size):
+        innovation.difference[i] /= root
+        for k in range(i + 1):
+            innovation.covariance[i, k] *= root
 
 
 def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:

@@ -202,16 +202,20 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
         parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
         parts = [_fields(stream, tuple(sensor.measured))]
-    if sensor.about is not None:
-        target = stream[sensor.about.of].astype(np.int64)
+    about: list[Floats] = []
+    if sensor.maps:
+        target = stream[sensor.maps[0].of].astype(np.int64)
         run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
-        places = world.points[sensor.about.topic]
-        rows = places.rows(run, target)
+    for each in sensor.maps:
+        places = world.points[each.topic]
+        rows = places.rows(run, stream[each.of].astype(np.int64))
         source[rows < 0] = NOTHING
-        parts.insert(1, places.at(rows))
+        about.append(places.at(rows))
     if sensor.control is not None:  # see `with_control`
-        unknown = np.full((len(stream), len(sensor.control.components)), np.nan)
-        parts.insert(2 if sensor.about else 1, unknown)
+        about.append(np.full((len(stream), len(sensor.control.components)), np.nan))
+    if sensor.is_numbered:
+        about.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
+    parts[1:1] = about
     source[lacking] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
@@ -316,8 +320,8 @@ def with_control(stage: Stage, happenings: Happenings) -> Happenings:
     for number, sensor in enumerate(stage.sensors):
         if sensor.control is not None:
             rows, controls = happenings.source == number, len(sensor.control.components)
-            end = len(sensor.measured) + sensor.about_size
-            data[rows, end - controls : end] = data[rows, -controls:]
+            begin = len(sensor.measured) + sensor.control_start
+            data[rows, begin : begin + controls] = data[rows, -controls:]
     return happenings._replace(data=data)
 
 

@@ -132,7 +132,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     modes, n, t = len(filters), model.size, model.tangent
     slots = len(slots_of(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    gather, mix = mixing(model.kinds, modes)
+    gather, mix = mixing(model.kinds)
     change, weigh, predict_modes = changing(modes), weighing(modes), predicting(filters)
     rates_of, fill_rates = switching.rates, filling(modes * (modes - 1))
 
@@ -182,9 +182,25 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             open_gate=np.full(most + 1, np.inf),
         )
 
+    def of_run(update: Function) -> Function:
+        def update_run(
+            run: int,
+            belief: Belief,
+            data: Floats,
+            parameters: Any,
+            gate: Floats,
+            use: int,
+            memory: Memory,
+            note: Note,
+        ) -> int:
+            weights = belief.probability[run], belief.log_probability[run]
+            gaussians = Gaussian(belief.mean[run], belief.covariance[run])
+            return update(gaussians, weights, data, parameters, gate, use, memory, note)
+
+        return update_run
+
     updates = tuple(
-        interacting_update(stage, number, modes, update)
-        for number, update in enumerate(filters[0].updates)
+        of_run(weighed_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
     return Steps(memory, predict, updates, estimate, sampled)
@@ -201,10 +217,11 @@ def predicting(filters: Sequence[Steps]) -> Function:
     return function_of(text, **{f"predict_{mode}": each.predict for mode, each in enumerate(filters)})
 
 
-def interacting_update(stage: Stage, number: int, modes: int, update_mode: Function) -> Function:
-    """The update of all modes by sensor `number`, and of their probabilities.
+def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function:
+    """The update of several Gaussians by sensor `number`, and of the probabilities of their modes.
 
-    A measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
+    `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
+    measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
     do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
     of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
     """
@@ -213,20 +230,20 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
     angular = tuple(kind == "angle" for kind in measured.values())
     m, tell = len(measured), noting(stage, number)
 
-    def blend(probability: Floats, memory: Memory, note: Note) -> float:
+    def blend(probability: Floats, memory: Any, note: Note) -> float:
         """Note the innovation of the mixture of all modes; returns its NIS."""
         innovation, notes = memory.filters[0].innovations[number], memory.notes
         difference, covariance, _ = innovation
         for i in range(m):
             first = notes.difference[0, places[i]]
             difference[i] = first
-            for mode in range(1, modes):
+            for mode in range(1, len(probability)):
                 away = wrap(notes.difference[mode, places[i]] - first, angular[i])
                 difference[i] += probability[mode] * away
         for i in range(m):
             for j in range(i + 1):
                 entry, row, column = 0.0, places[i], places[j]
-                for mode in range(modes):
+                for mode in range(len(probability)):
                     spread = wrap(notes.difference[mode, row] - difference[i], angular[i])
                     spread *= wrap(notes.difference[mode, column] - difference[j], angular[j])
                     entry += probability[mode] * (notes.covariance[mode, row, column] + spread)
@@ -235,21 +252,21 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
         return whiten(innovation, keep_measured(innovation))[0]
 
     def update(
-        run: int,
-        belief: Belief,
+        gaussians: Gaussian,
+        weights: tuple[Floats, Floats],
         data: Floats,
         parameters: Any,
         gate: Floats,
         use: int,
-        memory: Memory,
+        memory: Any,
         note: Note,
     ) -> int:
-        gaussians = Gaussian(belief.mean[run], belief.covariance[run])
-        probability, numbers, taken = belief.probability[run], memory.notes.numbers, 0
-        for mode in range(modes):
+        probability, log_probability = weights
+        numbers, taken = memory.notes.numbers, 0
+        for mode in range(len(probability)):
             numbers[mode, 2] = 0.0
         for bounds in (gate, memory.open_gate):
-            for mode in range(modes):
+            for mode in range(len(probability)):
                 if numbers[mode, 2] == 0.0:
                     own = Note(
                         memory.notes.difference[mode], memory.notes.covariance[mode], numbers[mode]
@@ -266,20 +283,20 @@ def interacting_update(stage: Stage, number: int, modes: int, update_mode: Funct
         note.numbers[1] = 0.0
         note.numbers[2] = 1.0 if taken else 0.0
         if taken:
-            note.numbers[1] = weigh(probability, belief.log_probability[run], numbers)
+            note.numbers[1] = weigh(probability, log_probability, numbers)
         return ALL_WELL
 
     def weigh(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
         """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
         highest, total = -np.inf, 0.0
-        for mode in range(modes):
+        for mode in range(len(probability)):
             log_probability[mode] += numbers[mode, 1]
             highest = max(highest, log_probability[mode])
-        for mode in range(modes):
+        for mode in range(len(probability)):
             probability[mode] = np.exp(log_probability[mode] - highest)
             total += probability[mode]
         likelihood = highest + np.log(total)
-        for mode in range(modes):
+        for mode in range(len(probability)):
             log_probability[mode] -= likelihood
             probability[mode] /= total
         return likelihood
@@ -379,7 +396,7 @@ def weighing(modes: int) -> Function:
     return weigh
 
 
-def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
+def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
     """`gather(mean, covariance, probability, memory)` and `mix(weights, memory, mean, covariance)`.
 
     The first carries the Gaussians of all modes to the tangent space of the likeliest; the second fills
@@ -389,15 +406,12 @@ def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
     reset, reset_back = resetting(kinds), resetting(kinds, back=True)
     n, t = len(kinds), tangent_size(kinds)
 
-    def gather(mean: Floats, covariance: Floats, probability: Floats, memory: Memory) -> None:
-        likeliest = 0
-        for mode in range(1, modes):
-            if probability[mode] > probability[likeliest]:
-                likeliest = mode
+    def gather(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
+        likeliest = likeliest_of(probability)
         centre, away = memory.centre, memory.away
         for row in range(n):
             centre[row] = mean[likeliest, row]
-        for mode in range(modes):
+        for mode in range(len(probability)):
             carried = memory.carried[mode]
             subtract(mean[mode], centre, away, mode)
             for row in range(t):
@@ -407,17 +421,17 @@ def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
                 reset_back(away[mode], carried)
                 reset_back(away[mode], carried.T)
 
-    def mix(weights: Floats, memory: Memory, mean: Floats, covariance: Floats) -> None:
+    def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
         away, carried, shift = memory.away, memory.carried, memory.shift
         for row in range(t):
             entry = 0.0
-            for mode in range(modes):
+            for mode in range(len(weights)):
                 entry += weights[mode] * away[mode, row]
             shift[row] = entry
         for row in range(t):
             for column in range(row + 1):
                 entry = 0.0
-                for mode in range(modes):
+                for mode in range(len(weights)):
                     spread = (away[mode, row] - shift[row]) * (away[mode, column] - shift[column])
                     entry += weights[mode] * (carried[mode, row, column] + spread)
                 covariance[row, column] = covariance[column, row] = entry
@@ -429,6 +443,15 @@ def mixing(kinds: tuple[str, ...], modes: int) -> tuple[Function, Function]:
             reset(shift, covariance.T)
 
     return gather, mix
+
+
+def likeliest_of(probability: Floats) -> int:
+    """The first mode than which none is more probable."""
+    likeliest = 0
+    for mode in range(1, len(probability)):
+        if probability[mode] > probability[likeliest]:
+            likeliest = mode
+    return likeliest
 
 
 class SmoothingMemory(NamedTuple):
@@ -483,8 +506,44 @@ def smoothing(modes: int) -> Function:
 # As an estimator
 
 
-class Interacting(Filter):
-    """A filter of all modes of a model, which tells their probabilities beside the state."""
+class Mixing(Filter):
+    """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What the Gaussians are of."""
+        raise NotImplementedError
+
+    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+        """Estimates and innovations to be filled in."""
+        (end, time_ns, mean, covariance), innovations = super().no_results(due, noted, slots)
+        probability = np.empty((len(mean), len(self.names)))
+        return Mixtures(end, time_ns, mean, covariance, probability), innovations
+
+    def told(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
+        """The streams of the state and of the modes' probabilities."""
+        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
+        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
+
+    def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
+        """The stream of the modes' probabilities (n, M)."""
+        stream = make_stream(
+            f"/estimates/{self.name}/{name}",
+            schemas.MODE_PROBABILITIES,
+            time_ns,
+            metadata=named(dict.fromkeys(self.names, "linear")),
+            probability=probability,
+        )
+        return Ragged(stream, offsets)
+
+
+class Interacting(Mixing):
+    """A filter of all modes of a model."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The modes."""
+        return tuple(self.stage.model.modes or ())
 
     @cached_property
     def chain(self) -> tuple[Floats, Floats]:
@@ -504,23 +563,12 @@ class Interacting(Filter):
             belief = Belief(mean, covariance, probability, np.log(probability))
         return state._replace(carried=state.carried._replace(belief=belief), kept=())
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
-        """Estimates and innovations to be filled in."""
-        (end, time_ns, mean, covariance), innovations = super().no_results(due, noted, slots)
-        probability = np.empty((len(mean), len(self.stage.modes)))
-        return Mixtures(end, time_ns, mean, covariance, probability), innovations
-
     @property
     def cannot_rewind(self) -> str:
         """See `Filter.cannot_rewind`."""
         if self.parameters.smoothed_modes:
             return "smoothed modes use what came later in any case (smoothed_modes)"
         return super().cannot_rewind
-
-    def told(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
-        """The streams of the state and of the modes' probabilities."""
-        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
-        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
 
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events."""
@@ -541,17 +589,6 @@ class Interacting(Filter):
         arguments = (modes.offsets, time_ns, rates, probability)
         _smoothing(count)(modes.runs, *arguments, scratch=partial(smoothing_memory, count))
         return self.modes("smoothed_modes", time_ns, probability, modes.offsets)
-
-    def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
-        """The stream of the modes' probabilities (n, M)."""
-        stream = make_stream(
-            f"/estimates/{self.name}/{name}",
-            schemas.MODE_PROBABILITIES,
-            time_ns,
-            metadata=named(dict.fromkeys(self.stage.model.modes or (), "linear")),
-            probability=probability,
-        )
-        return Ragged(stream, offsets)
 
 
 # As a method

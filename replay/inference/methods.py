@@ -18,7 +18,15 @@ from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
 from replay.inference.binding import trial_parameters
-from replay.inference.gaussian import kalman_step, keep_measured, reduce_covariance, whiten, wrap
+from replay.inference.gaussian import (
+    kalman_step,
+    keep_measured,
+    reduce_covariance,
+    whiten,
+    widen,
+    widening,
+    wrap,
+)
 from replay.inference.generate import is_flat, resetting, retraction, tuple_of
 from replay.inference.model import Model, trial_state
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
@@ -55,7 +63,8 @@ class MethodParameters(Parameters):
     `every_s` asks for estimates every so often, beside those at the stamps of sensors; `mode` is the
     motion to use of a model that has several. `estimate` names parameters that become part of the state:
     each starts from its value with the standard deviation that `estimate_sigma` has for it, and drifts
-    at random by the density (per square root of a second) that `estimate_drift` has, by default not.
+    at random by the density (per square root of a second) that `estimate_drift` has, by default not, and
+    comes back within about the time that `estimate_time_s` has: a first-order Gauss-Markov process.
     `topics` says which topic of the log stands for one that the model asks for, such as
     {pose = "/amcl_pose/pose"}; an empty name leaves a sensor out.
     """
@@ -65,6 +74,7 @@ class MethodParameters(Parameters):
     estimate: list[str] | None = None
     estimate_sigma: dict[str, PositiveFloat] | None = None
     estimate_drift: dict[str, NonNegativeFloat] | None = None
+    estimate_time_s: dict[str, PositiveFloat] | None = None
     topics: dict[str, str] | None = None
 
 
@@ -126,14 +136,16 @@ def iterated_update(stage: Stage, number: int) -> Function:
     """The update linearised anew at every iterate, until it settles: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
-    gate is tested at the prediction; innovation and likelihood are those of the last iterate.
+    gate is tested at the prediction, and so is how much the measurement counts; innovation and
+    likelihood are those of the last iterate.
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
     flat = is_flat(model.kinds)
     read_state, read_about = tuple_of(n), reading(sensor).about
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    tell, correct = noting(stage, number), correcting(model)
+    # the iterates are those of the one rotation, whatever the model's other corrections are
+    tell, correct = noting(stage, number), correcting(replace(model, upright=False))
     add, turn = retraction(model.kinds), resetting(model.kinds)
 
     def relinearise(
@@ -169,7 +181,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
             present += not np.isnan(data[i])
         if present == 0:
             return NOTHING_MEASURED
-        innovation, step = work.innovations[number], work.step
+        innovation, step, factor = work.innovations[number], work.step, 1.0
         for row in range(t):
             step[row] = 0.0
         for iteration in range(ITERATIONS):
@@ -179,9 +191,12 @@ def iterated_update(stage: Stage, number: int) -> Function:
             squared, determinant = whiten(innovation, size)
             if np.isnan(squared):
                 return NOT_POSITIVE_DEFINITE
+            if iteration == 0:
+                factor = widening(squared, size, parameters)
             if size == 0 or (iteration == 0 and not squared <= gate[size]):
-                note_numbers(note, squared, determinant, size, False)
+                note_numbers(note, squared, determinant, size, False, 1.0)
                 return ALL_WELL
+            widen(innovation, size, factor)
             for row in range(t):
                 work.turned[row] = step[row]
             kalman_step(innovation, size, step)
@@ -192,7 +207,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
                 break
         reduce_covariance(covariance, innovation.cross_covariance, size)
         correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, True)
+        note_numbers(note, squared, determinant, size, True, factor)
         return ALL_WELL
 
     return update

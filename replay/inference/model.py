@@ -37,6 +37,12 @@ class ModelParameters(Parameters):
     gate_reopens_s: PositiveFloat | None = None
     """The gate is open where a sensor's last measurement that was let in is older, so that a filter that
     has lost its way, as in an outage, does not keep out all that would bring it back."""
+    inflate_nis: PositiveFloat | None = None
+    """An innovation with a greater NIS counts with a larger covariance, by which it has this NIS."""
+    student_freedom: PositiveFloat | None = None
+    """Innovations count as if drawn from Student's distribution of so many degrees of freedom."""
+    switch_nis: PositiveFloat | None = None
+    """Above this NIS a measurement is switched off by degrees, as in dynamic covariance scaling."""
     sigma_fix_m: PositiveFloat | None = None
     """Of each component of a position fix that does not state its covariance."""
 
@@ -81,7 +87,7 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         gap: the parameter that says how long, in s, an interpolated control may be silent: what is
-            estimated ends there.
+            estimated ends there, or is unknown until it speaks again, see `Motion.lost`.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
         instead: other topics that the components of these names are taken from where the log has them,
@@ -109,8 +115,13 @@ class Motion:
             noise enter other than by addition, (state, control, noise, duration_s, parameters).
         noise: (state, duration_s, parameters) -> the variances of the additive noise in the tangent
             space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
+        noise_block: how many components the triangle is of, where variances of the others follow it; of
+            all of them for zero.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
             duration; it enters the state through the derivative by the control.
+        lost: (state, duration_s, parameters) -> the variances in the tangent space that are added where
+            the control was silent for longer than its `gap`. The state stays, so that they cover what it
+            may have moved meanwhile; there are no estimates between.
         linear: whether `move` is linear in the state: sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
             they are written by hand, jets give them else.
@@ -121,10 +132,17 @@ class Motion:
     move: Function
     noise: Function | None = None
     noises: int = 0
+    noise_block: int = 0
     control_noise: Function | None = None
+    lost: Function | None = None
     linear: bool = False
     jacobians: Function | None = None
     moments: Function | None = None
+
+    def triangle(self, tangent: int) -> int:
+        """How many numbers `noise` returns where it is no variances alone."""
+        block = self.noise_block or tangent
+        return block * (block + 1) // 2 + tangent - block
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +177,8 @@ class Sensor:
             every component is a field of its own.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
-        about: what the message is about.
+        about: what the message is about: a point of a map, or one of each of several maps.
+        is_numbered: whether `about` ends with the numbers of these points.
         control: the model's, which has to be interpolated, where what is measured depends on it:
             `about` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
@@ -180,7 +199,8 @@ class Sensor:
     noises: int = 0
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
-    about: Map | None = None
+    about: Map | tuple[Map, ...] | None = None
+    is_numbered: bool = False
     control: Control | None = None
     read: Callable[[Stream], Floats] | None = None
     delay: str = ""
@@ -190,10 +210,20 @@ class Sensor:
     log_likelihood: Function | None = None
 
     @property
+    def maps(self) -> tuple[Map, ...]:
+        """The maps of the points that a message is about."""
+        return self.about if isinstance(self.about, tuple) else (self.about,) if self.about else ()
+
+    @property
+    def control_start(self) -> int:
+        """How many numbers of `about` come before those of the control: the points' components."""
+        return sum(each.size for each in self.maps)
+
+    @property
     def about_size(self) -> int:
-        """How many numbers `measure` gets as `about`: those of the point, then those of the control."""
+        """How many numbers `measure` gets as `about`: of points, of the control, the points' numbers."""
         controls = len(self.control.components) if self.control else 0
-        return (self.about.size if self.about else 0) + controls
+        return self.control_start + controls + (len(self.maps) if self.is_numbered else 0)
 
 
 @lru_cache(maxsize=64)
@@ -230,9 +260,9 @@ class Start:
             zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
             The state is that at the last of them, and begins just after it: they are used up. For a
             state of which a position tells too little.
-        find: (first messages of a run by the model's names for their topics, parameters) -> `Started`,
-            in place of all that; for a state that is found from several sensors together. Raises
-            BadInput where they do not tell it. Such a model needs a sensor.
+        find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
+            the model's names for their topics, and the maps; for a state that is found from several
+            messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
     """
 
     sigmas: Mapping[str, float]
@@ -270,6 +300,9 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
+        upright: whether filters correct its orientation, the only one, by a turn about the third axis of
+            the log's frame and then by a tilt of the body. Where that axis is up, a heading that is
+            hardly known then leaves the tilt, which is known well, as it is.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -318,6 +351,7 @@ class Model:
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
     takes_fixes: bool = True
+    upright: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
@@ -329,6 +363,11 @@ class Model:
             return self.sensors
         components = list(self.state)
         return (*self.sensors, fix_sensor(tuple(map(components.index, names))))
+
+    @property
+    def finds_start(self) -> bool:
+        """Whether the model finds where to start itself, see `Start.find`."""
+        return self.start is not None and self.start.find is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -367,7 +406,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     returns what the model denies.
     """
     state, control = trial_state(model.kinds), (0.0,) * model.controls
-    sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
+    sizes = (model.tangent, motion.triangle(model.tangent))
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
     if motion.noises and (motion.noise is None or motion.control_noise is not None):
@@ -378,6 +417,8 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     if motion.noise is not None:
         wanted = (motion.noises,) if motion.noises else sizes
         _check(where, motion.noise, (state, 1.0, parameters), wanted)
+    if motion.lost is not None:
+        _check(where, motion.lost, (state, 1.0, parameters), (model.tangent,))
     if motion.control_noise is not None:
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 

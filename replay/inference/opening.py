@@ -78,16 +78,10 @@ class Beginning:
         """The topics whose first message is where to begin."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.instead)]
-        if self._finds:
+        if self.stage.model.finds_start:
             return [*drives, *(topic for _, topic in self.found.sensors)]
         needs_drives = self._aligns or not self._measuring
         return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
-
-    @property
-    def _finds(self) -> bool:
-        """Whether the model finds the state from several sensors together."""
-        start = self.stage.model.start
-        return start is not None and start.find is not None
 
     @property
     def _aligns(self) -> bool:
@@ -96,36 +90,40 @@ class Beginning:
         sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
         return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
-    def find(self, first: Mapping[str, Ragged], clock: Clock) -> Opened:
+    def find(self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], clock: Clock) -> Opened:
         """What is found in the first messages; raises BadInput where none of them can be used."""
-        whole: dict[str, Ragged] = {}
+        found: dict[str, Ragged] = {}
         told: list[Ragged] = []
         facts: list[_Fact] = []
         origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
             time_ns, has_one, rows = _first_of(fixes, clock, None)
-            whole[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
-            origins = origins_of(whole[topic.name])
-            told.append(self._told_origin(whole[topic.name]))
+            found[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            origins = origins_of(found[topic.name])
+            told.append(self._told_origin(found[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
             facts.append(_Fact(what, time_ns, has_one))
         if not self.found.has_prior:
-            prior, found = self._prior(first, clock, origins)
-            whole[self.found.prior.name] = prior
-            facts += found
-        return Opened(whole, [*told, *self._told(facts)])
+            prior, begun = self._prior(first, whole, clock, origins)
+            found[self.found.prior.name] = prior
+            facts += begun
+        return Opened(found, [*told, *self._told(facts)])
 
     def _prior(
-        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None
+        self,
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        clock: Clock,
+        origins: Floats | None,
     ) -> tuple[Ragged, list["_Fact"]]:
         """The priors of all runs, and what is to be told of them."""
         model, runs = self.stage.model, _runs(first)
-        mean, sigma = _unknown(model.state, model.start)
+        mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
-        if self._finds:
-            facts = self._found(first, origins, begun)
+        if model.finds_start:
+            facts = self._found(first, whole, origins, begun)
         elif self._measuring:
             facts = self._at_first(first, clock, origins, begun)
         else:
@@ -166,7 +164,11 @@ class Beginning:
         return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
 
     def _found(
-        self, first: Mapping[str, Ragged], origins: Floats | None, begun: "_Begun"
+        self,
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        origins: Floats | None,
+        begun: "_Begun",
     ) -> list["_Fact"]:
         """Begin all runs where the model finds them; raises BadInput where it finds none."""
         model, control = self.stage.model, self.found.control
@@ -180,6 +182,7 @@ class Beginning:
             if origins is not None and topic in self.found.geodetic:
                 ragged = in_plane(ragged, origins)
             given[sensor.topic] = ragged
+            given |= {each.topic: whole[each.topic] for each in sensor.maps}
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         how = [""] * len(begun.time_ns)
         for run in range(len(how)):
@@ -222,7 +225,7 @@ class Beginning:
     def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
         """The mean and the much wider sigmas of a state that one message tells of."""
         model, sensor = self.stage.model, self.stage.sensors[number]
-        mean, sigma = _unknown(model.state, model.start)
+        mean, sigma = unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
@@ -352,16 +355,16 @@ def _runs(first: Mapping[str, Ragged]) -> int:
     return next(iter(first.values())).runs
 
 
-def _unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
     """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
-    assert start is not None
+    sigmas = start.sigmas if start else {}
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
     for kind, columns in things(kinds):
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([start.sigmas.get(name, np.nan) for name in names])
+    return mean, np.array([sigmas.get(name, np.nan) for name in names])
 
 
 def _first_of(

@@ -30,6 +30,7 @@ from replay.inference.gaussian import (
     no_innovation,
     semidefinite_cholesky,
     whiten,
+    widening,
     wrap,
 )
 from replay.inference.generate import (
@@ -342,7 +343,8 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     """
     t, noise = stage.model.tangent, stage.motion.noise
     assert noise is not None
-    read_state, add_noise = tuple_of(stage.model.size), adding_noise(t)
+    read_state = tuple_of(stage.model.size)
+    add_noise = adding_noise(t, stage.motion.noise_block)
     read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
     def factored(lower: Floats, variances: Any) -> bool:
@@ -412,7 +414,7 @@ def weighing(stage: Stage, number: int) -> Function:
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
-        note_numbers(note, squared, determinant, size, accepted)
+        note_numbers(note, squared, determinant, size, accepted, 1.0)
         if not accepted:
             return ALL_WELL
         factor_kept(own, kept)
@@ -571,7 +573,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """See `_likelihood`; the difference becomes L^-1 v."""
+    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `widening`."""
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):
@@ -580,7 +582,9 @@ def gaussian_likelihood(
             entry -= factor[a, b] * difference[b]
         difference[a] = entry / factor[a, a]
         squared += difference[a] * difference[a]
-    return -0.5 * (squared + own.determinant[number] + size * LOG_TWO_PI)
+    factor = widening(squared, size, parameters)
+    known = own.determinant[number] + size * LOG_TWO_PI
+    return -0.5 * (squared / factor + known + size * np.log(factor))
 
 
 def reweigh(weight: Floats, likelihood: Floats) -> float:

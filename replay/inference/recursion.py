@@ -22,6 +22,7 @@ from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
+    UNKNOWN,
     Note,
     Stage,
     Steps,
@@ -141,6 +142,7 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
     has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
+    resumes = steps.resumes
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: Carried) -> None:
@@ -162,7 +164,7 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         """Predict to an event."""
         control = carried.control[run]
         first = happenings.data.shape[1] - controls
-        if interpolated:  # the mean of both ends drives the step
+        if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
                 control[k] = 0.5 * (control[k] + happenings.data[event, first + k])
         parameters = settings_of(settings, 0)
@@ -178,12 +180,18 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         innovations: Innovations,
         memory: Any,
     ) -> int:
-        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did."""
+        """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did.
+
+        UNKNOWN in a gap of the control after which it goes on.
+        """
         source, data = happenings.source[event], happenings.data[event]
         duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             if has_gaps and np.isnan(data[len(data) - 1]):
-                return NOT_DRIVEN
+                if not resumes:
+                    return NOT_DRIVEN
+                carried.control[run, :] = np.nan
+                return UNKNOWN
             carried.time_ns[run] = happenings.time_ns[event]
             if not advance(run, event, duration_s, happenings, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE
@@ -245,7 +253,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 if failure == ALL_WELL:
                     estimates.time_ns[row] = happenings.time_ns[event]
                     estimates.end[run] = row + 1
-            carried.failure[run] = failure
+            carried.failure[run] = ALL_WELL if failure == UNKNOWN else failure
 
     return follow
 

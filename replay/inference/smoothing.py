@@ -128,7 +128,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
 
     updates = tuple(_with_memory(update) for update in steps.updates)
-    return Steps(memory, predict, updates, estimate, steps.sampled)
+    return Steps(memory, predict, updates, estimate, steps.sampled, steps.resumes)
 
 
 def _with_memory(update: Function) -> Function:

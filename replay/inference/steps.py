@@ -24,6 +24,8 @@ from replay.inference.gaussian import (
     no_innovation,
     reduce_covariance,
     whiten,
+    widen,
+    widening,
     wrap,
 )
 from replay.inference.generate import (
@@ -34,6 +36,7 @@ from replay.inference.generate import (
     is_flat,
     resetting,
     retraction,
+    things,
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
@@ -47,7 +50,7 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
-NOTHING_MEASURED, NOT_STARTED = -2, -3  # beside ALL_WELL, -1
+NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Stage(NamedTuple):
@@ -81,6 +84,7 @@ class Steps(NamedTuple):
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
+        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -88,6 +92,7 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
+    resumes: bool = False
 
 
 class Note(NamedTuple):
@@ -168,6 +173,9 @@ def gaussian_filter(
     `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
     one run's mean and covariance.
     """
+    lost = stage.motion.lost
+    if lost is not None:
+        predict = _predicting_lost(stage.model, lost, predict)
 
     def predict_run(
         run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
@@ -185,7 +193,32 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
+        resumes=lost is not None,
     )
+
+
+def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
+    """The prediction, which stays where it is and knows less where the control is NaN."""
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        if not np.isnan(control[0]):
+            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+        for row in range(t):
+            for column in range(t):
+                work.product[row, column] = covariance[row, column]
+        add(covariance, lost(read_state(mean), duration_s, parameters))
+        return True
+
+    return predict
 
 
 def _of_run(update: Function) -> Function:
@@ -269,7 +302,7 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     if motion.noise is not None and motion.noises:
         pieces.append(_entering_noise(motion.noise, motion.noises))
     elif motion.noise is not None:
-        pieces.append(_additive_noise(motion.noise, model.tangent))
+        pieces.append(_additive_noise(motion.noise, adding_noise(model.tangent, motion.noise_block)))
     if not pieces:
         return nothing
     return pieces[0] if len(pieces) == 1 else _both(*pieces)
@@ -308,9 +341,7 @@ def _entering_noise(variances: Function, noises: int) -> Function:
     return add
 
 
-def _additive_noise(noise: Function, tangent: int) -> Function:
-    add_noise = adding_noise(tangent)
-
+def _additive_noise(noise: Function, add_noise: Function) -> Function:
     def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         add_noise(covariance, noise(state, duration_s, parameters))
 
@@ -485,6 +516,8 @@ def noting(stage: Stage, number: int) -> Function:
 def correcting(model: Model) -> Function:
     """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it."""
     add = retraction(model.kinds)
+    if model.upright:
+        return _correcting_upright(model, add)
     if is_flat(model.kinds):
 
         def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
@@ -501,12 +534,57 @@ def correcting(model: Model) -> Function:
     return move_and_turn
 
 
+def _correcting_upright(model: Model, add: Function) -> Function:
+    """The same of a state whose orientation turns about up first, and is then tilted.
+
+    With up e in the body's axes, a correction d turns by a = e'd and tilts by p = d - a e; covariances
+    follow by e+ e' + Jr(p) (I - e e'), e+ being up after it. To first order nothing else than
+    `correcting` does; but what is unknown about e stays unknown about e+ alone.
+    """
+    reset = resetting(model.kinds)
+    place, row = next((c, t) for kind, c, t, _ in things(model.kinds) if kind == "quaternion")
+
+    def up(mean: Floats) -> tuple[float, float, float]:
+        w, x, y, z = mean[place], mean[place + 1], mean[place + 2], mean[place + 3]
+        return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z
+
+    def take_out(rows: Floats, axis: tuple[float, float, float], along: Floats) -> None:
+        for column in range(len(along)):
+            a, b, c = rows[row, column], rows[row + 1, column], rows[row + 2, column]
+            along[column] = axis[0] * a + axis[1] * b + axis[2] * c
+        put_in(rows, (-axis[0], -axis[1], -axis[2]), along)
+
+    def put_in(rows: Floats, axis: tuple[float, float, float], along: Floats) -> None:
+        for column in range(len(along)):
+            for k in range(3):
+                rows[row + k, column] += axis[k] * along[column]
+
+    def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
+        step, turned, before = work.step, work.turned, up(mean)
+        turn = before[0] * step[row] + before[1] * step[row + 1] + before[2] * step[row + 2]
+        for k in range(len(turned)):
+            turned[k] = 0.0
+        for k in range(3):
+            turned[row + k] = turn * before[k]
+            step[row + k] -= turned[row + k]
+        add(mean, turned)
+        add(mean, step)
+        after = up(mean)
+        for rows in (covariance, covariance.T):
+            take_out(rows, before, turned)
+            reset(step, rows)
+            put_in(rows, after, turned)
+
+    return move
+
+
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     """The Kalman update by sensor `number`, after `innovate` has filled its innovation.
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components.
+    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
+    in may still count less, see `gaussian.widening`.
     """
     m, tell, correct = (
         len(stage.sensors[number].measured),
@@ -538,19 +616,26 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
+        factor = widening(squared, size, parameters)
         if accepted:
+            widen(innovation, size, factor)
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)
             correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, accepted)
+        note_numbers(note, squared, determinant, size, accepted, factor)
         return ALL_WELL
 
     return update
 
 
-def note_numbers(note: Note, squared: float, determinant: float, size: int, accepted: bool) -> None:
-    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is."""
+def note_numbers(
+    note: Note, squared: float, determinant: float, size: int, accepted: bool, factor: float
+) -> None:
+    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
+
+    The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
+    """
     note.numbers[0] = squared
-    likelihood = -0.5 * (squared + determinant + size * LOG_TWO_PI)
+    likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
     note.numbers[1] = likelihood if accepted else 0.0
     note.numbers[2] = 1.0 if accepted else 0.0

@@ -192,7 +192,7 @@ def squares(errors: Errors) -> Sums:
     """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
     found |= squares_by_name(errors.squared, errors.components, errors.kinds)
-    return found | {_rmse_of(name): np.nan for name in errors.unjudged}
+    return found | {rmse_of(name): np.nan for name in errors.unjudged}
 
 
 def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
@@ -207,7 +207,7 @@ def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[
         found["orientation_rmse_deg"] = np.degrees(np.degrees(totals[rotation].sum()))
     for column, name in enumerate(components):
         if column not in position:
-            found[_rmse_of(name)] = float(totals[column])
+            found[rmse_of(name)] = float(totals[column])
     return found
 
 
@@ -227,7 +227,7 @@ def accuracy(sums: Sums) -> dict[str, float]:
     return values | {"estimates_without_truth": sums["estimates_without_truth"]}
 
 
-def _rmse_of(component: str) -> str:
+def rmse_of(component: str) -> str:
     """What the RMSE of a component is called: `turn_rmse_radps` of `turn_radps`."""
     quantity, _, unit = component.rpartition("_")
     return f"{quantity}_rmse_{unit}".strip("_")

@@ -1,7 +1,7 @@
 """Estimated sets against the true ones, step by step: OSPA and GOSPA with its parts.
 
 A set estimate is a pair of streams: its size, and its elements (see `schemas.ESTIMATE_SIZE`). The true
-set at a time are all things whose truth has the estimate's components and is known then.
+set at a time are all targets whose truth has the estimate's components and is known then.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ class SetErrors(NamedTuple):
     """A set estimate of an ensemble, judged: one row (n,) per run and step.
 
     Distances are in m; localisation, missed and false are GOSPA's parts in m^2. `estimated` and `true`
-    are the numbers of things.
+    are the numbers of targets.
     """
 
     estimator: str
@@ -55,7 +55,7 @@ def set_errors(
 ) -> dict[str, SetErrors]:
     """Judge every set estimate, by its topic, among a replay's outputs, or a block of them.
 
-    Left out are those whose things have no truths in some run; `first_run` is the number of the first.
+    Left out are those whose targets have no truths in some run; `first_run` is the number of the first.
     """
     found = {}
     for topic, sizes in outputs.items():
@@ -63,11 +63,11 @@ def set_errors(
         if sizes.stream.schema.full_name != schemas.ESTIMATE_SIZE.full_name or elements is None:
             continue
         components = sizes.stream.components
-        things = [_things(each, components) for each in truths]
-        if components and all(things):
+        targets = [_targets(each, components) for each in truths]
+        if components and all(targets):
             judge = partial(_judge_run, cutoff_m=cutoff_m, gap_limit_s=gap_limit_s)
             runs = [
-                judge(sizes.of_run(run), elements.of_run(run), things[run], truths[run])
+                judge(sizes.of_run(run), elements.of_run(run), targets[run], truths[run])
                 for run in range(len(truths))
             ]
             number = np.repeat(np.arange(len(runs)), [len(each) for each in runs])
@@ -81,8 +81,8 @@ def set_errors(
     return found
 
 
-def _things(truths: Truths, components: Sequence[str]) -> list[str]:
-    """The topics of things whose truths have exactly these components."""
+def _targets(truths: Truths, components: Sequence[str]) -> list[str]:
+    """The topics of targets whose truths have exactly these components."""
     stated = truths.source.topics
     return [
         topic
@@ -94,7 +94,7 @@ def _things(truths: Truths, components: Sequence[str]) -> list[str]:
 def _judge_run(
     sizes: Stream,
     elements: Stream,
-    things: Sequence[str],
+    targets: Sequence[str],
     truths: Truths,
     *,
     cutoff_m: float,
@@ -103,7 +103,7 @@ def _judge_run(
     """Rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
-    states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in things]
+    states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in targets]
     true = np.stack(states, axis=1)
     columns = [sizes.components.index(name) for name in place]
     ends = np.cumsum(sizes["elements"].astype(np.int64))
@@ -133,14 +133,14 @@ def _means(sums: Sums) -> dict[str, float]:
     steps = sums.get("steps")
     if not steps:
         return {}
-    per_thing = CUTOFF_M**ORDER / 2.0
+    per_target = CUTOFF_M**ORDER / 2.0
     return {
         "ospa_m": sums["ospa"] / steps,
         "gospa_m": sums["gospa"] / steps,
         "gospa_localisation_m": float(np.sqrt(sums["localisation"] / steps)),
-        "missed_things": sums["missed"] / steps / per_thing,
-        "false_things": sums["false"] / steps / per_thing,
-        "cardinality_error_things": sums["excess"] / steps,
+        "missed_targets": sums["missed"] / steps / per_target,
+        "false_targets": sums["false"] / steps / per_target,
+        "cardinality_error_targets": sums["excess"] / steps,
     }
 
 

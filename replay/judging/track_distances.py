@@ -1,6 +1,6 @@
-"""How far tracks are from the trajectories of things: trajectory GOSPA, HOTA and IDF1.
+"""How far tracks are from the trajectories of targets: trajectory GOSPA, HOTA and IDF1.
 
-Tracks and trajectories are (things, steps, axes), NaN at the steps at which one is absent.
+Tracks and trajectories are (targets, steps, axes), NaN at the steps at which one is absent.
 
 Sources: Garcia-Fernandez, Rahmathullah, Svensson, "A metric on the space of finite sets of trajectories
 for evaluation of multi-target tracking algorithms", IEEE TSP 68, 2020 (trajectory GOSPA); Luiten et al.,
@@ -88,28 +88,26 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
     """The weights (steps, n, m) of pairs that the linear programme finds.
 
     Weights w >= 0 whose rows and columns sum up to 1 at most minimise sum w * gain, which is negative,
-    and half_switch for all changes e >= |w[k + 1] - w[k]|.
+    and half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
     """
     steps, n, m = gain.shape
-    pairs = n * m
-    if steps * pairs == 0:
-        return np.zeros(gain.shape)
-    one_step = sparse.vstack(
-        [
-            sparse.kron(sparse.eye(n), np.ones((1, m))),
-            sparse.kron(np.ones((1, n)), sparse.eye(m)),
-        ]
-    )
+    row, column = np.nonzero((gain < 0.0).any(axis=0))
+    pairs, weights = len(row), np.zeros(gain.shape)
+    if pairs == 0:
+        return weights
+    members = np.append(row, n + column), np.tile(np.arange(pairs), 2)
+    one_step = sparse.coo_matrix((np.ones(2 * pairs), members), (n + m, pairs))
     sums = sparse.kron(sparse.eye(steps), one_step)
     changes = sparse.kron(sparse.diags([-1.0, 1.0], [0, 1], (steps - 1, steps)), sparse.eye(pairs))
     size = sparse.eye((steps - 1) * pairs)
     bounds = sparse.bmat([[sums, None], [changes, -size], [-changes, -size]], format="csr")
     limits = np.concatenate([np.ones(sums.shape[0]), np.zeros(2 * (steps - 1) * pairs)])
-    cost = np.concatenate([gain.ravel(), np.full((steps - 1) * pairs, half_switch)])
+    cost = np.append(gain[:, row, column].ravel(), np.full((steps - 1) * pairs, half_switch))
     found = linprog(cost, bounds, limits, method="highs")
     if not found.success:
         raise BadInput(f"the linear programme of trajectory GOSPA has no solution: {found.message}")
-    return found.x[: steps * pairs].reshape(gain.shape)
+    weights[:, row, column] = found.x[: steps * pairs].reshape(steps, pairs)
+    return weights
 
 
 def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
@@ -165,18 +163,18 @@ def hota(
     levels = np.atleast_1d(np.asarray(thresholds, float))
     first, second = _tracks(estimates, truths)
     similarity = np.nan_to_num(np.maximum(0.0, 1.0 - _distances(first, second) / cutoff))
-    in_track, in_thing = _present(first).sum(axis=1), _present(second).sum(axis=1)
+    in_track, in_target = _present(first).sum(axis=1), _present(second).sum(axis=1)
     either = similarity.sum(axis=1, keepdims=True) + similarity.sum(axis=2, keepdims=True) - similarity
     shared = np.divide(similarity, either, out=np.zeros_like(similarity), where=either > 0).sum(axis=0)
-    alignment = shared / np.maximum(in_track[:, None] + in_thing - shared, 1.0)
+    alignment = shared / np.maximum(in_track[:, None] + in_target - shared, 1.0)
     matches = np.zeros((len(levels), *shared.shape))
     for step in similarity:
         pair = linear_sum_assignment(alignment * step, maximize=True)
         matches[:, *pair] += step[pair] >= np.maximum(levels[:, None], np.finfo(float).tiny)
     true_positive = matches.sum(axis=(1, 2))
-    either_count = in_track.sum() + in_thing.sum() - true_positive
+    either_count = in_track.sum() + in_target.sum() - true_positive
     detection = true_positive / np.maximum(either_count, 1)
-    jaccard = matches / np.maximum(in_track[:, None] + in_thing - matches, 1)
+    jaccard = matches / np.maximum(in_track[:, None] + in_target - matches, 1)
     association = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(true_positive, 1)
     return Hota(np.sqrt(detection * association), detection, association)
 
@@ -200,14 +198,14 @@ def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
     first, second = np.asarray(estimates, float), np.asarray(truths, float)
     if first.ndim != 3 or second.ndim != 3 or first.shape[1:] != second.shape[1:]:
         raise BadInput(
-            f"tracks {first.shape} and trajectories {second.shape}: give (things, steps, axes) of the "
+            f"tracks {first.shape} and trajectories {second.shape}: give (targets, steps, axes) of the "
             "same steps and axes, NaN where one is absent"
         )
     return first, second
 
 
 def _present(tracks: Floats) -> NDArray[np.bool_]:
-    """At which steps each thing is there, (things, steps)."""
+    """At which steps each target is there, (targets, steps)."""
     return np.asarray(np.isfinite(tracks).all(axis=2))
 
 

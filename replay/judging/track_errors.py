@@ -1,11 +1,11 @@
-"""Tracks against the trajectories of things, judged at instants that no sensor sets.
+"""Tracks against the trajectories of targets, judged at instants that no sensor sets.
 
-At every instant the tracks, predicted to it, are paired with the things that are there (GOSPA, alpha 2).
-What is paired says how far a track is from its thing, for how much of the time a thing is followed, and
-how often by another track than before (switch) or after a gap (break).
+At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
+alpha 2). The pairs say how far a track is from its target, for how much of the time a target is
+followed, and how often by another track than before (switch) or after a gap (break).
 
-Where the reference knows some of the things alone, a track of another one is no false track. Those that
-are farther than a limit from all things with a reference are counted on their own, as unreferenced.
+Where the reference knows some of the targets alone, a track of another one is no false track. Those that
+are farther than a limit from all targets with a reference are counted on their own, as unreferenced.
 """
 
 from collections.abc import Sequence
@@ -42,9 +42,9 @@ class TrackErrors(NamedTuple):
         gospa_all: (k,), of all tracks.
         gospa, localisation, missed, false: (k,), without those that have no reference.
         unreferenced: (k,), how many these are.
-        track: (things, k), the track that each thing is paired with, or NONE.
-        distance: (things, k), NaN where it is not.
-        present: (things, k), whether the thing is there.
+        track: (targets, k), the track that each target is paired with, or NONE.
+        distance: (targets, k), NaN where it is not.
+        present: (targets, k), whether the target is there.
     """
 
     gospa_all: Floats
@@ -59,7 +59,7 @@ class TrackErrors(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The instants (k,) at which the tracks of a run are judged, and the truths (things, k, 2) then."""
+    """The instants (k,) at which the tracks of a run are judged, and the truths (targets, k, 2) then."""
 
     time_ns: Integers
     truths: Floats
@@ -92,17 +92,18 @@ def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PE
     return Judged(at_ns, np.array(places).transpose(0, 2, 1))
 
 
-def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers) -> list[TracksAt]:
+def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
     """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
 
-    `sizes` says how many messages of `tracks` each scan has.
+    `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
+    of each one `delay_ns` after its stamp.
     """
     names = tracks.components
     place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
     ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
     found = []
     for time_ns, last in zip(
-        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns, side="right"), strict=True
+        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns - delay_ns, side="right"), strict=True
     ):
         rows = slice(ends[last - 1], ends[last]) if last else slice(0, 0)
         later_s = (time_ns - sizes.publish_time_ns[last - 1]) * 1e-9 if last else 0.0
@@ -118,8 +119,8 @@ def track_errors(
     cutoff_m: float = CUTOFF_M,
     unreferenced_m: float = UNREFERENCED_M,
 ) -> TrackErrors:
-    """Judge the tracks at k instants by the truths (things, k, 2), NaN where a thing is not there."""
-    things_in_all, instants, _ = truths.shape
+    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there."""
+    targets_in_all, instants, _ = truths.shape
     present = np.asarray(np.isfinite(truths).all(axis=2))
     found = TrackErrors(
         gospa_all=np.zeros(instants),
@@ -128,13 +129,13 @@ def track_errors(
         missed=np.zeros(instants),
         false=np.zeros(instants),
         unreferenced=np.zeros(instants, np.int64),
-        track=np.full((things_in_all, instants), NONE),
-        distance=np.full((things_in_all, instants), np.nan),
+        track=np.full((targets_in_all, instants), NONE),
+        distance=np.full((targets_in_all, instants), np.nan),
         present=present,
     )
     for instant, at in enumerate(tracks):
-        things = np.flatnonzero(present[:, instant])
-        true = truths[things, instant]
+        targets = np.flatnonzero(present[:, instant])
+        true = truths[targets, instant]
         away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
         known = (away <= unreferenced_m).any(axis=1)
         place = at.place[known]
@@ -144,34 +145,34 @@ def track_errors(
         found.missed[instant], found.false[instant] = parts.missed, parts.false
         found.unreferenced[instant] = np.count_nonzero(~known)
         estimate, paired = gospa_pairs(place, true, cutoff_m)
-        found.track[things[paired], instant] = at.number[known][estimate]
-        found.distance[things[paired], instant] = away[known][estimate, paired]
+        found.track[targets[paired], instant] = at.number[known][estimate]
+        found.distance[targets[paired], instant] = away[known][estimate, paired]
     return found
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """The means over the instants, and of each thing, from 1 on, RMSE and coverage.
+    """The means over the instants, and of each target, from 1 on, RMSE and coverage.
 
-    Missed and false are numbers of things. NaN is the RMSE of a thing that is never followed.
+    Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed.
     """
     alone = cutoff_m**2 / 2.0
     figures = {
         "gospa_m": float(errors.gospa.mean()),
         "gospa_all_m": float(errors.gospa_all.mean()),
         "localisation_m2": float(errors.localisation.mean()),
-        "missed_things": float(errors.missed.mean()) / alone,
-        "false_things": float(errors.false.mean()) / alone,
-        "unreferenced_things": float(errors.unreferenced.mean()),
+        "missed_targets": float(errors.missed.mean()) / alone,
+        "false_targets": float(errors.false.mean()) / alone,
+        "unreferenced_targets": float(errors.unreferenced.mean()),
     }
     switches = breaks = 0
-    for thing, (track, distance, present) in enumerate(
+    for target, (track, distance, present) in enumerate(
         zip(errors.track, errors.distance, errors.present, strict=True), start=1
     ):
         followed = np.flatnonzero(track != NONE)
-        figures[f"thing{thing}_rmse_m"] = (
+        figures[f"target{target}_rmse_m"] = (
             float(np.sqrt(np.mean(distance[followed] ** 2))) if len(followed) else float("nan")
         )
-        figures[f"thing{thing}_coverage"] = len(followed) / max(int(present.sum()), 1)
+        figures[f"target{target}_coverage"] = len(followed) / max(int(present.sum()), 1)
         switches += int(np.count_nonzero(np.diff(track[followed])))
         breaks += int(np.count_nonzero(np.diff(followed) > 1))
     return figures | {"switches": float(switches), "breaks": float(breaks)}

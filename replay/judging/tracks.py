@@ -1,7 +1,7 @@
-"""Tracks against the things they should follow: which reports of a thing went to one track.
+"""Tracks against the targets they should follow: which reports of a target went to one track.
 
-A thing's own track is found by assigning tracks to things one to one, so that as many reports as can be
-are in the track of their thing: a track that swallows two things counts for one of them.
+A target's own track is found by assigning tracks to targets one to one, so that as many reports as can
+be are in the track of their target: a track that swallows two targets counts for one of them.
 """
 
 import operator
@@ -18,48 +18,48 @@ from replay.judging.metrics import Metric, Output
 
 Integers = NDArray[np.int64]
 IDENTITY = "identity"
-# Things with more reports than that are judged: a few reports say little of a track.
+# Targets with more reports than that are judged: a few reports say little of a track.
 MANY_REPORTS = 50
-# A thing has kept its track with this share of its reports.
+# A target has kept its track with this share of its reports.
 KEPT_SHARE = 0.95
 
 
 class Kept(NamedTuple):
-    """How many things are judged, what share of them kept a track, and their mean share in it."""
+    """How many targets are judged, what share of them kept a track, and their mean share in it."""
 
-    things: int
+    targets: int
     kept_share: float
     mean_share: float
 
 
-def track_table(things: Integers, tracks: Integers) -> pd.DataFrame:
-    """One row per thing of reports (n,), most reports first.
+def track_table(targets: Integers, tracks: Integers) -> pd.DataFrame:
+    """One row per target of reports (n,), most reports first.
 
-    Columns: thing, reports; track, its own, -1 for none; share of its reports in that; largest_share in
+    Columns: target, reports; track, its own, -1 for none; share of its reports in that; largest_share in
     any track; tracks, how many have a report of it; switches, how often successive reports of it are in
-    different ones; others, how many reports of other things its own track has.
+    different ones; others, how many reports of other targets its own track has.
     """
-    thing, of_thing = np.unique(things, return_inverse=True)
+    target, of_target = np.unique(targets, return_inverse=True)
     track, of_track = np.unique(tracks, return_inverse=True)
-    counts = np.zeros((len(thing), len(track)), np.int64)
-    np.add.at(counts, (of_thing, of_track), 1)
+    counts = np.zeros((len(target), len(track)), np.int64)
+    np.add.at(counts, (of_target, of_track), 1)
     rows, columns = linear_sum_assignment(counts, maximize=True)
-    own = np.full(len(thing), -1)
+    own = np.full(len(target), -1)
     own[rows] = np.where(counts[rows, columns] > 0, columns, -1)
     has_one = own >= 0
     reports = counts.sum(axis=1)
-    in_own = np.where(has_one, counts[np.arange(len(thing)), own], 0)
-    order = np.argsort(of_thing, kind="stable")
-    changes = (np.diff(of_track[order]) != 0) & (np.diff(of_thing[order]) == 0)
+    in_own = np.where(has_one, counts[np.arange(len(target)), own], 0)
+    order = np.argsort(of_target, kind="stable")
+    changes = (np.diff(of_track[order]) != 0) & (np.diff(of_target[order]) == 0)
     table = pd.DataFrame(
         {
-            "thing": thing,
+            "target": target,
             "reports": reports,
             "track": np.where(has_one, track[own], -1),
             "share": in_own / reports,
             "largest_share": counts.max(axis=1) / reports,
             "tracks": (counts > 0).sum(axis=1),
-            "switches": np.bincount(of_thing[order][1:][changes], minlength=len(thing)),
+            "switches": np.bincount(of_target[order][1:][changes], minlength=len(target)),
             "others": np.where(has_one, counts.sum(axis=0)[own] - in_own, 0),
         }
     )
@@ -67,7 +67,7 @@ def track_table(things: Integers, tracks: Integers) -> pd.DataFrame:
 
 
 def kept(table: pd.DataFrame, column: str = "share", reports: int = MANY_REPORTS) -> Kept:
-    """How the things with more than so many reports kept their tracks."""
+    """How the targets with more than so many reports kept their tracks."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
         return Kept(0, np.nan, np.nan)
@@ -95,7 +95,7 @@ Reports = dict[int, list[tuple[Integers, Integers]]]
 
 
 def reports_of(output: Output) -> Reports:
-    """Of every run the true things and the tracks (n,) of its reports; {} where that is not known.
+    """Of every run the true targets and the tracks (n,) of its reports; {} where that is not known.
 
     The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
     Raises BadInput where the log is not the one that these are estimates of.
@@ -113,13 +113,13 @@ def reports_of(output: Output) -> Reports:
             continue
         identity = source.read([topic])[topic]
         times, [first_ns, last_ns] = identity.publish_time_ns, tracks.publish_time_ns[[0, -1]]
-        things = identity["thing_id"][(times >= first_ns) & (times <= last_ns)]
-        if len(things) != len(tracks):
+        targets = identity["thing_id"][(times >= first_ns) & (times <= last_ns)]
+        if len(targets) != len(tracks):
             raise BadInput(
-                f"{source.name}: {len(things)} identities for {len(tracks)} reports on {stream.topic}; "
+                f"{source.name}: {len(targets)} identities for {len(tracks)} reports on {stream.topic}; "
                 "give the log that these are estimates of"
             )
-        both = things.astype(np.int64), tracks["track_id"].astype(np.int64)
+        both = targets.astype(np.int64), tracks["track_id"].astype(np.int64)
         found[output.first_run + run].append(both)
     return found
 
@@ -148,7 +148,7 @@ def _finish(reports: Reports) -> dict[str, float]:
     own, largest = kept(found), kept(found, "largest_share")
     tracks = np.concatenate([each for parts in reports.values() for _, each in parts])
     return {
-        "judged_things": own.things,
+        "judged_targets": own.targets,
         "kept_track_percent": 100.0 * own.kept_share,
         "kept_largest_percent": 100.0 * largest.kept_share,
         "own_track_mean_percent": 100.0 * own.mean_share,
@@ -159,7 +159,7 @@ def _finish(reports: Reports) -> dict[str, float]:
 
 
 TRACKS = Metric(
-    "how things with more than 50 reports kept one track of their own",
+    "how targets with more than 50 reports kept one track of their own",
     Output,
     dict,
     _add,

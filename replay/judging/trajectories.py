@@ -14,10 +14,10 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
-from recorders.log import Stream
+from recorders.log import Stream, make_stream, schemas
 from recorders.trajectories import Trajectory
 from replay.engine.components import stated_components
-from replay.engine.tangent import states_at, things
+from replay.engine.tangent import states_at, tangent_components, things
 from replay.judging.alignment import HEADING, Align, Alignment, aligned, alignment_of
 from replay.judging.evaluation import POSITION
 
@@ -377,3 +377,50 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
     elif components.get(HEADING) == "angle":
         rotation = Rotation.from_euler("z", state[:, [names.index(HEADING)]]).as_matrix()
     return Trajectory(stream.topic, position_m, rotation, stamps)
+
+
+def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
+    """A trajectory as an estimate stream, in those of the truth's components that it states.
+
+    It states no covariance: that is zero, of which there is no NEES.
+
+    Raises BadInput where the trajectory has no stamps, or the truth none of its components.
+    """
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    stated = stated_components(truth.metadata, {}, f"topic {truth.topic}")
+    columns = {
+        name: trajectory.position_m[:, axis] for axis, name in enumerate(POSITION) if name in stated
+    }
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation)
+        quaternion = [name for name, kind in stated.items() if kind == "quaternion"]
+        if len(quaternion) == 4:
+            columns |= zip(quaternion, turned.as_quat(scalar_first=True).T, strict=True)
+        elif stated.get(HEADING) == "angle":
+            columns[HEADING] = turned.as_euler("ZYX")[:, 0]
+    if not columns:
+        raise BadInput(f"{trajectory.name}: topic {truth.topic} states no position to judge it by")
+    kinds = [stated[name] for name in columns]
+    width = len(tangent_components(list(columns), kinds))
+    count = len(trajectory)
+    return make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        trajectory.time_ns,
+        metadata={"components": ",".join(columns), "kinds": ",".join(kinds), "truth": truth.topic},
+        mean=np.stack(list(columns.values()), axis=1),
+        covariance=np.zeros((count, width * width)),
+    )
+
+
+def truth_of(trajectory: Trajectory, topic: str) -> Stream:
+    """A trajectory as a truth stream; raises BadInput where it has no stamps."""
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    names, state = [*POSITION], trajectory.position_m
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation).as_quat(scalar_first=True)
+        names, state = [*names, "qw", "qx", "qy", "qz"], np.hstack([state, turned])
+    metadata = {"components": ",".join(names), "kinds": ",".join(POSE_KINDS[: len(names)])}
+    return make_stream(topic, schemas.TRUTH_STATE, trajectory.time_ns, metadata=metadata, state=state)

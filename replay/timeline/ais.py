@@ -97,9 +97,9 @@ def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(reports_of(output)):
-        shown = table[["thing", "reports", "share", "tracks", "switches"]][:LISTED_VESSELS]
-        for thing, reports, share, count, switches in shown.itertuples(index=False):
-            lines.append(f"|{thing}|{reports}|{share:.3f}|{count}|{switches}|")
+        shown = table[["target", "reports", "share", "tracks", "switches"]][:LISTED_VESSELS]
+        for target, reports, share, count, switches in shown.itertuples(index=False):
+            lines.append(f"|{target}|{reports}|{share:.3f}|{count}|{switches}|")
         if len(table) > LISTED_VESSELS:
             lines.append(f"\n{len(table) - LISTED_VESSELS} more are in the study's tables")
     canvas.fix("vessels", rr.TextDocument("\n".join(lines), media_type="text/markdown"))

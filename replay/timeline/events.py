@@ -1,6 +1,6 @@
 """What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,17 +40,22 @@ def above_events(
 
 
 def draw_events(
-    canvas: Canvas, scene: Scene, case: str, not_drawn: Mapping[str, str] | None = None
+    canvas: Canvas,
+    scene: Scene,
+    case: str,
+    not_drawn: Mapping[str, str] | None = None,
+    also: Iterable[Happened] = (),
 ) -> list[rrb.TextLogView]:
     """The events of a case, one entity per estimator and sensor: no view where nothing happened.
 
-    `not_drawn` says of topics that have no drawing why, beside those that cannot be read.
+    `not_drawn` says of topics that have no drawing why, beside those that cannot be read; `also` is what
+    happened that only a scenario family knows of.
     """
     root = entity_path("events", case)
     reasons = {**scene.unread, **(not_drawn or {})}
     texts = [f"{topic} is not drawn: {reason}" for topic, reason in reasons.items()]
     unread = Happened("log", "INFO", np.full(len(texts), canvas.epoch_ns), texts)
-    happened = [unread, *_of_estimators(scene, case), *_of_sensors(scene, case)]
+    happened = [unread, *also, *_of_estimators(scene, case), *_of_sensors(scene, case)]
     happened = [each for each in happened if each.texts]
     for who, level, time_ns, texts in happened:
         lines = [f"{who}: {text}" for text in texts]

@@ -19,6 +19,7 @@ from replay.engine.sources import Source
 from replay.judging.evaluation import Errors, errors_at
 from replay.timeline.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from replay.timeline.generic import TIMELINE as GENERIC
+from replay.timeline.side_by_side import draw_side_by_side
 from replay.timeline.sinks import open_recording
 from replay.timeline.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 
@@ -39,6 +40,7 @@ class Drawing:
         focus: the case that is seen first, such as `robot3`.
         save: the .rrd file to write.
         connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
+        sides: estimators whose scenes stand side by side, with the differences of their errors.
 
     Raises BadInput where neither is given or a sink fails (see `open_recording`), or there is no such
     focus.
@@ -52,12 +54,14 @@ class Drawing:
         focus: str | None = None,
         save: Path | None = None,
         connect: str | None = None,
+        sides: Sequence[str] = (),
     ) -> None:
         if save is None and connect is None:
             raise BadInput(
                 "a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both"
             )
         self._source, self._focus, self._save = source, focus, save
+        self._sides = sides
         scenario = source.run.scenario if source.run else ""
         known = available("timelines")
         self._timeline: Timeline = load("timelines", scenario) if scenario in known else GENERIC
@@ -123,6 +127,8 @@ class Drawing:
             raise BadInput(f"nothing called '{self._focus}' to show; {known}")
         canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
         layout = self._timeline.draw(canvas, scene)
+        if self._sides:
+            layout = draw_side_by_side(canvas, scene, layout, self._sides)
         recording.send_blueprint(
             rrb.Blueprint(
                 layout,

@@ -1,24 +1,33 @@
-"""The timeline of tracks of many things: what each sensor scans, the tracks in colours of their own.
+"""The timeline of tracks of many targets: what each sensor scans, the tracks in colours of their own.
 
 The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
-nothing; bearings are rays from where the sensor is. Beside it are GOSPA, the number of tracks and how
-probable it is that they exist.
+nothing; bearings are rays from where the sensor is. Lines lead from a track to the detections of places
+that were associated with it, the fainter the less probable. Beside it are GOSPA, the number of tracks
+and how probable it is that they exist; below it when tracks are confirmed and end, and when a target
+goes on with another one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
+from replay.engine.arrays import Integers
 from replay.engine.measurements import PLANE, covariances_of, read_vectors
 from replay.estimators.scans import ORIGIN
 from replay.judging.evaluation import Floats
-from replay.judging.track_errors import instants_of, track_errors, tracks_at
+from replay.judging.track_errors import NONE, TrackErrors, instants_of, track_errors, tracks_at
 from replay.timeline.ais import track_colours
 from replay.timeline.canvas import MUTED, PALETTE, TRUTH, Canvas, Scene, Timeline
+from replay.timeline.events import Happened, above_events, draw_events
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -53,20 +62,25 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
     boards = []
     for name, tracks in trackers:
         drawn = _draw_tracks(canvas, f"{ROOT}/{name}", tracks)
+        _draw_associations(canvas, scene, name, tracks)
         view = plane_view(canvas, f"{ROOT}/{name}", shared, [*paths, *drawn], shown, name=name)
         boards.append(view)
     if not boards:
         return plane_view(canvas, ground, shared, paths, shown)
+    at_ns, errors = _errors(scene, trackers)
     plots = [
-        _draw_gospa(canvas, scene, trackers),
+        _draw_gospa(canvas, scene, at_ns, errors),
         _draw_counts(canvas, scene),
         _draw_existence(canvas, scene, trackers),
     ]
-    return rrb.Horizontal(rrb.Tabs(*boards), rrb.Vertical(*plots), column_shares=[3, 1])
+    told = [each for name, tracks in trackers for each in _life(scene, name, tracks)]
+    told += [each for name in errors for each in _switches(name, at_ns, errors[name])]
+    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, "", also=told), share=4.0)
+    return rrb.Horizontal(board, rrb.Vertical(*plots), column_shares=[3, 1])
 
 
 def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
-    """What moves with a known position: things with a truth, and sensors."""
+    """What moves with a known position: targets with a truth, and sensors."""
     for topic in scene.source.topics.values():
         if topic.schema_name == schemas.TRUTH_STATE.full_name:
             yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)
@@ -131,17 +145,114 @@ def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
     return ways
 
 
-def _draw_gospa(canvas: Canvas, scene: Scene, trackers: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:
-    """GOSPA at instants, where the log has truths."""
+def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> None:
+    """Lines from tracks to the detections of places that are theirs, in the tracks' colours."""
+    for estimator, associations in scene.outputs_of("", schemas.ASSOCIATION):
+        sensors = associations.metadata["sensors"].split(",") if estimator == name else []
+        for number, sensor in enumerate(sensors):
+            if f"/{sensor}/detection" not in scene.source.topics:
+                continue
+            own = associations.take(associations["sensor_id"] == number)
+            scan = scene.read(f"/{sensor}/scan")
+            seen = _joined(scan, scene.read(f"/{sensor}/detection"))
+            first = np.searchsorted(seen.scan, np.arange(len(scan)))
+            row = _scan_of(scan, own)
+            end = _own_places(scene, scan)[row] + seen.place[first[row] + own["detection"]]
+            begin, is_there = _places_of(tracks, own)
+            colours = np.empty((len(own), 4), np.uint8)
+            colours[:, :3] = track_colours(own["track_id"].astype(np.int64))
+            colours[:, 3] = np.rint(255.0 * own["probability"])
+            lines = np.stack([begin, end], axis=1)[is_there]
+            entity = f"{ROOT}/{name}/associations/{sensor}"
+            draw_lines(canvas, entity, own.publish_time_ns[is_there], lines, colours[is_there])
+
+
+class Joined(NamedTuple):
+    """The detections of a sensor as trackers take them: by row of the scan, relative to the sensor."""
+
+    scan: Integers
+    place: Floats
+
+
+def _joined(scan: Stream, seen: Stream) -> Joined:
+    """Each chain of detections of a scan that are near each other as its mean, by its first one.
+
+    How near is stated on the channel of the scans; see `replay.inference.scanning.join_near`.
+    """
+    row, place = _scan_of(scan, seen), read_vectors(seen, "position_m", PLANE)
+    order = np.argsort(row, kind="stable")
+    row, place = row[order], place[order]
+    within = float(scan.metadata.get("joined_within_m", 0.0))
+    if within == 0.0 or not len(row):
+        return Joined(row, place)
+    apart = cKDTree(np.column_stack([place, row * 2.0 * within])).query_pairs(
+        within, output_type="ndarray"
+    )
+    pairs = coo_matrix((np.ones(len(apart)), apart.T), (len(row), len(row)))
+    count, group = connected_components(pairs, directed=False)
+    first = np.unique(group, return_index=True)[1]
+    sums = [np.bincount(group, axis, count) for axis in place.T]
+    means = np.stack(sums, axis=1) / np.bincount(group)[:, None]
+    by_first = np.argsort(first)
+    return Joined(row[first[by_first]], means[by_first])
+
+
+def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np.bool_]]:
+    """Where the associations' tracks are then (n, 2), and of which of them that is known."""
+    keys = [
+        np.stack([stream.publish_time_ns, stream["track_id"].astype(np.int64)], axis=1)
+        for stream in (tracks, associations)
+    ]
+    _, number = np.unique(np.concatenate(keys), axis=0, return_inverse=True)
+    of_track, wanted = np.split(number.ravel(), [len(tracks)])
+    order = np.argsort(of_track, kind="stable")
+    at = np.searchsorted(of_track[order], wanted, side="right") - 1
+    found = order[np.maximum(at, 0)]
+    return read_vectors(tracks, "mean", PLANE)[found], of_track[found] == wanted
+
+
+def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
+    """When tracks of a tracker are confirmed, and when they end."""
+    numbers, times = tracks["track_id"].astype(np.int64), tracks.publish_time_ns
+    scans_ns = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))[name].publish_time_ns
+    for number in np.unique(numbers):
+        own = times[numbers == number]
+        yield Happened(name, "INFO", own[:1], [f"track {number} is confirmed"])
+        if own[-1] < scans_ns[-1]:
+            after = scans_ns[scans_ns > own[-1]]
+            yield Happened(name, "INFO", after[:1], [f"track {number} ends"])
+
+
+def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happened]:
+    """When a target goes on with another track than before."""
+    for target, track in enumerate(errors.track, start=1):
+        followed = np.flatnonzero(track != NONE)
+        for row in np.flatnonzero(np.diff(track[followed])):
+            before, now = track[followed[row]], track[followed[row + 1]]
+            text = f"target {target} goes on with track {now}, before with {before}"
+            yield Happened(name, "WARN", at_ns[followed[row + 1] :][:1], [text])
+
+
+def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers, dict[str, TrackErrors]]:
+    """By tracker its errors at instants; none where the log has nothing to judge by."""
     try:
-        at_ns, truths = instants_of(scene.source)
-    except BadInput:  # nothing to judge by: the plot is empty
-        at_ns, truths = np.empty(0, np.int64), np.empty((0, 0, 2))
+        judged = instants_of(scene.source)
+    except BadInput:
+        return np.empty(0, np.int64), {}
     sizes = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))
-    for name, tracks in trackers if len(at_ns) else []:
-        errors = track_errors(tracks_at(sizes[name], tracks, at_ns), truths)
-        draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, errors.gospa, LINE)
-    return plot_view("plots/gospa", "GOSPA (m), c = 20 m, without what has no truth")
+    return judged.time_ns, {
+        name: track_errors(tracks_at(sizes[name], tracks, judged.time_ns), judged.truths)
+        for name, tracks in trackers
+    }
+
+
+def _draw_gospa(
+    canvas: Canvas, scene: Scene, at_ns: Integers, errors: Mapping[str, TrackErrors]
+) -> rrb.TimeSeriesView:
+    """GOSPA at the instants."""
+    for name, of_tracker in errors.items():
+        draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
+    return plot_view("plots/gospa", "GOSPA (m), c = 20 m")
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:

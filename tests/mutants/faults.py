@@ -328,7 +328,7 @@ FAULTS = [
     Fault(
         "replay/judging/tracks.py",
         "rows, columns = linear_sum_assignment(counts, maximize=True)",
-        "rows, columns = np.arange(len(thing)), counts.argmax(axis=1)",
+        "rows, columns = np.arange(len(target)), counts.argmax(axis=1)",
         "tests/replay/estimators/test_report_tracker.py tests/replay/judging/test_metrics.py",
     ),
     Fault(

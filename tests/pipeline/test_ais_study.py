@@ -38,7 +38,7 @@ def run(data: Path, out: Path, settings: dict | None = None):
 def test_from_table_to_claims_and_timeline(tmp_path: Path):
     """Both keep their track but for the report that is far off; the timeline has all reports."""
     result = run(table(tmp_path, far=True), tmp_path / "out")
-    assert result.metrics["report-tracker.judged_things"] == 2
+    assert result.metrics["report-tracker.judged_targets"] == 2
     assert result.metrics["report-tracker.own_track_mean_percent"] == pytest.approx(100 * 119 / 120)
     assert [claim.verdict for claim in result.claims] == ["confirmed", "confirmed"]
     vessels = pd.read_csv(tmp_path / "out" / "tables" / "vessels.csv")
@@ -95,7 +95,7 @@ def test_on_the_command_line_block_by_block(
     part = fuselog(
         "replay", "log.mcap", "-e", "report-tracker", "--start", "5", "--end", "580", "--json"
     )
-    assert part.json["metrics"]["report-tracker.judged_things"] == 2
+    assert part.json["metrics"]["report-tracker.judged_targets"] == 2
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import time
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,10 +18,13 @@ import pytest
 from pipeline import campaigns
 from pipeline.command_line import main
 from pipeline.executors import Here, Team, crew_of, version_of_code
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
 from pipeline.kept import kept_cells
 from recorders.errors import BadInput
+from recorders.log import write_log
+from recorders.recording import record_run
 from replay.judging.sums import BinnedSums
+from tests.bench import scaling
 
 # Three cells, of which the last is small.
 RUNS = 260
@@ -195,11 +200,81 @@ class Dying(Here):
         return super().submit(work, *args, **kwargs)
 
 
+def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
+    """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
+    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    drives, place = tmp_path / "drives", tmp_path / "result"
+    drives.mkdir()
+    logs = [drives / f"{seed}.mcap" for seed in (1, 2)]
+    for seed, log in enumerate(logs):
+        recording, run = record_run("landmarks", {"duration_s": 3.0}, seed)
+        write_log(log, recording.streams, run)
+
+    def replayed(crew=None) -> dict[str, bytes]:
+        experiment = experiment_of_logs(logs, ["ekf"]).with_settings({}, {})
+        run_experiment("drives", experiment, place, logs=1, errors=True, crew=crew)
+        names = sorted(path for path in place.rglob("*") if path.is_file() and path.suffix != ".rrd")
+        return {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
+
+    files = replayed()
+    shutil.rmtree(place)
+    hidden = [drives, unfinished(place)]
+    asked: list[list[Path]] = []
+
+    def sees(files) -> bool:
+        asked.append(list(files))
+        return False
+
+    @contextmanager
+    def elsewhere():
+        yield Team(Elsewhere(hidden), 1, sees)
+
+    assert replayed(elsewhere) == files
+    assert "estimates/run-0000.mcap" in files
+    assert asked == [logs]
+    logs[1].write_bytes(logs[1].read_bytes()[:-100])
+    with pytest.raises(BadInput, match=f"^{re.escape(str(logs[1]))}: .*--recover"):
+        replayed(elsewhere)
+
+
+class Elsewhere(Here):
+    """Works as another machine would, where some folders are not."""
+
+    def __init__(self, hidden: list[Path]) -> None:
+        self.hidden = hidden
+
+    def submit(self, work, /, *args):
+        """What comes back and forth is pickled."""
+        for folder in self.hidden:
+            folder.rename(folder.with_suffix(".away"))
+        try:
+            done = super().submit(pickle.loads(pickle.dumps(work)), *args)
+        finally:
+            for folder in self.hidden:
+                folder.with_suffix(".away").rename(folder)
+        return done
+
+
 def test_a_campaign_without_logs_has_its_timeline(tmp_path):
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": 130})
     run_experiment(name, experiment, tmp_path / "result", logs=0)
     assert (tmp_path / "result" / "timeline.rrd").is_file()
     assert not (tmp_path / "result" / "logs").exists()
+
+
+def test_progress_tells_how_many_runs_how_fast_and_who_works(tmp_path):
+    said: list[tuple[str, int]] = []
+
+    def progress(items, title, total):
+        for item in items:
+            yield item
+            said.append((str(title), total))
+
+    run(tmp_path / "result", runs=130, progress=progress)
+    told = [each for each in said if each[0].startswith("replaying: ")]
+    assert [total for _, total in told] == [2, 2]
+    for done, (text, _) in zip((128, 130), told, strict=True):
+        assert re.fullmatch(rf"replaying: {done} of 130 runs, [1-9]\d* runs/s, 1 worker; cells", text)
 
 
 def test_what_is_not_ours_stays(tmp_path):
@@ -254,6 +329,9 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     assert main([*begin, "--workers", "2", "--scheduler", "local:2"]) == 2
     assert "the scheduler has its own; give one" in capsys.readouterr().err
     assert main([*begin, "--workers", "0"]) == 2
+    capsys.readouterr()
+    assert main(["run", "ispace", "--workers", "2", *out]) == 2
+    assert "networks, does more than judge; leave out --workers" in capsys.readouterr().err
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
     assert "give local:N with a number of workers" in capsys.readouterr().err
@@ -263,6 +341,27 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
 def test_the_version_of_the_code_is_of_all_sources():
     assert version_of_code() == version_of_code.__wrapped__()
     assert len(version_of_code()) == 64
+
+
+def test_the_page_and_its_figure_say_what_was_measured():
+    measured = scaling.kept()
+    page = scaling.PAGE.read_text(encoding="utf-8")
+    assert scaling.rendered(page, measured) == page, "python -m tests.bench.scaling --keep makes it anew"
+    drawn = ElementTree.parse(scaling.FIGURE).find(".//{http://purl.org/dc/elements/1.1/}description")
+    assert drawn is not None
+    assert drawn.text == scaling.chart(measured).model_dump_json()
+    slower = measured._replace(driver_s=2 * measured.driver_s)
+    assert scaling.rendered(page, slower) != page
+
+
+def test_the_simulated_driver_is_the_limit_where_it_is_busy():
+    """A cell of 1 s, and .1 s of the driver: ten workers and one more keep it busy."""
+    network = scaling.NETWORK_BYTES_PER_S
+    measured = scaling.Measured(1.0, 0.05, round(0.05 * network), (100.0, 200.0))
+    assert measured.limit_workers == 11
+    assert scaling.simulated(measured, 1) == pytest.approx(128 / 1.1, rel=0.01)
+    assert scaling.simulated(measured, 4) == pytest.approx(4 * 128 / 1.1, rel=0.05)
+    assert scaling.simulated(measured, 100) == pytest.approx(measured.limit_runs_per_s, rel=0.01)
 
 
 @pytest.mark.paper

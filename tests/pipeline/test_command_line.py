@@ -234,7 +234,9 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         for row in fuselog("models", "--json").json
     }
     methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "smoother", "imm", "particles", "bound")
-    assert listed["vehicle"] == dict.fromkeys(methods, "yes")
+    no_angle = "no: it lacks an angle or an orientation in its state, across which to cut its prior"
+    assert listed["vehicle"] == {**dict.fromkeys(methods, "yes"), "bank": no_angle}
+    assert listed["robot"]["bank"] == "yes"
     table = fuselog("models").out
     for name, cells in listed.items():
         (row,) = re.findall(rf"^ {name} +((?:yes|no:).*)$", table, re.MULTILINE)

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline import experiment
 from pipeline.command_line import main
 from pipeline.sweeps import parse_over, points_of
 from recorders.errors import BadInput
@@ -54,6 +55,16 @@ def test_a_sweep_gives_at_every_point_what_a_run_gives(tmp_path, capsys):
     assert (tmp_path / "sweep" / "figures" / "position_rmse_m-robot1.svg").is_file()
     assert not (tmp_path / "sweep.unfinished").exists()
     assert main(["report", str(tmp_path / "sweep"), "--out", str(tmp_path / "sweep.html")]) == 0
+
+
+def test_the_experiment_is_read_once_for_all_points(tmp_path, monkeypatch, capsys):
+    read: list[str] = []
+    read_toml = experiment.read_toml
+    monkeypatch.setattr(experiment, "read_toml", lambda path: read.append(path.name) or read_toml(path))
+    swept = ["--over", "ekf.sigma_range_m=0.1,0.2,0.4", "--runs", "2", "--set", "duration_s=3"]
+    assert main(["sweep", "landmarks", *swept, "--out", str(tmp_path / "sweep"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["settings"]["sweep"]) == 3
+    assert read == ["landmarks.toml"]
 
 
 def test_the_door_sweeps_as_the_command_does(tmp_path):

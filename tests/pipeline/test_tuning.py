@@ -1,10 +1,12 @@
 """Tuning: the reference sheet's numbers, what logs cannot tell, and what is refused."""
 
 import os
+import pickle
 import re
 import shlex
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,10 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline.executors import Here
 from pipeline.results import read_result
 from pipeline.tuning.objective import Best
-from tests.replay.inference.scalar import EPOCH_NS, SCALAR, source
+from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
 Fuselog = Callable[..., Any]
@@ -298,6 +301,50 @@ def test_any_number_of_cores_finds_the_same(
     assert found[0] == found[1]
 
 
+class Away(Here):
+    """Does the work as another process would: what comes and goes is pickled."""
+
+    def submit(self, work: Callable[..., Any], /, *args: Any) -> Future[Any]:
+        """The same on copies of everything."""
+        work, args = pickle.loads(pickle.dumps((work, args)))
+        return super().submit(lambda: pickle.loads(pickle.dumps(work(*args))))
+
+
+def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
+    given = {"set": {"sigma_range_m": 0.5}}
+    alone = fl.tune(seen, "ekf", "sigma_range_m", **given)
+    shared = fl.tune(seen, "ekf", "sigma_range_m", executor=Away(), **given)
+    assert shared.found.optimum.tobytes() == alone.found.optimum.tobytes()
+    assert shared.profile.equals(alone.profile)  # computed when the workers have gone
+
+    class Own(ScalarParameters):
+        """Parameters that only this function knows."""
+
+    with pytest.raises(fl.BadInput, match="level: cannot go to another process"):
+        fl.tune(
+            source(np.ones(5)),
+            {"level": fl.modelled(replace(SCALAR, parameters=Own), "ekf")},
+            "sigma_measured",
+            executor=Away(),
+        )
+
+    class Dying(Here):
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.set_exception(BrokenExecutor("it was killed"))
+            return future
+
+    with pytest.raises(fl.BadInput, match=r"tunes ekf died \(it was killed\); try fewer workers"):
+        fl.tune(seen, "ekf", "sigma_range_m", executor=Dying(), **given)
+
+
+@pytest.mark.paper
+def test_processes_tune_as_the_command_says(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:
+    tune = ("tune", world / "log.mcap", "-e", "ekf", "--free", "sigma_range_m", "--json", "--out")
+    shared = fuselog(*tune, tmp_path / "shared", "--workers", "2").json
+    assert shared["parameters"] == fuselog(*tune, tmp_path / "alone").json["parameters"]
+
+
 def test_what_need_not_be_positive_is_found_too() -> None:
     """Biases and a scale, with the noise ten times off; what was put in lies in the intervals."""
     sensor = {"rate_hz": 2.0, "bias_range_m": 0.2, "bias_bearing_rad": -0.05}
@@ -307,6 +354,52 @@ def test_what_need_not_be_positive_is_found_too() -> None:
     for row in found.parameters.to_dict("records"):
         assert row["low"] < true[row["parameter"]] < row["high"], row
         assert row["high"] - row["low"] < 0.2
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize(
+    ("scenario", "duration", "estimator", "free"),
+    [
+        (
+            "landmarks",
+            {"duration_s": 30.0, "range_bearing": {"rate_hz": 2.0}},
+            "ekf",
+            ["forward_noise_density", "turn_noise_density", "sigma_range_m", "sigma_bearing_rad"],
+        ),
+        (
+            "manoeuvres",
+            {},
+            "imm:ekf",
+            ["acceleration_sigma_mps2", "manoeuvring_sigma_mps2", "standing_sigma_mps"],
+        ),
+        (
+            "extended-target",
+            {},
+            "analytic",
+            ["size_drift_m2", "position_drift_m2", "point_variance_m2"],
+        ),
+        ("batch-reactor", {}, "lrkf:ukf", ["process_variance", "pressure_variance"]),
+        ("navigation", {"duration_s": 20.0}, "ekf", ["force_noise_density", "gyro_noise_density"]),
+    ],
+)
+def test_a_start_ten_times_off_leads_to_the_same_optimum(
+    scenario: str, duration: dict[str, Any], estimator: str, free: list[str]
+) -> None:
+    """Each parameter and all together, times and divided by ten: within a hundredth of the likelihood.
+
+    What logs tell so little of that this leaves it more than its interval is said in words.
+    """
+    log = fl.record(scenario, seed=1, **duration)
+    near = fl.tune(log, estimator, free)
+    starts = near.parameters.set_index("parameter")["start"]
+    bounds = {each.name: (each.low, each.high) for each in near.found.coordinates.free}
+    for factor in (0.1, 10.0):
+        for changed in (free, *([name] for name in free)):
+            far = fl.tune(log, estimator, free, set=dict(factor * starts[changed]), bounds=bounds)
+            assert far.costs[1] == pytest.approx(near.costs[1], abs=0.01), (changed, factor)
+            for row in near.parameters.assign(far=far.found.optimum).to_dict("records"):
+                is_said = any(row["parameter"] in note for note in near.notes_of_search)
+                assert row["low"] <= row["far"] <= row["high"] or is_said, (changed, factor, row)
 
 
 def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.importers.tables import files
-from recorders.importers.tables.mapping import read_mapping, shipped
+from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
 
@@ -55,14 +55,16 @@ components = "x_m,y_m,z_m"
 def imported(tmp_path: Path) -> Callable[..., tuple[dict[str, Stream], dict[str, str]]]:
     """Imports a table by a mapping, which may be text: its streams and notes."""
 
-    def run(path: Path | str, mapping: str, *more: Path) -> tuple[dict[str, Stream], dict[str, str]]:
+    def run(
+        path: Path | str, mapping: str, *more: Path, **settings: Any
+    ) -> tuple[dict[str, Stream], dict[str, str]]:
         if isinstance(path, str):
             (tmp_path / "table.csv").write_text(path)
             path = tmp_path / "table.csv"
         if "\n" in mapping:
             (tmp_path / "mapping.toml").write_text(mapping)
             mapping = str(tmp_path / "mapping.toml")
-        values = {"mapping": mapping, "more": [str(each) for each in more]}
+        values = {"mapping": mapping, "more": [str(each) for each in more], **settings}
         recording, run = import_run("table", path, values)
         return {stream.topic: stream for stream in recording.streams}, run.notes
 
@@ -220,6 +222,59 @@ delay_s = 0.5
         imported(tmp_path / "raw.csv", tagged)
 
 
+def test_fixes_are_made_of_a_path_that_is_known(imported: Callable[..., Any], tmp_path: Path) -> None:
+    """Some of the rows with noise of a seed, which the notes say; other noise comes of another seed."""
+    mapping = """
+[[tables]]
+time = { column = "t" }
+[[tables.streams]]
+topic = "/fix"
+becomes = "PositionFix"
+fields = { position_m = ["x", "y"] }
+every = 3
+noise = { position_m = 0.5 }
+"""
+    text = "t,x,y\n" + "".join(f"{t},{t},0\n" for t in range(10))
+    streams, notes = imported(text, mapping, seed=9)
+    noise = 0.5 * np.random.default_rng(9).normal(size=(4, 2))
+    places = np.array([[0, 0], [3, 0], [6, 0], [9, 0]])
+    assert_allclose(streams["/fix"]["position_m"], places + noise, rtol=1e-15)
+    assert notes["/fix: messages with simulated noise, position_m: 0.5"] == "4"
+    assert (streams["/fix"]["position_m"] != imported(text, mapping)[0]["/fix"]["position_m"]).all()
+    with pytest.raises(BadInput, match="noise is of position, which `fields` does not have"):
+        imported(text, mapping.replace("{ position_m = 0.5", "{ position = 0.5"))
+
+
+def test_recordings_of_one_format_differ_in_mounting_and_delays(imported: Callable[..., Any]) -> None:
+    """Settings take the place of what the mapping says of them; what it does not say is refused."""
+    mapping = INERTIAL + "mounting_deg = [0, 0, 90]\n"
+    found = imported(ROWS, mapping, mounting_deg=[0, 0, 180], delays_s={"/inertial": 0.5})[0][
+        "/inertial"
+    ]
+    assert_allclose(found["specific_force_mps2"][0], np.array([-0.1, -0.2, 1]) * GRAVITY)
+    assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 2
+    with pytest.raises(BadInput, match=r"delays_s: the mapping has no topic '/inertia'; did you mean"):
+        imported(ROWS, mapping, delays_s={"/inertia": 0.5})
+    with pytest.raises(BadInput, match="mounting_deg: the mapping turns no stream"):
+        imported(ROWS, INERTIAL, mounting_deg=[0, 0, 180])
+
+
+def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
+    """Those that have all files of the mapping, a single folder or many; a part of one is none."""
+    mapping = read_mapping("quadrotor")
+    for name, held in {"a/path_2": ["GT.csv", "IMU_1.csv"], "path_10": ["GT.csv", "IMU_1.csv"]}.items():
+        (tmp_path / name).mkdir(parents=True)
+        for file in held:
+            (tmp_path / name / file).touch()
+    (tmp_path / "part").mkdir()
+    (tmp_path / "part" / "GT.csv").touch()
+    both = [tmp_path / "a" / "path_2", tmp_path / "path_10"]
+    assert recordings_in(mapping, tmp_path) == both
+    assert recordings_in(mapping, both[1]) == both[1:]
+    with pytest.raises(BadInput, match=r"no folder there has the files .* \(GT.csv, IMU_{unit}.csv\)"):
+        recordings_in(mapping, tmp_path / "part")
+
+
 def test_many_messages_of_a_row_and_what_is_missing(imported: Callable[..., Any]) -> None:
     """A row of ranges is a message for each; empty cells and such as stand for none are left out."""
     mapping = """
@@ -371,6 +426,8 @@ def test_the_other_navigation_data(imported: Callable[..., Any], navigation: Pat
         -0.10000003381003134,
     ]
     assert notes["IMU_2.csv: stamps repeat, and are kept"] == "3"
+    assert len(streams["/fix"]) == 55
+    assert streams["/prior"].publish_time_ns.tolist() == [streams["/truth"].publish_time_ns[0]]
 
     streams, notes = imported(navigation / "uwb_lias", "uwb-lias")
     ranges, truth = streams["/ranges"], streams["/truth"]

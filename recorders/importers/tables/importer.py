@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import NonNegativeInt
 
 from recorders.errors import BadInput
 from recorders.importers.mapping import checked, mapped, schema_of
 from recorders.importers.tables.mapping import (
     ConstantStream,
     LogMapping,
+    adapted,
     find_files,
     read_mapping,
     shipped,
@@ -26,10 +28,17 @@ from recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, a name (walk) or a file (own.toml), and more files and folders that it is of."""
+    """The mapping, a name (walk) or a file (own.toml), and more files and folders that it is of.
+
+    Recordings of one format differ in `mounting_deg` and, by topic, `delays_s`, which take the place of
+    what the mapping says; `seed` is that of its noise.
+    """
 
     mapping: str = ""
     more: list[str] = []
+    mounting_deg: tuple[float, float, float] | None = None
+    delays_s: dict[str, float] = {}
+    seed: NonNegativeInt = 0
 
 
 def read(path: Path, parameters: TableParameters) -> Blocks:
@@ -48,14 +57,17 @@ def read(path: Path, parameters: TableParameters) -> Blocks:
         if not each.exists():
             raise BadInput(f"{each}: no such file or folder; give the tables to import")
     found = Blocks(iter(()))
-    found.blocks = _blocks(paths, read_mapping(parameters.mapping), found)
+    mapping = adapted(read_mapping(parameters.mapping), parameters.mounting_deg, parameters.delays_s)
+    found.blocks = _blocks(paths, mapping, np.random.default_rng(parameters.seed), found)
     return found
 
 
-def _blocks(paths: list[Path], mapping: LogMapping, told: Blocks) -> Iterator[list[Stream]]:
+def _blocks(
+    paths: list[Path], mapping: LogMapping, generator: np.random.Generator, told: Blocks
+) -> Iterator[list[Stream]]:
     files, others = find_files(mapping, paths)
     counts: Told = Counter()
-    sources = [Rows(file, counts) for file in files]
+    sources = [Rows(file, counts, generator) for file in files]
     firsts = {
         number: first
         for number, source in enumerate(sources)

@@ -12,12 +12,13 @@ units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Self
 
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from recorders.errors import BadInput, choices
 from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
@@ -67,12 +68,21 @@ class TableStream(StreamMapping):
     """A stream of a table's rows.
 
     What it says was measured `delay_s` before its stamp; with `only_first` the first row alone is taken,
-    as for a prior.
+    as for a prior, else the first of `every` so many. To fields of `noise` white Gaussian noise of these
+    standard deviations is added, such as makes fixes of a path that is known.
     """
 
     topic: str = Field(pattern=r"^/\S+$")
     delay_s: float = 0.0
     only_first: bool = False
+    every: PositiveInt = 1
+    noise: dict[str, PositiveFloat] = {}
+
+    @model_validator(mode="after")
+    def _has_fields_of_noise(self) -> Self:
+        if unknown := self.noise.keys() - self.fields.keys():
+            raise ValueError(f"noise is of {', '.join(sorted(unknown))}, which `fields` does not have")
+        return self
 
 
 class TableMapping(Parameters):
@@ -158,6 +168,51 @@ def read_mapping(name: str) -> LogMapping:
     for constant in found.constants:
         schema_of(constant.mapping, f"{name}: {constant.topic}")
     return found
+
+
+def adapted(
+    mapping: LogMapping,
+    mounting_deg: tuple[float, float, float] | None = None,
+    delays_s: Mapping[str, float] | None = None,
+) -> LogMapping:
+    """The mapping with another mounting, of all streams that it turns, and other delays by topic.
+
+    Raises BadInput where it turns none, or has no such topic.
+    """
+    delays_s = delays_s or {}
+    streams = [stream for table in mapping.tables for stream in table.streams]
+    topics = [stream.topic for stream in streams]
+    for topic in delays_s:
+        if topic not in topics:
+            raise BadInput(f"delays_s: the mapping has no topic '{topic}'; {choices(topic, topics)}")
+    if mounting_deg is not None and all(stream.mounting_deg is None for stream in streams):
+        raise BadInput("mounting_deg: the mapping turns no stream; state the mounting of one in it")
+
+    def changed(stream: TableStream) -> TableStream:
+        update: dict[str, object] = {"delay_s": delays_s.get(stream.topic, stream.delay_s)}
+        if mounting_deg is not None and stream.mounting_deg is not None:
+            update["mounting_deg"] = mounting_deg
+        return stream.model_copy(update=update)
+
+    tables = [
+        table.model_copy(update={"streams": [changed(stream) for stream in table.streams]})
+        for table in mapping.tables
+    ]
+    return mapping.model_copy(update={"tables": tables})
+
+
+def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
+    """The folders at a place and below that have all files of a mapping; raises BadInput for none."""
+    below = [each for each in place.rglob("*") if each.is_dir()] if place.is_dir() else []
+    folders = []
+    for folder in sorted([place, *below], key=lambda each: (len(each.name), each)):
+        with suppress(BadInput):
+            find_files(mapping, [folder])
+            folders.append(folder)
+    if not folders:
+        patterns = ", ".join(table.files for table in mapping.tables if not table.optional)
+        raise BadInput(f"{place}: no folder there has the files of the mapping ({patterns})")
+    return folders
 
 
 class Found(NamedTuple):

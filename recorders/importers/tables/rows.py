@@ -29,12 +29,13 @@ Told = Counter[tuple[str, str]]
 class Rows:
     """A file that is being imported: its next batch lies ready, and what is left out is counted.
 
-    Raises BadInput where the file cannot be read, or lacks a column that its mapping names.
+    `generator` makes the noise that the mapping asks for. Raises BadInput where the file cannot be read,
+    or lacks a column that its mapping names.
     """
 
-    def __init__(self, found: Found, told: Told) -> None:
+    def __init__(self, found: Found, told: Told, generator: np.random.Generator) -> None:
         self.path, self.mapping, self._names = found
-        self._told = told
+        self._told, self._generator = told, generator
         own = self.mapping
         self.table = self._open()
         self.count = 0
@@ -253,7 +254,7 @@ class Rows:
         """Which of the messages are taken; the others are counted by reason."""
         topic = self._filled(own.topic)
         lacking = not_finite(schema_of(own, topic), found.columns)
-        keep = timed[found.rows]
+        keep = timed[found.rows] & ((self.count + found.rows) % own.every == 0)
         for reason, which in {**found.dropped, "NaN or infinite": lacking}.items():
             self._tell(topic, f"messages left out: {reason}", int((which & keep).sum()))
             keep = keep & ~which
@@ -277,6 +278,10 @@ class Rows:
         is_in_plane = self.mapping.geodetic is not None and own.becomes in _IN_PLANE
         if plane is not None and (is_in_plane or own.becomes == "GeodeticFix"):
             metadata |= plane.metadata
+        columns = {name: checked(where, name, column[rows]) for name, column in found.columns.items()}
+        for name, sigma in own.noise.items():
+            columns[name] = columns[name] + sigma * self._generator.normal(size=columns[name].shape)
+            self._tell(topic, f"messages with simulated noise, {name}: {sigma:g}", len(rows))
         return make_stream(
             topic,
             schema_of(own, where),
@@ -284,7 +289,7 @@ class Rows:
             log_time_ns=logged[of],
             sensor_time_ns=stamps[of],
             metadata=metadata,
-            **{name: checked(where, name, column[rows]) for name, column in found.columns.items()},
+            **columns,
         )
 
     # What is told.

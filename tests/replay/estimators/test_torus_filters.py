@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from recorders.models.headings import turn_together
+from recorders.models.headings import turn_on, turn_together
 from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
@@ -88,9 +88,36 @@ def test_toroidal_filter_is_nearly_as_good_as_a_grid():
     own = run_toroidal_filter(given, start(40), offsets, measured)[1]
     density = wrapped_normal.density(make_wrapped_normal([0.0, 0.0], np.eye(2)), torus_grid(32))
     cells = np.broadcast_to(density / density.sum(), (40, 32, 32))
-    state, means = run_torus_grid_filter(given, cells, offsets, measured)
-    assert rmse(truth, own.mean) == pytest.approx(rmse(truth, means), abs=0.005)
-    np.testing.assert_allclose(state.sum(axis=(1, 2)), 1.0)
+    grid = run_torus_grid_filter(given, cells, offsets, measured)
+    assert rmse(truth, own.mean) == pytest.approx(rmse(truth, grid.mean), abs=0.005)
+    np.testing.assert_allclose(grid.state.sum(axis=(1, 2)), 1.0)
+
+
+def test_an_angle_that_is_not_measured():
+    """A direction alone, of a motion whose second angle is its turn: filters beside a grid."""
+    given = make_heading_model(0.5, (0.0, 0.0), 0.2**2 * np.eye(2), 0.3**2 * np.eye(2))
+    generator = np.random.default_rng(2)
+    truth, x = np.empty((60, 2)), np.zeros(2)
+    for each in truth:
+        x = np.array(turn_on(*x, 0.5, 0.0, 0.0)) + 0.2 * generator.standard_normal(2)
+        each[:] = x
+    measured = truth + 0.3 * generator.standard_normal(truth.shape)
+    measured[:, 1] = np.nan
+    offsets, density = (
+        np.array([0, 60]),
+        wrapped_normal.density(WrappedNormal(np.zeros(2), np.eye(2)), torus_grid(40)),
+    )
+    grid = run_torus_grid_filter(given, density[None] / density.sum(), offsets, measured, turn_on)
+    for own in (
+        run_toroidal_filter(given, start(1), offsets, measured, motion=turn_on)[1],
+        run_unscented_filter(given, start(1), offsets, measured, motion=turn_on, wrapped=True)[1],
+    ):
+        np.testing.assert_allclose(wrap_angle(own.mean - grid.mean), 0.0, atol=0.1)
+    alone = given._replace(measurement=np.diag([0.3**2, 80.0]))
+    same = run_toroidal_filter(alone, start(1), offsets, np.nan_to_num(measured), motion=turn_on)[1]
+    own = run_toroidal_filter(given, start(1), offsets, measured, motion=turn_on)[1]
+    assert np.array_equal(own.mean, same.mean)
+    assert np.isfinite(grid.log_density).all()
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +130,8 @@ def ragged() -> tuple[HeadingModel, np.ndarray, np.ndarray]:
 
 
 def grid_filter(given, state, offsets, measured):
-    cells, means = run_torus_grid_filter(given, state[0], offsets, measured)
-    return (cells,), (means,)
+    found = run_torus_grid_filter(given, state[0], offsets, measured)
+    return (found.state,), (found.mean,)
 
 
 FILTERS = {

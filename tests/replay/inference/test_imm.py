@@ -356,7 +356,7 @@ def test_a_mixture_of_rotations_has_the_moments_of_its_samples() -> None:
     roots = np.array([np.diag([0.25, 0.02, 0.02, 0.1]), np.diag([0.02, 0.25, 0.1, 0.1])])
     roots[:, 3, 0] = 0.05
     covariance = roots @ roots.swapaxes(1, 2)
-    gather, mix = mixing(kinds, 2)
+    gather, mix = mixing(kinds)
     memory = memory_of(5, 4, 2)
     found, spread = np.empty(5), np.empty((4, 4))
     gather(mean, covariance, weights, memory)

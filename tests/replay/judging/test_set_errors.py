@@ -36,7 +36,7 @@ def estimates(times_s: list[float], sets: list[list[tuple[float, float]]]) -> tu
 
 
 def run(epoch_s: float, **truths: dict[float, tuple[float, float]]) -> MemorySource:
-    """A run with things of a name at (x, y) at times."""
+    """A run with targets of a name at (x, y) at times."""
     streams = [
         make_stream(
             f"/{name}/truth",
@@ -54,7 +54,7 @@ def run(epoch_s: float, **truths: dict[float, tuple[float, float]]) -> MemorySou
 
 
 def test_sets_of_changing_size_are_judged_element_by_element():
-    """Two runs of other epochs; sizes 2, 0, 1 and 1; one thing is known for the first second only."""
+    """Two runs of other epochs; sizes 2, 0, 1 and 1; one target is known for the first second only."""
     first = run(10.0, a={10.0: (0.0, 0.0), 12.0: (20.0, 0.0)}, b={10.0: (100.0, 0.0)})
     second = run(0.0, a={5.0: (7.0, 7.0)})
     parts = [
@@ -79,9 +79,9 @@ def test_sets_of_changing_size_are_judged_element_by_element():
             "e.ospa_m": (np.sqrt(12.5) + 20.0) / 4,
             "e.gospa_m": (15.0 + np.sqrt(50.0)) / 4,
             "e.gospa_localisation_m": 2.5,
-            "e.missed_things": 0.5,
-            "e.false_things": 0.25,
-            "e.cardinality_error_things": -0.25,
+            "e.missed_targets": 0.5,
+            "e.false_targets": 0.25,
+            "e.cardinality_error_targets": -0.25,
         }
     )
 

@@ -55,14 +55,14 @@ def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
             len(at_ns),
             found["gospa_all_m"],
             found["gospa_m"],
-            found["unreferenced_things"],
+            found["unreferenced_targets"],
             track_figures(lidar)["gospa_all_m"],
             track_figures(lidar)["gospa_m"],
         ),
         abs=1e-6,
     )
     if scenario == 2:
-        names = "missed_things", "false_things", "thing1_rmse_m", "thing2_rmse_m"
+        names = "missed_targets", "false_targets", "target1_rmse_m", "target2_rmse_m"
         parts = [0.087963, 0.087963, 7.006923, 9.090370]
         assert [found[name] for name in names] == pytest.approx(parts, abs=1e-6)
         # the sheet reckons with stamps of 1e9 s as doubles, which are good to 2e-7 s
@@ -70,7 +70,7 @@ def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
 
 
 def test_switches_breaks_and_what_has_no_reference():
-    """A thing stands at the origin, another is there at the end; track 7 is lost and comes back as 8."""
+    """One target stands at the origin, another comes at the end; track 7 is lost and returns as 8."""
     still = np.zeros((1, 5, 2))
     late = np.full((1, 5, 2), np.nan)
     late[0, 4] = (100, 0)
@@ -88,8 +88,8 @@ def test_switches_breaks_and_what_has_no_reference():
     assert errors.gospa.tolist() == pytest.approx([5, np.sqrt(200), 20, 0, 3])
     figures = track_figures(errors)
     assert (figures["switches"], figures["breaks"]) == (2, 1)
-    assert figures["thing1_coverage"] == 0.6
-    assert figures["thing1_rmse_m"] == pytest.approx(np.sqrt(25 / 3))
-    assert (figures["thing2_coverage"], figures["thing2_rmse_m"]) == (1, 3)
-    assert (figures["missed_things"], figures["false_things"]) == (0.4, 0.2)
+    assert figures["target1_coverage"] == 0.6
+    assert figures["target1_rmse_m"] == pytest.approx(np.sqrt(25 / 3))
+    assert (figures["target2_coverage"], figures["target2_rmse_m"]) == (1, 3)
+    assert (figures["missed_targets"], figures["false_targets"]) == (0.4, 0.2)
     assert np.isfinite(as_trajectories(tracks)[:, :, 0]).sum(axis=1).tolist() == [3, 2, 1]

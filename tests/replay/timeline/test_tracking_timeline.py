@@ -62,3 +62,48 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
     drawn = np.concatenate(found["/plots/gospa/jipda"]["Scalars:scalars"])
     np.testing.assert_allclose(drawn, gospa, rtol=1e-9)
+
+
+def test_associations_and_what_happened(tmp_path: Path, uncompiled: None):
+    """A hull gives two detections, which are one; its track is lost, and another one follows it.
+
+    The other detection of every scan stands first, so that the hull's is the second one of its scan.
+    """
+    seconds = np.arange(50)
+    seen = [
+        [(500.0, -500.0 + 40.0 * second), (2.0 * second - 3.0, 100.0), (2.0 * second + 3.0, 100.0)]
+        for second in seconds
+    ]
+    seen[16:31] = [[]] * 15
+    truth = make_stream(
+        "/vessel/truth",
+        schemas.TRUTH_STATE,
+        SIMULATION_EPOCH_NS + seconds * SECOND,
+        metadata=state_metadata(("x_m", "y_m")),
+        state=np.stack([2.0 * seconds, np.full(50, 100.0)], axis=1),
+    )
+    radar = sensor("radar", {**RADAR, "joined_within_m": "12.0"}, seconds, seen)
+    source = log([truth], radar, scenario="autoferry")
+    outputs = collect(
+        replay([source], bind("hungarian", [source], {"kind": "tracker", "association": "hungarian"}))
+    )
+    show(source, outputs, [], save=tmp_path / "run.rrd")
+    found = read(tmp_path / "run.rrd")
+    texts = [text for row in found["/events/hungarian"]["TextLog:text"] for text in row]
+    tracks = outputs["/estimates/hungarian/track"].stream
+    first, second = np.unique(tracks["track_id"])
+    assert texts == [
+        f"hungarian: track {first} is confirmed",
+        f"hungarian: track {first} ends",
+        f"hungarian: track {second} is confirmed",
+        f"hungarian: target 1 goes on with track {second}, before with {first}",
+    ]
+    strips = found["/map/hungarian/associations/radar"]["LineStrips2D:strips"]
+    lines = np.array([strip for row in strips for strip in row])
+    pairs = outputs["/estimates/hungarian/association"].stream
+    assert set(pairs["detection"]) == {1}
+    elapsed_s = (pairs.publish_time_ns - SIMULATION_EPOCH_NS) / SECOND
+    np.testing.assert_allclose(lines[:, 1, 0], 2.0 * elapsed_s, atol=1e-4)
+    np.testing.assert_allclose(lines[:, 1, 1], 100.0, atol=1e-4)
+    own = np.isin(tracks.publish_time_ns, pairs.publish_time_ns)
+    np.testing.assert_allclose(lines[:, 0], tracks["mean"][own][:, [0, 2]], rtol=1e-5)

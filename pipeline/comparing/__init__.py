@@ -1,0 +1,1 @@
+"""Comparing: two estimators or more over the same runs, with a verdict on every metric."""

@@ -1,0 +1,87 @@
+"""The command `fuselog compare`: it prints verdicts with their intervals, and writes what is asked."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.commands import read_settings, settings_of_estimators
+from pipeline.comparing.comparing import compare
+from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.terminal import print_json, print_table, progress, say, warn
+from recorders.parameters import parse_settings
+
+COLUMNS = {
+    "quantity": "metric",
+    "aim": "aim",
+    "first_mean": "{first}",
+    "second_mean": "{second}",
+    "difference": "difference",
+    "low": "95 % from",
+    "high": "to",
+    "verdict": "verdict",
+    "sure": "sure",
+    "runs": "runs",
+}
+
+
+def compare_sides(
+    sides: Sequence[Path],
+    labels: Sequence[str],
+    *,
+    truth: Path | None,
+    case: str | None,
+    margin: float,
+    out: Path | None,
+    save: Path | None,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
+    inputs = {"input": [*sides, *filter(None, [truth, settings_file])]}
+    if out is not None:
+        check_folder(out, inputs)
+    if save is not None:
+        check_files([(save, TIMELINE)], inputs)
+    tuned = read_settings(settings_file, labels)
+    chosen = settings_of_estimators(labels, parse_settings(settings), tuned)
+    found = compare(
+        *sides,
+        estimators=[{label: values} for label, values in chosen.items()],
+        truth=truth,
+        case=case,
+        margin=margin,
+        gap_limit_s=gap_limit_s,
+        recover=recover,
+        progress=progress,
+    )
+    written = []
+    if out is not None:
+        written.append(found.save(out).folder)
+    if save is not None:
+        found.draw(save)
+        written.append(save)
+    for note in found.notes:
+        warn(note)
+    if as_json:
+        print_json(
+            {
+                "differences": found.table.replace({np.nan: None}).to_dict("records"),
+                "sentences": found.sentences,
+                "notes": found.notes,
+                "written": [str(path) for path in written],
+            }
+        )
+        return
+    table = found.table.replace({np.nan: None})
+    for (first, second, case_), rows in table.groupby(["first", "second", "case"], sort=False):
+        columns = [title.format(first=first, second=second) for title in COLUMNS.values()]
+        title = " ".join(filter(None, (str(case_), f"{second} against {first}")))
+        print_table(columns, rows[list(COLUMNS)].to_numpy().tolist(), title)
+    for sentence in found.sentences:
+        say(sentence)
+    for path in written:
+        say(str(path))

@@ -1,0 +1,532 @@
+"""Comparing estimators: paired differences of every metric over the same runs, with a verdict each."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.charts import Axis, Chart, Panel, band, curve, level
+from pipeline.comparing.sides import (
+    Given,
+    Side,
+    name_of,
+    of_estimates,
+    of_replay,
+    of_result,
+    of_trajectory,
+)
+from pipeline.door import ResultFolder
+from pipeline.ensemble import Progress, hash_files, judge_logs, no_progress
+from pipeline.outputs import check_folder
+from pipeline.replays import Kind, replay
+from pipeline.results import RESULT_FILE, Outcome, result_folder, write_outcome
+from recorders.errors import BadInput, choices
+from recorders.log import NotMcap, RunMetadata, open_log, schemas
+from recorders.trajectories import read_trajectory
+from replay.engine.sources import LogSource, MemorySource, Source
+from replay.judging.differences import (
+    FEWEST_RUNS,
+    NATS,
+    Aim,
+    Difference,
+    aim_of,
+    paired_difference,
+)
+from replay.judging.trajectories import truth_of
+
+MARGIN = 0.02
+# The differences over time have at most so many spans.
+SPANS = 32
+# So many settings that differ are named.
+NAMED = 8
+ALL = "all"
+
+
+class Paired(NamedTuple):
+    """A metric of two sides.
+
+    Attributes:
+        first, second: the sides' names.
+        quantity: the metric.
+        case: of what; `all` is the mean over the cases of each run.
+        aim: what it should be.
+        found: the difference over the runs.
+        where: when it is, from and to, in seconds since the epoch; None where it is no more at one time.
+    """
+
+    first: str
+    second: str
+    quantity: str
+    case: str
+    aim: Aim
+    found: Difference
+    where: tuple[float, float] | None = None
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        found = self.found
+        of = f" of {self.case}" if self.case else ""
+        values = f"{found.second:.4g} against {found.first:.4g}"
+        if isinstance(self.aim, float):
+            values += f", where {self.aim:g} is right"
+        if found.runs < FEWEST_RUNS and np.isnan(found.low):
+            return (
+                f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
+                f"and there is {_runs(found.runs)}"
+            )
+        interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
+        margin = f"{_runs(found.runs)}, margin {found.margin:.3g}"
+        verdict = f"{self.second} is {found.verdict} than {self.first}"
+        if found.verdict == "unclear":
+            verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
+        elif found.verdict == "no difference":
+            verdict = f"no difference beyond the margin between {self.second} and {self.first}"
+        when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
+        return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Differences:
+    """Estimators compared: the first of each group with every other one.
+
+    Attributes:
+        groups: the sides.
+        margin: which share of a metric is no matter.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        notes: sentences on what is not alike, and what was left out.
+        paired: every metric of every pair.
+        times: a row per pair, case, quantity and span of time: the difference and its interval.
+    """
+
+    groups: Sequence[Sequence[Side]]
+    margin: float
+    gap_limit_s: float
+    notes: Sequence[str]
+    paired: Sequence[Paired]
+    times: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row per pair, metric and case."""
+        rows = []
+        for each in self.paired:
+            found = each.found._asdict()
+            begin_s, end_s = each.where or (np.nan, np.nan)
+            first, second = each.first, each.second
+            about = {"quantity": each.quantity, "case": each.case, "aim": _told(each.aim)}
+            values = {"first_mean": found.pop("first"), "second_mean": found.pop("second")}
+            when = {"most_from_s": begin_s, "most_to_s": end_s}
+            rows.append({"first": first, "second": second, **about, **values, **found, **when})
+        return pd.DataFrame(rows)
+
+    @property
+    def sentences(self) -> list[str]:
+        """The verdicts in words, those on differences first."""
+        order = ("worse", "better", "higher", "lower", "unclear", "no difference")
+        return [
+            each.sentence for each in sorted(self.paired, key=lambda p: order.index(p.found.verdict))
+        ]
+
+    def __repr__(self) -> str:
+        return "\n".join([*self.notes, *self.sentences])
+
+    def charts(self) -> dict[str, Chart]:
+        """The differences over time, a chart for each pair and case."""
+        if self.times.empty:
+            return {}
+        groups = self.times.groupby(["first", "second", "case"], sort=False)
+        return {
+            "-".join(filter(None, ("differences", *map(str, what)))): _chart(rows)
+            for what, rows in groups
+        }
+
+    def draw(self, save: Path) -> None:
+        """Write a timeline of the first run that both sides of the first group have: side by side.
+
+        Raises BadInput where no such run can be drawn.
+        """
+        from replay.timeline.show import Drawing  # which takes long to import
+
+        sides = self.groups[0]
+        if not self.drawable:
+            raise BadInput(f"{save}: there are no estimates of one run to draw side by side")
+        first = self.drawable[0]
+        source = sides[0].pairs[first][0]
+        of_sides = (side.estimates(first).streams.items() for side in sides)
+        streams = {topic: stream for streams in of_sides for topic, stream in streams}
+        run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+        estimates = MemorySource(streams, run, source.name)
+        names = [side.name for side in sides]
+        identity = json.dumps([source.name, names])
+        with Drawing(source.whole(), identity=identity, save=save, sides=names) as drawing:
+            judge_logs([estimates], [source], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write tables, figures and the timeline as a result folder, for `fuselog report` and `view`.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        inputs = self.inputs
+        check_folder(place, {"input": inputs})
+        names = [[side.name for side in sides] for sides in self.groups]
+        outcome = Outcome(tables={"differences": self.table}, figures=dict(self.charts()))
+        if len(self.times):
+            outcome.tables["times"] = self.times
+        for each in self.paired:
+            key = f"{each.second}.{each.quantity}_difference"
+            outcome.metrics[f"{key}.{each.case}" if each.case else key] = each.found.difference
+        outcome.input_sha256 = hash_files([path for path in inputs if path.is_file()])
+        settings = {
+            "title": "; ".join(" against ".join(reversed(each)) for each in names),
+            "sides": names,
+            "margin": self.margin,
+            "notes": list(self.notes),
+        }
+        with result_folder(place) as part:
+            if self.drawable:
+                self.draw(part / "timeline.rrd")
+            return ResultFolder(place, write_outcome(part, "compare", settings, outcome))
+
+    @property
+    def drawable(self) -> list[str]:
+        """The runs of which all sides of the first group have estimates."""
+        first, *others = self.groups[0]
+        return [run for run in first.pairs if all(run in each.pairs for each in others)]
+
+    @property
+    def inputs(self) -> list[Path]:
+        """The files that went in."""
+        sources = [each for side in self.groups[0] for pair in side.pairs.values() for each in pair]
+        return [each.log.path for each in sources if isinstance(each, LogSource)]
+
+
+def _told(aim: Aim) -> str:
+    return "" if aim is None else f"{aim:g}" if isinstance(aim, float) else aim
+
+
+def _chart(rows: pd.DataFrame) -> Chart:
+    first, second, case = (rows[name].iloc[0] for name in ("first", "second", "case"))
+    panels = []
+    for quantity, of in rows.groupby("quantity", sort=False):
+        x = of["elapsed_s"].to_numpy()
+        label = f"{second} - {first}"
+        panel = Panel(x=Axis(label="time (s)"), y=Axis(label=f"difference of {quantity}"))
+        panel.series.extend([curve(label, x, of["difference"]), level("no difference", x, 0.0)])
+        panel.bands.append(band(label, x, of["low"], of["high"]))
+        panels.append(panel)
+    title = f"{case or 'differences'}: {second} less {first}, with 95 % over the runs"
+    return Chart(title=title, panels=panels)
+
+
+def compare(
+    *sides: str | Path,
+    estimators: Sequence[str | Mapping[str, Kind]] = (),
+    truth: str | Path | None = None,
+    case: str | None = None,
+    margin: float = MARGIN,
+    gap_limit_s: float = 0.2,
+    recover: bool = False,
+    progress: Progress = no_progress,
+) -> Differences:
+    """Compare estimators over the same runs, each other one with the first.
+
+    Args:
+        sides: result folders, estimates logs or folders of them, and trajectory files; or with
+            `estimators` logs to replay.
+        estimators: which ones, as for `replay`; by default those that all sides have, or the only ones.
+        truth: the true trajectory, as a file, where all sides are files.
+        case: what trajectory files are of, such as `robot2`, where a log has several truths.
+        margin: which share of a metric is no matter.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        recover: read what is whole of logs that were cut off or damaged.
+        progress: is told how a replay of results goes.
+
+    Raises BadInput where there are not two sides, or they have nothing in common.
+
+    >>> from pipeline.door import record, write
+    >>> write("run.mcap", record("landmarks", duration_s=5.0))
+    >>> found = compare("run.mcap", estimators=["ekf", {"sure": {"kind": "ekf", "sigma_range_m": 0.02}}])
+    >>> found.table.query("quantity == 'nees'")["runs"].tolist()
+    [1]
+    """
+    if not 0 <= margin < np.inf:
+        raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which is 2 %")
+    paths = [Path(side) for side in sides]
+    if not paths:
+        raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
+    givens = _given(paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover)
+    groups = list(_groups(givens, [label for each in estimators for label in _labels(each)]))
+    notes = [note for group in groups for side in group for note in side.notes]
+    paired: list[Paired] = []
+    times: list[pd.DataFrame] = []
+    for group in groups:
+        for second in group[1:]:
+            notes += _unlike(group[0], second)
+            found, over_time = _compared(group[0], second, margin, notes)
+            paired += found
+            times.append(over_time)
+    filled = [each for each in times if len(each)]
+    table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+    return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table)
+
+
+def _labels(each: str | Mapping[str, Kind]) -> list[str]:
+    return [each] if isinstance(each, str) else list(each)
+
+
+def _given(
+    paths: Sequence[Path],
+    estimators: Sequence[str | Mapping[str, Kind]],
+    truth: str | Path | None,
+    case: str | None,
+    progress: Progress,
+    *,
+    gap_limit_s: float,
+    recover: bool,
+) -> list[Given]:
+    """What every path stands for; logs without estimates are replayed together."""
+    kinds = [_kind_of(path, recover=recover) for path in paths]
+    logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
+    if logs and len(logs) < len(paths):
+        raise BadInput(f"{logs[0]}: is a log without estimates; fuselog replay makes them")
+    if logs:
+        if not estimators:
+            raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")
+        done = replay(
+            [LogSource(open_log(path, recover=recover)) for path in logs],
+            estimators,
+            gap_limit_s=gap_limit_s,
+        )
+        return [of_replay(name_of(logs[0]), done, gap_limit_s)]
+    found: dict[int, Given] = {}
+    for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
+        if kind == "result":
+            found[number] = of_result(path, progress)
+        elif kind == "estimates":
+            found[number] = of_estimates(path, gap_limit_s, recover=recover)
+    if len(found) < len(paths):
+        source = _true_source(truth, list(found.values()))
+        topic = _truth_topic(source, case)
+        for number, path in enumerate(paths):
+            if number not in found:
+                found[number] = of_trajectory(path, source, topic, gap_limit_s)
+    return [found[number] for number in range(len(paths))]
+
+
+def _kind_of(path: Path, *, recover: bool) -> str:
+    if path.is_dir():
+        return "result" if (path / RESULT_FILE).is_file() else "estimates"
+    try:
+        log = open_log(path, recover=recover)
+    except NotMcap:
+        return "trajectory"
+    return "estimates" if any(topic.startswith("/estimates/") for topic in log.topics) else "log"
+
+
+def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
+    """The run that trajectories are of: that of the other sides, or the true trajectory alone."""
+    if truth is not None:
+        trajectory = read_trajectory(truth)
+        stream = truth_of(trajectory, "/truth")
+        epoch_ns = int(stream.publish_time_ns[0])
+        return MemorySource({"/truth": stream}, RunMetadata("trajectory", epoch_ns=epoch_ns), str(truth))
+    sources = {run: source for each in others for run, source in each.sources.items()}
+    if len(sources) != 1:
+        raise BadInput(
+            "a trajectory file is of one run: compare it with the estimates log of that run, or give "
+            "the true trajectory with --truth"
+        )
+    return next(iter(sources.values()))
+
+
+def _truth_topic(source: Source, case: str | None) -> str:
+    truths = {
+        topic.rpartition("/")[0].removeprefix("/"): topic
+        for topic, each in source.topics.items()
+        if each.schema_name == schemas.TRUTH_STATE.full_name
+    }
+    if case is None and len(truths) == 1:
+        return next(iter(truths.values()))
+    if case not in truths:
+        known = ", ".join(truths) or "none"
+        raise BadInput(f"{source.name}: say which truth trajectories are of with --case: {known}")
+    return truths[case]
+
+
+def _groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Side]]:
+    """The sides to compare: the estimators of one thing, or each estimator of several things."""
+    for each in givens:
+        for label in labels:
+            if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
+                raise BadInput(f"{each.name}: no estimates of {label}; {choices(label, each.labels)}")
+    if len(givens) == 1:
+        chosen = list(labels) or list(givens[0].labels)
+        if len(chosen) < 2:
+            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give something to compare with")
+        yield [givens[0].side(label, label) for label in chosen]
+        return
+    names = _distinct([each.name for each in givens])
+    common = list(labels) or [x for x in givens[0].labels if all(x in each.labels for each in givens)]
+    if not common and all(len(each.labels) == 1 for each in givens):
+        yield [each.side(each.labels[0], name) for each, name in zip(givens, names, strict=True)]
+        return
+    if not common:
+        told = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
+        raise BadInput(f"no estimator is in all of them: {told}; name one with -e")
+    for label in common:
+        suffix = f":{label}" if len(common) > 1 else ""
+        yield [
+            each.side(label if label in each.labels else each.labels[0], name + suffix)
+            for each, name in zip(givens, names, strict=True)
+        ]
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, numbered where two are the same."""
+    return [
+        f"{name}-{number}" if names.count(name) > 1 else name for number, name in enumerate(names, 1)
+    ]
+
+
+def _unlike(first: Side, second: Side) -> Iterator[str]:
+    """A sentence for what two sides do not share; raises BadInput where that is everything."""
+    runs = [list(dict.fromkeys(side.rows["run"])) for side in (first, second)]
+    common = [run for run in runs[0] if run in set(runs[1])]
+    if not common:
+        told = " and ".join(f"{each[0]}" if each else "nothing" for each in runs)
+        raise BadInput(
+            f"{first.name} and {second.name} have no run in common: they begin with {told}; compare "
+            "estimates of the same runs"
+        )
+    for side, own in zip((first, second), runs, strict=True):
+        alone = [run for run in own if run not in set(common)]
+        if alone:
+            yield f"only {side.name} has {_runs(len(alone))}, left out: {', '.join(alone[:3])}" + (
+                ", ..." if len(alone) > 3 else ""
+            )
+    judged = [run for run in common if run in first.truths and run in second.truths]
+    apart = [run for run in judged if first.truths[run] != second.truths[run]]
+    if apart:
+        yield f"{_runs(len(apart))} have different truths in {first.name} and {second.name}: {apart[0]}"
+    missing = "not stated"
+    names = dict.fromkeys([*first.settings, *second.settings])
+    values = {name: [side.settings.get(name, missing) for side in (first, second)] for name in names}
+    differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
+    if differing:
+        more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
+        what = ", ".join(differing[:NAMED])
+        yield f"settings differ between {first.name} and {second.name}: {what}{more}"
+
+
+def _compared(
+    first: Side, second: Side, margin: float, notes: list[str]
+) -> tuple[list[Paired], pd.DataFrame]:
+    """Every metric that both have, over the runs that both have; and some over time."""
+    keys = ["quantity", "case", "run"]
+    both = first.rows.merge(second.rows, on=keys, suffixes=("_first", "_second"))
+    of_first, of_second = (set(side.rows["quantity"]) for side in (first, second))
+    for side, alone in ((first, of_first - of_second), (second, of_second - of_first)):
+        if alone:
+            notes.append(f"only {side.name} has {', '.join(sorted(alone))}")
+    known = both.dropna(subset=["value_first", "value_second"])
+    if known.empty:
+        raise BadInput(
+            f"{first.name} and {second.name} have no metric in common: one of them has estimates "
+            "without truth, or of something else"
+        )
+    over_time = _over_time(first, second, margin)
+    paired: list[Paired] = []
+    for quantity in dict.fromkeys(known["quantity"]):
+        rows = known[known["quantity"] == quantity]
+        missing = len(set(both["run"])) - len(set(rows["run"]))
+        if missing:
+            notes.append(f"{quantity}: {_runs(missing)} without it are left out")
+        scale = NATS if quantity == "log_likelihood" else None
+        cases = list(dict.fromkeys(rows["case"]))
+        sizes = {first.sizes.get((quantity, case), aim_of(quantity)) for case in cases}
+        groups = {ALL: rows} if len(cases) > 1 and len(sizes) == 1 else {}
+        groups |= {case: rows[rows["case"] == case] for case in cases}
+        for case, own in groups.items():
+            aim = first.sizes.get((quantity, case if case in cases else cases[0]), aim_of(quantity))
+            means = own.groupby("run", sort=False)[["value_first", "value_second"]].mean().to_numpy()
+            found = paired_difference(means[:, 0], means[:, 1], aim, margin, scale)
+            where = _where(over_time, quantity, case, found)
+            paired.append(Paired(first.name, second.name, quantity, case, aim, found, where))
+    return paired, over_time
+
+
+def _over_time(first: Side, second: Side, margin: float) -> pd.DataFrame:
+    """The differences of the main RMSE and of NEES by spans of time."""
+    if first.times.empty or second.times.empty:
+        return pd.DataFrame()
+    width_s = _span_s([first.times, second.times])
+    spans = [_in_spans(side.times, width_s) for side in (first, second)]
+    both = spans[0].merge(spans[1], on=["case", "quantity", "span", "run"], suffixes=("_1", "_2"))
+    rows = []
+    for _, own in both.groupby(["case", "quantity", "span"], sort=False):
+        case, quantity, span = (own[name].iloc[0] for name in ("case", "quantity", "span"))
+        aim = first.sizes.get((quantity, case), aim_of(quantity))
+        found = paired_difference(own["value_1"].to_numpy(), own["value_2"].to_numpy(), aim, margin)
+        about = {"first": first.name, "second": second.name, "case": case, "quantity": quantity}
+        time = {
+            "elapsed_s": (span - 0.5) * width_s,
+            "from_s": (span - 1) * width_s,
+            "to_s": span * width_s,
+        }
+        kept = {name: getattr(found, name) for name in ("difference", "low", "high", "runs")}
+        rows.append({**about, **time, **kept})
+    return pd.DataFrame(rows)
+
+
+def _span_s(tables: Iterable[pd.DataFrame]) -> float:
+    """How long the spans are: whole multiples of those of all tables, at most `SPANS` of them."""
+    ends_ms = [np.rint(table["until_s"].to_numpy() * 1e3).astype(np.int64) for table in tables]
+    width = int(np.lcm.reduce([np.gcd.reduce(each) for each in ends_ms]))
+    longest = max(int(each.max()) for each in ends_ms)
+    while longest > SPANS * width:
+        width *= 2
+    return width * 1e-3
+
+
+def _in_spans(times: pd.DataFrame, width_s: float) -> pd.DataFrame:
+    """RMSE of the position or orientation, else of the first component, and NEES, by span."""
+    columns = [column for column in times if "rmse" in str(column)]
+    main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in columns]
+    parts = []
+    for quantity in [*(main or columns[:1]), "nees"]:
+        power = 1 if quantity == "nees" else 2
+        span = np.ceil(times["until_s"] / width_s - 1e-9).astype(int)
+        sums = times.assign(span=span, value=times["estimates"] * times[quantity] ** power)
+        spans = sums.dropna(subset=["value"]).groupby(["run", "case", "span"], sort=False)
+        mean = spans["value"].sum() / spans["estimates"].sum()
+        parts.append((mean ** (1 / power)).rename("value").reset_index().assign(quantity=quantity))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _where(
+    over_time: pd.DataFrame, quantity: str, case: str, found: Difference
+) -> tuple[float, float] | None:
+    """The stretch of spans in a row that has most of a difference, where that is beyond the margin."""
+    if over_time.empty or found.verdict in ("no difference", "unclear"):
+        return None
+    own = over_time[(over_time["quantity"] == quantity) & (over_time["case"] == case)]
+    own = own.sort_values("from_s").reset_index(drop=True)
+    sign = np.sign(found.difference)
+    beyond = np.where(sign > 0, own["low"] > 0, own["high"] < 0)
+    if not beyond.any():
+        return None
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], beyond.astype(int), [0]])))
+    stretches = list(zip(edges[::2], edges[1::2], strict=True))
+    begin, end = max(stretches, key=lambda each: float(own["difference"][slice(*each)].abs().sum()))
+    return float(own["from_s"][begin]), float(own["to_s"][end - 1])

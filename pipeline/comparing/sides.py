@@ -1,0 +1,373 @@
+"""The sides of a comparison: what an estimator gave of every run, wherever that comes from.
+
+A side's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
+result says of itself. What comes of a trajectory file is an estimate stream like any other.
+"""
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.commands import log_of_estimates, stated_estimators
+from pipeline.ensemble import Progress, judge_logs, parts_of
+from pipeline.experiment import Experiment, Setting, load_scenario
+from pipeline.replays import Replay, replay
+from pipeline.results import RESULT_FILE, Result, read_result, split_metric
+from pipeline.runner import Runner
+from pipeline.starting import check_same_run
+from recorders.errors import BadInput
+from recorders.log import RunMetadata, open_log
+from recorders.parameters import build
+from recorders.trajectories import read_trajectory
+from replay.engine.estimator import configure
+from replay.engine.sources import LogSource, MemorySource, Source
+from replay.judging.evaluation import POSITION, split_topic
+from replay.judging.judge import joined
+from replay.judging.metrics import find_metrics, rmse_of
+from replay.judging.trajectories import estimates_of
+
+# Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.
+SAME = 1e-6
+# Entries of an experiment that decide about its results.
+DECIDING = ("record", "import", "logs", "gap_limit_s", "arrival_order", "late")
+
+
+Pairs = Mapping[str, tuple[Source, Source]]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """What an estimator gave, judged run by run.
+
+    Attributes:
+        name: what to call it.
+        label: what its estimates call it.
+        rows: a row per run, case and quantity: `run`, `case`, `quantity`, `value`.
+        times: a row per run, case and span of time; see `Judge.times`.
+        sizes: of a mean NEES, by quantity and case, how large it should be.
+        settings: what decided about it, by dotted name.
+        truths: by run, a hash of what it was judged by.
+        pairs: by run, those that can be drawn: the log, and the estimates.
+        notes: sentences on where it comes from.
+        replay: what the files of `pairs` go with.
+    """
+
+    name: str
+    label: str
+    rows: pd.DataFrame
+    times: pd.DataFrame
+    sizes: Mapping[tuple[str, str], float]
+    settings: Mapping[str, Any]
+    truths: Mapping[str, str] = field(default_factory=dict)
+    pairs: Pairs = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    replay: Replay | None = None
+
+    def estimates(self, run: str) -> MemorySource:
+        """The estimates of a run that can be drawn, under this side's name."""
+        return renamed(self.pairs[run][1], self.label, self.name)
+
+
+@dataclass(frozen=True)
+class Given:
+    """Something to compare.
+
+    Attributes:
+        name: what to call it.
+        labels: its estimators.
+        side: the side that one of them is, under a name.
+        sources: its runs, where they are logs.
+    """
+
+    name: str
+    labels: Sequence[str]
+    side: Callable[[str, str], Side]
+    sources: Mapping[str, Source] = field(default_factory=dict)
+
+
+def measured(
+    name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any]
+) -> Side:
+    """Judge the estimates of a label, each run by itself: of every pair of a log and its estimates."""
+    metrics = find_metrics()
+    rows: list[tuple[object, ...]] = []
+    times: list[pd.DataFrame] = []
+    sizes: dict[tuple[str, str], float] = {}
+    truths: dict[str, str] = {}
+    for run, (source, estimates) in pairs.items():
+        own = renamed(estimates, label, name)
+        judge = judge_logs([own], [source], metrics, gap_limit_s=gap_limit_s)
+        for key, value in judge.metrics.items():
+            _, quantity, case = split_metric(key)
+            rows.append((run, case, quantity, value))
+        times.append(judge.times.assign(run=run))
+        for errors in judge.judged.values():
+            sizes["nees", errors.case] = float(len(errors.components))
+            sizes["position_nees", errors.case] = float(len(errors.position))
+        truths[run] = _hash_of_truth(source, own)
+    values = pd.DataFrame(rows, columns=["run", "case", "quantity", "value"])
+    return Side(name, label, values, joined(times), sizes, settings, truths, pairs)
+
+
+def renamed(estimates: Source, label: str, name: str) -> MemorySource:
+    """The estimates of one label alone, under another name."""
+    before = f"/estimates/{label}/"
+    streams = estimates.read([topic for topic in estimates.topics if topic.startswith(before)])
+    of_name = {
+        f"/estimates/{name}/{topic.removeprefix(before)}": stream for topic, stream in streams.items()
+    }
+    run = estimates.run or RunMetadata("unknown", epoch_ns=estimates.epoch_ns)
+    placed = {topic: replace(stream, topic=topic) for topic, stream in of_name.items()}
+    return MemorySource(placed, run, estimates.name)
+
+
+def _hash_of_truth(source: Source, estimates: MemorySource) -> str:
+    digest = hashlib.sha256()
+    named = {stream.metadata.get("truth", "") for stream in estimates.streams.values()}
+    for topic in sorted(named & source.topics.keys()):
+        truth = source.read([topic])[topic]
+        for array in (truth.publish_time_ns, truth["state"]):
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def key_of(source: Source) -> str:
+    """What tells a run from others: scenario, seed and number, or the log's name of a recorded one."""
+    run = source.run
+    if run is not None and run.seed is not None:
+        return f"{run.scenario}, seed {run.seed}, run {run.run}"
+    return Path(source.name).name
+
+
+def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """What decided about the estimates of a label, by dotted name."""
+    run = source.run or RunMetadata("unknown")
+    return flat(
+        {"scenario": run.scenario, "parameters": run.parameters, "estimator": parameters(label, stated)}
+    )
+
+
+def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """An estimator's parameters, defaults included where this version knows it."""
+    try:
+        return dict(configure(label, stated)[1].model_dump(mode="json", exclude_none=True))
+    except BadInput:
+        return dict(stated)
+
+
+def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{before}{name}.")
+        else:
+            found[f"{before}{name}"] = value
+    return found
+
+
+def name_of(path: Path) -> str:
+    """A path's name as a label, which holds neither dot nor slash."""
+    stem = path.resolve().name.removesuffix(".estimates.mcap").removesuffix(path.suffix)
+    return re.sub(r"[^\w:=+-]+", "-", stem).strip("-") or "side"
+
+
+def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
+    """The estimators of a replay."""
+    runs = list(map(key_of, done.logs))
+    for run in runs:
+        if runs.count(run) > 1:
+            raise BadInput(f"{run}: two of the logs are of this run; give each run once")
+    pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))
+    stated = done.done.parameters
+
+    def side(label: str, name: str) -> Side:
+        settings = settings_of(done.logs[0], label, stated.get(label, {}))
+        return replace(measured(name, label, pairs, gap_limit_s, settings), replay=done)
+
+    return Given(name, list(done.settings), side, {run: log for run, (log, _) in pairs.items()})
+
+
+def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
+    """The estimators of an estimates log, or of a folder of them: a run each.
+
+    Raises BadInput where there are none, or a log that they are of is not there.
+    """
+    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    if not files:
+        raise BadInput(f"{path}: holds no estimates logs (*.mcap) and is no result of fuselog run")
+    pairs: dict[str, tuple[Source, Source]] = {}
+    for file in files:
+        log = open_log(file, recover=recover)
+        if not labels_of(LogSource(log)):
+            raise BadInput(f"{file}: holds no estimates; say what to replay it with: -e ekf -e ukf")
+        source = LogSource(open_log(log_of_estimates(log), recover=recover))
+        check_same_run(LogSource(log), source)
+        run = key_of(source)
+        if run in pairs:
+            raise BadInput(f"{file}: {pairs[run][1].name} has estimates of {run} too; give one of them")
+        pairs[run] = source, LogSource(log)
+    log_of_first, first = next(iter(pairs.values()))
+    stated = stated_estimators(first)
+
+    def side(label: str, name: str) -> Side:
+        own = {run: pair for run, pair in pairs.items() if label in labels_of(pair[1])}
+        return measured(
+            name, label, own, gap_limit_s, settings_of(log_of_first, label, stated.get(label, {}))
+        )
+
+    return Given(name_of(path), labels_of(first), side, {run: log for run, (log, _) in pairs.items()})
+
+
+def labels_of(estimates: Source) -> list[str]:
+    """The estimators of an estimates log."""
+    topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
+    return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
+
+
+def of_result(folder: Path, progress: Progress) -> Given:
+    """The estimators of a result folder, replayed from its settings.
+
+    A result holds RMSE and NEES of every run, but not every metric. Where a replay by this version gives
+    the same rows, it gives the other metrics too; where it does not, the rows of the result count.
+    """
+    result = read_result(folder)
+    tables = {name: folder / "tables" / f"{name}.parquet" for name in ("runs", "times")}
+    if not all(path.is_file() for path in tables.values()):
+        raise BadInput(
+            f"{folder}: its study {result.settings.get('study', result.experiment)} keeps no row for "
+            "each run; compare its estimates logs"
+        )
+    rows, times = (pd.read_parquet(path) for path in tables.values())
+    stated = result.settings.get("parameters", {})
+    numbers = sorted(set(rows["run"]))
+    runs = {number: _run_of_result(result, number) for number in numbers}
+    rows, times = (table.assign(run=table["run"].map(runs)) for table in (rows, times))
+
+    def side(label: str, name: str) -> Side:
+        kept = _stored(rows, times, label, name, _settings_of_result(result, label, stated))
+        try:
+            again = _replayed(folder, result, progress, kept)
+        except BadInput as error:
+            return replace(kept, notes=(_without_replay(folder, str(error)),))
+        difference = _row_that_differs(kept, again)
+        return replace(kept, notes=(_without_replay(folder, difference),)) if difference else again
+
+    labels = list(dict.fromkeys(rows["estimator"]))
+    return Given(name_of(folder), labels, side)
+
+
+def _run_of_result(result: Result, number: int) -> str:
+    """The key of a result's run; see `key_of`."""
+    settings = result.settings
+    if "record" in settings:
+        recorder, _, _ = load_scenario(settings["record"]["scenario"])
+        return f"{recorder}, seed {settings['seed']}, run {number}"
+    logs = settings.get("logs", [])
+    files = logs.get("files", []) if isinstance(logs, dict) else logs
+    return Path(files[number]).name if number < len(files) else f"run {number}"
+
+
+def _without_replay(folder: Path, why: str) -> str:
+    return f"{folder}: RMSE and NEES are compared as the result has them, without other metrics: {why}"
+
+
+def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
+    deciding = {name: result.settings[name] for name in DECIDING if name in result.settings}
+    return flat(deciding | {"estimator": stated.get(label, {})})
+
+
+def _stored(
+    rows: pd.DataFrame, times: pd.DataFrame, label: str, name: str, settings: Mapping[str, Any]
+) -> Side:
+    """The side of a result's own tables."""
+    own = rows[rows["estimator"] == label].drop(columns=["estimator", "estimates"])
+    components = [column for column in map(str, own) if column.startswith("rmse_")]
+    sizes = {
+        ("nees", str(case)): float(of_case[components].notna().any().sum())
+        for case, of_case in own.groupby("case")
+    }
+    in_position = [f"rmse_{component}" for component in POSITION]
+    named = {column: rmse_of(column.removeprefix("rmse_")) for column in components}
+    values = (
+        own.drop(columns=[column for column in in_position if column in own])
+        .rename(columns=named)
+        .melt(["case", "run"], var_name="quantity")
+        .dropna()
+    )
+    return Side(name, label, values, times[times["estimator"] == label], sizes, settings)
+
+
+def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> Side:
+    """What was kept of a result made again, a part of the runs at a time."""
+    label = kept.label
+    if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
+        raise BadInput("its settings do not say how to replay it")
+    fields = {each.alias or name for name, each in Experiment.model_fields.items()}
+    entries = {key: value for key, value in result.settings.items() if key in fields}
+    experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")
+    data = result.settings.get("data")
+    setting = Setting(folder, folder, data=Path(data) if data else None)
+    if experiment.import_ and setting.data is None:
+        raise BadInput("its settings do not say where its data are")
+    runner = Runner(experiment, setting)
+    parts: list[Side] = []
+    chosen = {label: experiment.estimators[label]}
+    for now in progress(list(parts_of(experiment.runs)), f"replaying {label} of {folder}", None):
+        done = replay(
+            runner.obtain(first_run=now.start, runs=now.stop - now.start),
+            [chosen],
+            gap_limit_s=experiment.gap_limit_s,
+            arrival_order=bool(experiment.arrival_order),
+            late=experiment.late,
+        )
+        runs = [_run_of_result(result, number) for number in range(now.start, now.stop)]
+        pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))
+        part = measured(kept.name, label, pairs, experiment.gap_limit_s, kept.settings)
+        parts.append(replace(part, replay=done) if not parts else replace(part, pairs={}))
+    first = parts[0]
+    return replace(
+        first,
+        rows=joined(each.rows for each in parts),
+        times=joined(each.times for each in parts),
+        truths={run: truth for each in parts for run, truth in each.truths.items()},
+    )
+
+
+def _row_that_differs(kept: Side, again: Side) -> str:
+    """A sentence where a replay does not give what a result has."""
+    both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
+    apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
+    if len(both) < len(kept.rows):
+        return "a replay does not give all of its rows"
+    if not apart.any():
+        return ""
+    row = both[apart].iloc[0]
+    return (
+        f"replayed now, {row['quantity']} of {kept.label}, {row['run']} is {row['value_again']:.6g}, "
+        f"not {row['value']:.6g}; the code has changed since"
+    )
+
+
+def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: float) -> Given:
+    """A trajectory file as the estimates of a run, judged by one of its truths."""
+    trajectory = read_trajectory(path)
+    name = name_of(path)
+    truth = source.read([truth_topic])[truth_topic]
+    case = truth_topic.rpartition("/")[0].removeprefix("/")
+    topic = "/".join(filter(None, ("/estimates", name, case, "pose")))
+    stream = estimates_of(trajectory, topic, truth)
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    pairs: Pairs = {key_of(source): (source, MemorySource({topic: stream}, run, str(path)))}
+
+    def side(label: str, name: str) -> Side:
+        found = measured(name, label, pairs, gap_limit_s, {})
+        return replace(found, notes=trajectory.notes)
+
+    return Given(name, [name], side)

@@ -1,0 +1,75 @@
+"""The study of tuning where the truth of the noise is not known: values are judged on other vehicles.
+
+The log's vehicles are parted: some tune the experiment's one estimator by likelihood, from its settings
+or what the log states; others, held out, are replayed with either values.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+from pipeline.ensemble import hash_streams
+from pipeline.experiment import Experiment, Setting, Study
+from pipeline.results import Outcome
+from pipeline.runner import Runner
+from pipeline.studies.localization import summarise
+from pipeline.tuning.outcome import START, TUNED
+from pipeline.tuning.tuning import tune
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.sources import MemorySource
+
+
+class HeldOutOptions(Parameters):
+    """What is searched for, and by the first word of their topics which vehicles tune and judge it."""
+
+    free: tuple[str, ...] = ()
+    tuned_by: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.experiment.Study`."""
+    options: HeldOutOptions = setting.options
+    if not (options.free and options.tuned_by and options.held_out and len(experiment.estimators) == 1):
+        raise BadInput(
+            f"experiment '{experiment.title}': give one estimator, and options.free, tuned_by, held_out"
+        )
+    [source] = Runner(experiment, setting).obtain()
+    found = tune(
+        _without(source, options.held_out),
+        dict(experiment.estimators),
+        options.free,
+        validate=_without(source, options.tuned_by),
+        gap_limit_s=experiment.gap_limit_s,
+    )
+    outcome = Outcome(tables={"parameters": found.parameters}, input_sha256=hash_streams([source]))
+    for each in found.replays:
+        judged = summarise(each.judge)
+        outcome.metrics |= judged.metrics
+        outcome.bounds |= judged.bounds
+    for row in found.parameters.to_dict("records"):
+        outcome.metrics[f"{TUNED}.{row['parameter']}"] = row["value"]
+        outcome.metrics[f"{START}.{row['parameter']}"] = row["start"]
+    assert found.held_out_costs is not None
+    for label, cost in zip((START, TUNED), found.held_out_costs, strict=True):
+        outcome.metrics[f"{label}-held-out.open_gate_log_likelihood"] = -cost
+    return outcome
+
+
+def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
+    """A log without the topics of some vehicles; raises BadInput where it has none of one of them."""
+    found = {topic.split("/")[1] for topic in source.streams}
+    for vehicle in vehicles:
+        if vehicle not in found:
+            raise BadInput(f"{source.name}: no topic begins with /{vehicle}/; there are {sorted(found)}")
+    kept = {
+        topic: stream for topic, stream in source.streams.items() if topic.split("/")[1] not in vehicles
+    }
+    return replace(source, streams=kept)
+
+
+TUNING_HELD_OUT = Study(
+    "noise tuned by maximum likelihood on some vehicles of a log, and judged on others",
+    study,
+    HeldOutOptions,
+)

@@ -1,0 +1,197 @@
+"""Mixtures on the torus, fitted by maximum likelihood: wrapped normals and von Mises densities.
+
+Angles (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximisation over components
+and turns; one of bivariate von Mises densities by its gradient, from the mixture of wrapped normals.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import i0e, i1e, log_softmax, logsumexp
+from sklearn.cluster import KMeans
+
+from recorders.errors import BadInput
+from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats
+
+Interaction = Literal["sine", "cosine"]
+
+# As many standard deviations of a component are told from none.
+_REACH = 6.0
+# A variance (rad^2) below which no component goes, so that none shrinks to a single sample: (1 deg)^2.
+_LEAST_VARIANCE = np.radians(1.0) ** 2
+_MOST_CONCENTRATION = 500.0
+_NODES = 2.0 * np.pi / 1024 * np.arange(1024)
+
+
+class WrappedMixture(NamedTuple):
+    """Wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of the angles unwrapped."""
+
+    weights: Floats
+    mean: Floats
+    covariance: Floats
+
+    def log_density(self, angles: Floats) -> Floats:
+        """At every angle, (n,)."""
+        return np.asarray(logsumexp(_log_parts(self, angles)[0], axis=(1, 2)))
+
+
+class VonMisesMixture(NamedTuple):
+    """Bivariate von Mises densities of one kind.
+
+    exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, a and b the deviations from the mean
+    (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular variables", 2002), or with
+    k3 cos(a - b) in place of the product of sines (Mardia, Taylor, Subramaniam, "Protein bioinformatics
+    and mixtures of bivariate von Mises distributions for angular data", 2007).
+
+    Attributes:
+        weights: (k,).
+        mean: (k, 2).
+        concentration: k1, k2, k3 of every component, (k, 3).
+        interaction: which of the two.
+    """
+
+    weights: Floats
+    mean: Floats
+    concentration: Floats
+    interaction: Interaction
+
+    def log_density(self, angles: Floats) -> Floats:
+        """At every angle, (n,)."""
+        log_norm, _ = _normalisation(self.concentration, self.interaction)
+        features = _features(angles, self.mean, self.interaction)[0]
+        parts = np.log(self.weights) + (features * self.concentration).sum(axis=2) - log_norm
+        return np.asarray(logsumexp(parts, axis=1))
+
+
+def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) -> WrappedMixture:
+    """The most likely wrapped normals near the clusters that k-means finds.
+
+    With one component it is the maximum-likelihood fit of a wrapped normal. Raises BadInput where there
+    are fewer than ten angles a component.
+    """
+    if len(angles) < 10 * components:
+        raise BadInput(f"{len(angles)} pairs of angles for {components} components; give 10 for each")
+    embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+    labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
+    share = np.eye(components)[labels]
+    mean = np.angle(share.T @ np.exp(1j * angles))
+    now = WrappedMixture(share.mean(axis=0), mean, np.tile(np.eye(2), (components, 1, 1)))
+    likelihood = -np.inf
+    for _ in range(iterations):
+        parts, deviations = _log_parts(now, angles)
+        of_angle = logsumexp(parts, axis=(1, 2), keepdims=True)
+        before, likelihood = likelihood, float(of_angle.sum())
+        if likelihood - before < 1e-7 * len(angles):
+            break
+        share = np.exp(parts - of_angle)  # of component and turn, (n, k, turns)
+        count = share.sum(axis=(0, 2))
+        shift = np.stack([(share * each).sum(axis=(0, 2)) / count for each in deviations], axis=1)
+        first, second = (each - of[:, None] for each, of in zip(deviations, shift.T, strict=True))
+        c11, c12, c22 = (
+            (share * product).sum(axis=(0, 2)) / count
+            for product in (first * first, first * second, second * second)
+        )
+        covariance = np.moveaxis(np.array([[c11, c12], [c12, c22]]), 2, 0) + _LEAST_VARIANCE * np.eye(2)
+        now = WrappedMixture(count / len(angles), wrap_angle(now.mean + shift), covariance)
+    return now
+
+
+def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Logarithms of weighted densities (n, k, turns), and both deviations from the means, as many."""
+    (c11, c12), (_, c22) = np.moveaxis(mixture.covariance, 0, 2)[..., None]
+    determinant = c11 * c22 - c12**2
+    most = int(_REACH * np.sqrt(max(c11.max(), c22.max())) / (2.0 * np.pi) + 0.5)
+    turns = 2.0 * np.pi * np.arange(-most, most + 1)
+    offsets = np.stack(np.meshgrid(turns, turns, indexing="ij"), axis=-1).reshape(-1, 2)
+    nearest = wrap_angle(angles[:, None] - mixture.mean)[:, :, None]
+    first, second = nearest[..., 0] + offsets[:, 0], nearest[..., 1] + offsets[:, 1]
+    square = (c22 * first**2 - 2.0 * c12 * first * second + c11 * second**2) / determinant
+    norm = np.log(mixture.weights)[:, None] - np.log(2.0 * np.pi) - 0.5 * np.log(determinant)
+    return norm - 0.5 * square, (first, second)
+
+
+def fit_von_mises_mixture(
+    angles: Floats, interaction: Interaction, start: WrappedMixture
+) -> VonMisesMixture:
+    """The most likely von Mises densities, as many as the wrapped normals that the search begins at."""
+    k = len(start.weights)
+    precision = np.linalg.inv(start.covariance)
+    third = -precision[:, 0, 1]
+    own = np.diagonal(precision, axis1=1, axis2=2) - (third[:, None] if interaction == "cosine" else 0.0)
+    own = np.clip(own, 0.05, 0.9 * _MOST_CONCENTRATION)
+    scale = np.sqrt(own.prod(axis=1))
+    low, high = (-0.99, 0.99) if interaction == "sine" else (-0.49, 4.0)
+    begin = [np.log(start.weights), start.mean.ravel(), np.log(own).ravel()]
+    begin.append(np.clip(third / scale, 0.9 * low, 0.9 * high))
+    bounds = [
+        *[(None, None)] * (3 * k),
+        *[(np.log(0.01), np.log(_MOST_CONCENTRATION))] * (2 * k),
+        *[(low, high)] * k,
+    ]
+
+    def unpacked(x: Floats) -> VonMisesMixture:
+        logits, mean, logs, third = np.split(x, np.cumsum([k, 2 * k, 2 * k]))
+        own = np.exp(logs.reshape(k, 2))
+        third = third * np.sqrt(own.prod(axis=1))
+        concentration = np.concatenate([own, third[:, None]], axis=1)
+        weights = np.exp(log_softmax(logits))
+        return VonMisesMixture(weights, wrap_angle(mean.reshape(k, 2)), concentration, interaction)
+
+    def cost(x: Floats) -> tuple[float, Floats]:
+        mixture = unpacked(x)
+        kappa = mixture.concentration
+        log_norm, expected = _normalisation(kappa, interaction)
+        features, slopes = _features(angles, mixture.mean, interaction)
+        parts = np.log(mixture.weights) + (features * kappa).sum(axis=2) - log_norm
+        of_angle = logsumexp(parts, axis=1, keepdims=True)
+        share = np.exp(parts - of_angle)  # (n, k)
+        logits = share.sum(axis=0) - len(angles) * mixture.weights
+        mean = -np.einsum("nk,nkfd,kf->kd", share, slopes, kappa)
+        by_kappa = np.einsum("nk,nkf->kf", share, features - expected)
+        # k3 = r sqrt(k1 k2): half of its slope goes to the logarithm of each
+        logs = by_kappa[:, :2] * kappa[:, :2] + 0.5 * (by_kappa[:, 2] * kappa[:, 2])[:, None]
+        third = by_kappa[:, 2] * np.sqrt(kappa[:, 0] * kappa[:, 1])
+        slope = np.concatenate([logits, mean.ravel(), logs.ravel(), third])
+        return -float(of_angle.sum()), -slope
+
+    found = minimize(cost, np.concatenate(begin), jac=True, method="L-BFGS-B", bounds=bounds)
+    return unpacked(found.x)
+
+
+def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
+    """What concentrations weigh (n, k, 3), and its slopes (n, k, 3, 2) in the deviations."""
+    a, b = np.moveaxis(angles[:, None] - mean, -1, 0)
+    none = np.zeros_like(a)
+    if interaction == "sine":
+        third, slope = np.sin(a) * np.sin(b), [np.cos(a) * np.sin(b), np.sin(a) * np.cos(b)]
+    else:
+        third, slope = np.cos(a - b), [-np.sin(a - b), np.sin(a - b)]
+    slopes = [[-np.sin(a), none], [none, -np.sin(b)], slope]
+    features = np.stack([np.cos(a), np.cos(b), third], axis=-1)
+    return features, np.moveaxis(np.array(slopes), (0, 1), (2, 3))
+
+
+def _normalisation(kappa: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
+    """Logarithms (k,) of the integrals, and their slopes in the concentrations (k, 3).
+
+    Over the second angle the integral is a Bessel function; over the first, a sum over equal steps,
+    which for a smooth periodic function is exact to rounding.
+    """
+    k1, k2, k3 = kappa.T[:, :, None]
+    if interaction == "sine":
+        along, across = k2 + 0.0 * _NODES, k3 * np.sin(_NODES)
+    else:  # k2 cos b + k3 cos(a - b)
+        along, across = k2 + k3 * np.cos(_NODES), k3 * np.sin(_NODES)
+    radius = np.maximum(np.hypot(along, across), 1e-12)
+    exponents = k1 * np.cos(_NODES) + radius + np.log(i0e(radius))
+    log_norm = logsumexp(exponents, axis=1) + 2.0 * np.log(2.0 * np.pi) - np.log(len(_NODES))
+    share = np.exp(exponents - logsumexp(exponents, axis=1, keepdims=True))
+    length = i1e(radius) / i0e(radius) / radius  # E[(cos b, sin b)] = length (along, across)
+    second, sine = length * along, length * across
+    third = np.sin(_NODES) * sine
+    if interaction == "cosine":
+        third = np.cos(_NODES) * second + third
+    slopes = [(share * each).sum(axis=1) for each in (np.cos(_NODES), second, third)]
+    return log_norm, np.stack(slopes, axis=1)

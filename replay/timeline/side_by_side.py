@@ -1,0 +1,81 @@
+"""Estimators side by side: a family's scenes once for each, and by how much one is farther off.
+
+The family has drawn everything once: a scene beside the other shows the same entities, but for those of
+the other estimators. So colours, cursor and all else are the same in both.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from uuid import uuid4
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from replay.judging.evaluation import Errors, Floats
+from replay.timeline.canvas import Canvas, Scene, entity_path, escaped
+from replay.timeline.plots import LINE, draw_curve, plot_view
+
+Board = rrb.Container | rrb.View
+
+
+def draw_side_by_side(
+    canvas: Canvas, scene: Scene, layout: Board, estimators: Sequence[str]
+) -> rrb.Container:
+    """The layout with a scene for each estimator, above the differences of their errors."""
+    plots = [view for case in scene.cases for view in _draw_differences(canvas, scene, case, estimators)]
+    board = _split(layout, estimators)
+    if not plots:
+        return board if isinstance(board, rrb.Container) else rrb.Horizontal(board)
+    return rrb.Vertical(board, rrb.Tabs(*plots), row_shares=[4.0, 1.0])
+
+
+def _split(layout: Board, estimators: Sequence[str]) -> Board:
+    """The layout, with every view of a scene split by estimator."""
+    if isinstance(layout, rrb.Container):
+        layout.contents = [
+            _split(each, estimators) if isinstance(each, rrb.Container | rrb.View) else each
+            for each in layout.contents
+        ]
+        return layout
+    if not isinstance(layout, rrb.Spatial2DView | rrb.Spatial3DView):
+        return layout
+    return rrb.Horizontal(*(_alone(layout, each, estimators) for each in estimators), name=layout.name)
+
+
+def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.View:
+    """A view of the same scene without the other estimators."""
+    shown = [str(each) for each in np.atleast_1d(np.asarray(view.contents))]
+    roots = [each.removesuffix("/**") for each in shown if each.endswith("/**")]
+    hidden = [
+        f"- {root}/{escaped(other)}/**" for root in roots for other in estimators if other != estimator
+    ]
+    alone = copy(view)
+    alone.id, alone.contents, alone.name = uuid4(), [*shown, *hidden], f"{estimator}: {view.name}"
+    return alone
+
+
+def _draw_differences(
+    canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
+) -> list[rrb.TimeSeriesView]:
+    """By how much the errors of the others are larger than the first's, at the stamps that both have."""
+    found = {errors.estimator: errors for errors in scene.errors_of(case)}
+    first = found.get(estimators[0])
+    plot, drawn = entity_path("plots", case, "difference"), False
+    for estimator in estimators[1:]:
+        other = found.get(estimator)
+        if first is None or other is None:
+            continue
+        time_ns, here, there = np.intersect1d(first.time_ns, other.time_ns, return_indices=True)
+        larger = _sizes(other)[there] - _sizes(first)[here]
+        name = f"{estimator} - {estimators[0]}"
+        draw_curve(canvas, plot, name, scene.colour(estimator), time_ns, larger, LINE)
+        drawn = drawn or len(time_ns) > 0
+    title = " ".join(filter(None, (case, "difference of the errors' size")))
+    return [plot_view(plot, title)] if drawn else []
+
+
+def _sizes(errors: Errors) -> Floats:
+    """How large the error of the main quantity is (n,)."""
+    _, columns, scale = errors.main
+    sizes: Floats = scale * np.linalg.norm(errors.error[:, columns], axis=1)
+    return sizes

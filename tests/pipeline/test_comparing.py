@@ -1,0 +1,184 @@
+"""Comparing: what two sides are made of, what is said of them, what is refused."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import rerun.blueprint as rrb
+
+import fuselog as fl
+from replay.timeline.side_by_side import _alone
+
+Fuselog = Callable[..., Any]
+RUNS = 8
+TIGHT = {"kind": "ekf", "sigma_range_m": 0.05, "sigma_bearing_rad": 0.01}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Short runs of one seed."""
+    folder = tmp_path_factory.mktemp("logs")
+    paths = [folder / f"run-{run}.mcap" for run in range(RUNS)]
+    for run, path in enumerate(paths):
+        fl.write(path, fl.record("landmarks", seed=2, run=run, duration_s=8.0))
+    return paths
+
+
+@pytest.fixture(scope="module")
+def estimates(logs: list[Path], fuselog: Fuselog) -> Path:
+    """The estimates logs of all runs."""
+    folder = logs[0].parent / "estimates"
+    said = fuselog(
+        "replay", *logs, "-e", "ekf", "-e", "ukf", "--set", "gate_probability=1", "--out", folder
+    )
+    assert said.code == 0, said.err
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result folder of the same runs' scenario."""
+    folder = tmp_path_factory.mktemp("results") / "landmarks"
+    fl.run("landmarks", runs=RUNS, seed=2, out=folder, logs=1, set={"duration_s": 8.0})
+    return folder
+
+
+def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: Path) -> None:
+    found = fl.compare(*logs, estimators=["ekf", {"tight": TIGHT}])
+    row = found.table.query("quantity == 'nees'").iloc[0]
+    assert (row["verdict"], row["runs"], row["aim"]) == ("worse", RUNS, "3")
+    assert 0 < row["low"] < row["difference"] < row["high"]
+    # what is compared are the metrics of every run
+    own = [fl.replay(log, [{"tight": TIGHT}], metrics="consistency").metrics for log in logs[:2]]
+    nees = [each.query("quantity == 'nees'")["value"].item() for each in own]
+    judged = found.groups[0][1].rows.query("quantity == 'nees'")["value"].tolist()
+    assert judged[:2] == nees
+    assert row["second_mean"] == pytest.approx(np.mean(judged))
+    saved = found.save(tmp_path / "out")
+    assert (saved.folder / "timeline.rrd").stat().st_size > 10_000
+    assert saved.metrics.query("quantity == 'nees_difference'")["value"].item() == row["difference"]
+    times = saved.tables["times"].query("quantity == 'nees'")
+    assert (times["low"] > 0).mean() > 0.5
+    assert any("sigma_range_m" in note for note in found.notes)
+
+
+def test_a_result_gives_what_its_estimates_logs_and_a_replay_give(
+    result: Path, estimates: Path, logs: list[Path]
+) -> None:
+    """Three ways to one comparison."""
+    ways = [
+        fl.compare(result, estimators=["ekf", "ukf"]),
+        fl.compare(estimates, estimators=["ekf", "ukf"]),
+        fl.compare(*logs, estimators=[{label: {"gate_probability": 1.0}} for label in ("ekf", "ukf")]),
+    ]
+    tables = [way.table.drop(columns=["most_from_s", "most_to_s"]) for way in ways]
+    for table in tables[1:]:
+        assert table["quantity"].tolist() == tables[0]["quantity"].tolist()
+        numbers = [each.select_dtypes("number").to_numpy() for each in (table, tables[0])]
+        np.testing.assert_allclose(*numbers, rtol=1e-9, atol=1e-12)
+    assert "worse" not in tables[0]["verdict"].tolist()
+
+
+def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one from before a change of the code: its own rows count, not those of today."""
+    import pipeline.comparing.sides as sides
+
+    def changed(*logs: Any, **options: Any) -> Any:
+        wrong = [{label: {"sigma_range_m": 0.2} if label == "ekf" else {}} for label in logs[1][0]]
+        return fl.replay(logs[0], wrong, **options)
+
+    kept = fl.compare(result, result, estimators=["ekf"])
+    assert set(kept.table["verdict"]) == {"no difference"}
+    monkeypatch.setattr(sides, "replay", changed)
+    found = fl.compare(result, estimators=["dead-reckoning", "ekf"])
+    [note] = [each for each in found.notes if "replayed now" in each]
+    assert "of ekf" in note
+    rows = found.groups[0][1].rows
+    stored = pd.read_parquet(result / "tables" / "runs.parquet").query("estimator == 'ekf'")
+    nees = rows.query("quantity == 'nees'")["value"].tolist()
+    assert nees == stored["nees"].tolist()
+    assert found.groups[0][1].sizes == {("nees", "robot1"): 3.0}
+
+
+def test_a_trajectory_is_compared_like_estimates(
+    estimates: Path, fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """As somebody else's tool wrote it: the same errors, without NEES."""
+    log = estimates / "run-0.estimates.mcap"
+    assert fuselog("export", log, "--to", "tum", "--out", tmp_path / "tum").code == 0
+    [file] = (tmp_path / "tum").glob("*ukf*")
+    found = fl.compare(log, file, estimators=["ekf"])
+    row = found.table.query("quantity == 'position_rmse_m'").iloc[0]
+    own = fl.compare(log, estimators=["ekf", "ukf"]).table.query("quantity == 'position_rmse_m'").iloc[0]
+    assert row["difference"] == pytest.approx(own["difference"], rel=1e-6)
+    assert row["verdict"] == "unclear"
+    assert "takes 5 runs or more, and there is 1 run" in found.sentences[0]
+    assert "nees" not in set(found.table["quantity"])
+    found.draw(tmp_path / "both.rrd")
+    other = fl.compare(file, file, truth=file).table
+    assert set(other["second_mean"]) <= {0.0}
+
+
+def test_what_is_not_alike_is_said(logs: list[Path], estimates: Path, fuselog: Fuselog) -> None:
+    folder = estimates.parent / "others"
+    fuselog("replay", *logs[:6], "-e", "ekf", "--set", "sigma_range_m=0.2", "--out", folder)
+    said = fuselog("compare", estimates, folder, "-e", "ekf", "--json")
+    assert said.code == 0
+    notes = " ".join(said.json["notes"])
+    assert "only estimates has 2 runs, left out: landmarks, seed 2, run 6" in notes
+    assert "estimator.sigma_range_m" in notes
+    assert {row["runs"] for row in said.json["differences"]} == {6}
+    json.dumps(said.json)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["LOG"], "name two estimators"),
+        (["LOG", "-e", "ekf"], "has only ekf"),
+        (["ESTIMATES", "LOG", "-e", "ekf"], "is a log without estimates; fuselog replay makes them"),
+        (["ESTIMATES", "-e", "ekf", "-e", "ukff"], "did you mean 'ukf'"),
+        (["ONE", "TWO", "-e", "ekf"], "have no run in common"),
+        (["EMPTY", "ESTIMATES"], "holds no estimates logs"),
+        (["ESTIMATES", "TEXT", "-e", "ekf"], "a trajectory file is of one run"),
+    ],
+)
+def test_bad_input(
+    arguments: list[str],
+    sentence: str,
+    logs: list[Path],
+    estimates: Path,
+    fuselog: Fuselog,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "empty").mkdir()
+    text = tmp_path / "text.txt"
+    text.write_text("0 1 2 3 0 0 0 1\n", encoding="utf-8")
+    places = {
+        "LOG": logs[0],
+        "ESTIMATES": estimates,
+        "ONE": estimates / "run-0.estimates.mcap",
+        "TWO": estimates / "run-1.estimates.mcap",
+        "EMPTY": tmp_path / "empty",
+        "TEXT": text,
+    }
+    said = fuselog("compare", *(places.get(each, each) for each in arguments))
+    assert said.code == 2
+    assert sentence in said.err
+    assert "Traceback" not in said.err
+
+
+def test_a_scene_beside_another_leaves_the_other_out() -> None:
+    view = rrb.Spatial2DView(origin="/", contents=["map/robot1/**", "map/landmarks/**"], name="Map")
+    alone = _alone(view, "ekf", ["ekf", "ukf:2"])
+    assert alone.name == "ekf: Map"
+    assert alone.id != view.id
+    shown = [str(each) for each in alone.contents]
+    assert shown[:2] == ["map/robot1/**", "map/landmarks/**"]
+    assert shown[2] == "- map/robot1/ukf\\:2/**"

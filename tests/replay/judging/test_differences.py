@@ -1,0 +1,73 @@
+"""Paired differences: intervals that hold, verdicts that follow from them."""
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.comparing.sides import Side, of_replay
+from replay.judging.differences import aim_of, paired_difference
+
+PAIRS, RUNS = 200, 50
+CALLED = ("better", "worse", "higher", "lower")
+
+
+@pytest.fixture(scope="module")
+def alike() -> Side:
+    """An EKF over 300 runs: any 50 of them are as good as any others."""
+    logs = [fl.record("landmarks", seed=11, run=run, duration_s=5.0) for run in range(300)]
+    return of_replay("alike", fl.replay(logs, ["ekf"]), 0.2).side("ekf", "ekf")
+
+
+@pytest.mark.paper
+def test_of_pairs_without_a_difference_five_in_a_hundred_are_called(alike: Side) -> None:
+    """A against A with margin 0, 200 times: 2 to 9 % for each metric that varies."""
+    table = alike.rows.pivot(index="run", columns="quantity", values="value")
+    table = table.loc[:, table.nunique() > 10]
+    assert {"nees", "position_rmse_m", "heading_rmse_rad", "nis_per_component"} <= set(table)
+    random = np.random.default_rng(3)
+    splits = [random.permutation(len(table))[: 2 * RUNS].reshape(2, RUNS) for _ in range(PAIRS)]
+    shares = {}
+    for quantity in table:
+        values = table[quantity].to_numpy()
+        aim = alike.sizes.get((str(quantity), "robot1"), aim_of(str(quantity)))
+        verdicts = [paired_difference(*values[split], aim, 0.0).verdict for split in splits]
+        shares[quantity] = np.mean(np.isin(verdicts, CALLED))
+    assert all(0.02 <= share <= 0.09 for share in shares.values()), shares
+
+
+def test_a_verdict_says_where_the_interval_lies() -> None:
+    random = np.random.default_rng(0)
+    first = random.normal(10.0, 1.0, 40)
+    second = first + random.normal(1.0, 0.1, 40)
+    found = paired_difference(first, second, "low", 0.02)
+    assert found.verdict == "worse"
+    assert found.low < found.difference < found.high
+    assert found.difference == pytest.approx(1.0, abs=0.06)
+    # Student's interval of the same differences, which are normal
+    apart = second - first
+    half = 2.0227 * apart.std(ddof=1) / np.sqrt(40)
+    assert [found.low, found.high] == pytest.approx(
+        [apart.mean() - half, apart.mean() + half], abs=0.006
+    )
+    assert paired_difference(first, second, "high", 0.02).verdict == "better"
+    assert paired_difference(second, first, "low", 0.02).verdict == "better"
+    assert paired_difference(first, second, None, 0.02).verdict == "higher"
+    assert paired_difference(first, second, "low", 0.2).verdict == "no difference"
+    assert paired_difference(first, second, "low", found.difference / found.first).verdict == "unclear"
+    assert paired_difference(first, first, "low", 0.0).verdict == "no difference"
+
+
+def test_what_has_an_aim_is_judged_by_its_distance() -> None:
+    random = np.random.default_rng(1)
+    about = random.normal(0.0, 0.1, 40)
+    right, low, high = 3.0 + about, 2.5 + about[::-1], 3.5 + about[::-1]
+    assert paired_difference(right, high, 3.0, 0.02).verdict == "worse"
+    assert paired_difference(low, right, 3.0, 0.02).verdict == "better"
+    # as far below as above: which is higher is sure, which is better is not
+    assert paired_difference(6.0 - high, high, 3.0, 0.02).verdict == "higher"
+
+
+def test_few_runs_have_no_interval() -> None:
+    found = paired_difference(np.arange(4.0), np.arange(4.0) + 5.0, "low", 0.02)
+    assert found.verdict == "unclear"
+    assert np.isnan([found.low, found.high, found.sure]).all()
