@@ -10,7 +10,6 @@ from recorders.errors import BadInput
 from replay.engine.blocks import Block, Ragged, join
 from replay.engine.estimator import Recursive
 from replay.estimators.targets import Targets
-from replay.inference.binding import settings_type
 from replay.inference.track_smoothing import smooth_tracks
 
 
@@ -24,13 +23,8 @@ class State(NamedTuple):
 def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
     """The tracker, which keeps what it says until the end and says its tracks smoothed.
 
-    Raises BadInput where the motion of its targets is not linear, or they have several.
+    Its targets have one motion, which is linear.
     """
-    if targets.stage.modes or not targets.stage.motion.linear:
-        raise BadInput(
-            f"estimator {tracker.name}: smoothed tracks are of targets with one linear motion; leave "
-            "out smoothed, or take another model, or one of its modes"
-        )
 
     def start(whole: Mapping[str, Ragged]) -> State:
         return State(tracker.start(dict(whole)), ())
@@ -65,7 +59,7 @@ def _smoothed(tracks: Ragged, targets: Targets) -> Ragged:
     )
     mean, covariance = smooth_tracks(
         targets.stage,
-        settings_type(tuple(targets.numbers))(*targets.numbers.values()),
+        targets.parameters,
         track.ravel(),
         stream.publish_time_ns,
         stream["mean"],

@@ -303,7 +303,7 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     if motion.noise is not None and motion.noises:
         pieces.append(_entering_noise(motion.noise, motion.noises))
     elif motion.noise is not None:
-        pieces.append(_additive_noise(motion.noise, model.tangent))
+        pieces.append(_additive_noise(motion.noise, adding_noise(model.tangent, motion.noise_block)))
     if not pieces:
         return nothing
     return pieces[0] if len(pieces) == 1 else _both(*pieces)
@@ -342,9 +342,7 @@ def _entering_noise(variances: Function, noises: int) -> Function:
     return add
 
 
-def _additive_noise(noise: Function, tangent: int) -> Function:
-    add_noise = adding_noise(tangent)
-
+def _additive_noise(noise: Function, add_noise: Function) -> Function:
     def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         add_noise(covariance, noise(state, duration_s, parameters))
 

@@ -11,8 +11,6 @@ from replay.estimators.targets import TARGET
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, replay, replay_late, sensor
 from tests.replay.inference.replays import outputs
 
-MOTION = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
-
 
 @pytest.mark.parametrize("targets", [1, 2])
 def test_with_certain_association_a_track_is_smoothed_as_its_target_alone(
@@ -62,14 +60,16 @@ def test_smoothed_tracks_do_not_go_back_for_late_scans(uncompiled: None):
         replay_late(source, "rewind:1", smoothed=True)
 
 
+def test_what_cannot_be_smoothed_is_said(uncompiled: None):
+    motion = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
+    with pytest.raises(
+        BadInput, match=r"smoothed.*one linear motion; give mode = drive or manoeuvre or stand"
+    ):
+        replay(log(sensor("radar", RADAR, [0], [[]])), smoothed=True, model="vehicle", motion=motion)
+
+
 def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
     found = replay(log(sensor("radar", RADAR, range(3), [[], [], []])), smoothed=True)
     assert len(found["track"]) == 0
     assert found["set"]["elements"].tolist() == [0, 0, 0]
     assert found["set"].publish_time_ns[0] == SIMULATION_EPOCH_NS + 0 * SECOND
-
-
-def test_modes_are_not_smoothed(uncompiled: None):
-    source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
-    with pytest.raises(BadInput, match="smoothed tracks are of targets with one linear motion"):
-        replay(source, smoothed=True, model="vehicle", motion=MOTION)
