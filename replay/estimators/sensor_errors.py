@@ -30,33 +30,34 @@ class Errors(NamedTuple):
         names: of the components.
         sigma, correlation_s: of each, (errors,); a constant has infinity for the second.
         shared: how many are registration errors.
-        first: (sensors, 2), where each sensor's own begin, registration first; -1 for nowhere.
+        places: by sensor, where its errors stand among them: of a sort and a measured component, as
+            `registration_at_0`; -1 for nowhere.
     """
 
     names: tuple[str, ...]
     sigma: Floats
     correlation_s: Floats
     shared: int
-    first: Floats
+    places: list[dict[str, float]]
 
 
 def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
     """The errors that settings give their sensors a sigma for."""
     names: list[str] = []
-    sigmas, times = [], []
-    first, shared = np.full((len(sensors), len(BY_SORT)), -1.0), 0
-    for column, sort in enumerate(BY_SORT):
-        for row, (sensor, kind, values) in enumerate(zip(sensors, kinds, settings, strict=True)):
-            units = ["rad" if each == "angle" else "m" for each in kind.measured.values()]
-            own = [values[f"{sort}_sigma_{unit}"] for unit in units]
-            if not any(own):
-                continue
-            first[row, column] = len(names)
-            names += [f"{sensor.replace('-', '_')}_{sort}_{each}" for each in kind.measured]
-            sigmas += own
-            times += [np.inf if sort == "registration" else values["correlation_s"]] * len(own)
-        shared = shared if column else len(names)
-    return Errors(tuple(names), np.array(sigmas), np.array(times), shared, first)
+    sigmas, times, shared = [], [], 0
+    places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]
+    for sort in BY_SORT:
+        is_constant = sort == "registration"
+        for sensor, kind, values, own in zip(sensors, kinds, settings, places, strict=True):
+            for i, (component, of_kind) in enumerate(kind.measured.items()):
+                sigma = values[f"{sort}_sigma_{'rad' if of_kind == 'angle' else 'm'}"]
+                if sigma > 0.0:
+                    own[f"{sort}_at_{i}"] = len(names)
+                    names.append(f"{sensor.replace('-', '_')}_{sort}_{component}")
+                    sigmas.append(sigma)
+                    times.append(np.inf if is_constant else values["correlation_s"])
+                    shared += is_constant
+    return Errors(tuple(names), np.array(sigmas), np.array(times), shared, places)
 
 
 def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:

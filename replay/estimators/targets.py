@@ -112,9 +112,6 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
     if stage.modes:
         _, mode = switching_of(where, model, own)
     mean, sigma = _unknown(where, model, parameters.birth_sigma_mps)
-    if parameters.smoothed and (stage.modes or not stage.motion.linear):
-        modes = f"; give mode = {' or '.join(model.modes)}" if stage.modes and model.modes else ""
-        raise BadInput(f"{where}: smoothed tracks are those of one linear motion{modes}")
     return Targets(stage, own, Newborn(mean, np.diag(sigma**2), mode))
 
 

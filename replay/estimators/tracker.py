@@ -35,7 +35,7 @@ from replay.engine.failures import reason_stream
 from replay.engine.results import innovation_stream, named
 from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
-from replay.estimators.sensor_errors import BY_SORT, Errors, errors_of, with_errors
+from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
 from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
@@ -243,9 +243,10 @@ def settings_of(
     of_errors |= {
         f"{name}_s": each for name, each in zip(errors.names, errors.correlation_s, strict=True)
     }
-    for values, first in zip(by_sensor, errors.first, strict=True):
-        places = np.where(first < 0, -1.0, targets.stage.model.size + first)
-        values |= {f"{sort}_at": place for sort, place in zip(BY_SORT, places, strict=True)} | of_errors
+    size = targets.stage.model.size
+    for values, places in zip(by_sensor, errors.places, strict=True):
+        values |= {name: place if place < 0 else size + place for name, place in places.items()}
+        values |= of_errors
     return Settings(tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors)
 
 

@@ -206,17 +206,23 @@ def measuring(model: Model, kind: ScanSensor) -> Sensor:
     return Sensor(kind.leaf, kind.schema, kind.measured, measure)
 
 
-def adding_errors(components: int) -> Function:
-    """`add(rows, predicted, mean, parameters)`: the sensor's own errors, where the state has them.
+@lru_cache(maxsize=4)
+def errors_at(component: int) -> Function:
+    """`errors(parameters)`: where in the state errors of a measured component stand; -1 for nowhere."""
+    places = f"parameters.registration_at_{component}, parameters.correlated_at_{component}"
+    return function_of(f"def errors(parameters):\n    return {places}\n")
 
-    The parameters say where they begin, -1 for nowhere.
-    """
+
+def adding_errors(components: int) -> Function:
+    """`add(rows, predicted, mean, parameters)`: the errors that the state has of what is measured."""
+    of_first, of_second = errors_at(0), errors_at(1)
 
     def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
-        for first in (parameters.registration_at, parameters.correlated_at):
-            for i in range(components if first >= 0.0 else 0):
-                rows[i, int(first) + i] += 1.0
-                predicted[i] += mean[int(first) + i]
+        for i in range(components):
+            for place in of_first(parameters) if i == 0 else of_second(parameters):
+                if place >= 0.0:
+                    rows[i, int(place)] += 1.0
+                    predicted[i] += mean[int(place)]
 
     return add
 
@@ -275,39 +281,32 @@ def correlating(model: Model, kind: ScanSensor, corner: tuple[int, int]) -> Func
     """
     x, y = corner
     read_state, read_origin = tuple_of(model.size), tuple_of(2)
+    of_first, of_second = errors_at(0), errors_at(1)
     linearise = sensor_derivative(model, measuring(model, kind))
+
+    def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
+        """Move the position by so much of an error."""
+        mean[x] += by_x * mean[error]
+        mean[y] += by_y * mean[error]
+        for k in range(len(covariance)):
+            covariance[x, k] += by_x * covariance[error, k]
+            covariance[y, k] += by_y * covariance[error, k]
+        for k in range(len(covariance)):
+            covariance[k, x] += by_x * covariance[k, error]
+            covariance[k, y] += by_y * covariance[k, error]
 
     def correlate(
         mean: Floats, covariance: Floats, origin: Floats, parameters: Any, work: Workspace
     ) -> None:
-        if parameters.registration_at < 0.0 and parameters.correlated_at < 0.0:
-            return
         linearise(read_state(mean), read_origin(origin), parameters, work)
         a, b, c, d = work.rows[0, x], work.rows[0, y], work.rows[1, x], work.rows[1, y]
-        by_x, by_y = (
-            (-d / (a * d - b * c), b / (a * d - b * c)),
-            (c / (a * d - b * c), -a / (a * d - b * c)),
-        )
-        for first in (parameters.registration_at, parameters.correlated_at):
-            if first < 0.0:
-                continue
-            i, j = int(first), int(first) + 1
-            mean[x] += by_x[0] * mean[i] + by_x[1] * mean[j]
-            mean[y] += by_y[0] * mean[i] + by_y[1] * mean[j]
-            for column in range(len(covariance)):
-                if column not in (x, y):
-                    one, other = covariance[i, column], covariance[j, column]
-                    covariance[x, column] += by_x[0] * one + by_x[1] * other
-                    covariance[y, column] += by_y[0] * one + by_y[1] * other
-                    covariance[column, x], covariance[column, y] = (
-                        covariance[x, column],
-                        covariance[y, column],
-                    )
-            xx, xy, yy = covariance[i, i], covariance[i, j], covariance[j, j]
-            for row, left in ((x, by_x), (y, by_y)):
-                for column, right in ((x, by_x), (y, by_y)):
-                    covariance[row, column] += left[0] * (xx * right[0] + xy * right[1])
-                    covariance[row, column] += left[1] * (xy * right[0] + yy * right[1])
+        determinant = a * d - b * c
+        for place in of_first(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), -d / determinant, c / determinant)
+        for place in of_second(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), b / determinant, -a / determinant)
 
     return correlate
 

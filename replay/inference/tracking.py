@@ -36,7 +36,7 @@ from replay.inference.scanning import (
     updating,
 )
 from replay.inference.shared_bias import pool_errors
-from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion
+from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion, nothing
 from replay.inference.track_management import MANAGEMENTS, Evidence
 from replay.inference.tracks import NEVER, Tracks, are_near, drop, expected
 
@@ -49,8 +49,8 @@ class Tracker(NamedTuple):
         kinds: of sensors.
         association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
         names: the parameters that the parts read, in the order of the columns of the settings.
-        shared: which components of the state all tracks share, see `replay.inference.shared_bias`: the
-            first, and how many.
+        shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
+            `replay.inference.shared_bias`.
     """
 
     stage: Stage
@@ -58,7 +58,7 @@ class Tracker(NamedTuple):
     association: str
     management: str
     names: tuple[str, ...]
-    shared: tuple[int, int] = (0, 0)
+    shared: tuple[int, int]
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -177,11 +177,11 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     clutter_of = choosing([kind.clutter for kind in kinds], "detection, parameters")
     begins = tuple(kind.birth is not None for kind in kinds)
     shared_at, shared = tracker.shared
-    correlate = choosing(
-        [correlating(model, kind, corner) for kind in kinds if kind.birth is not None],
-        "mean, covariance, origin, parameters, work",
-    )
     births = [kind.birth for kind in kinds if kind.birth is not None]
+    correlate = nothing
+    if shared_at < model.size:
+        correlations = [correlating(model, kind, corner) for kind in kinds if kind.birth is not None]
+        correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
     birth_number = tuple(sum(begins[:k]) for k in range(len(kinds)))
     birth = choosing(births, "detection, origin, parameters")
     read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)

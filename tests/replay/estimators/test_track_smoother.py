@@ -60,14 +60,6 @@ def test_smoothed_tracks_do_not_go_back_for_late_scans(uncompiled: None):
         replay_late(source, "rewind:1", smoothed=True)
 
 
-def test_what_cannot_be_smoothed_is_said(uncompiled: None):
-    motion = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
-    with pytest.raises(
-        BadInput, match=r"smoothed.*one linear motion; give mode = drive or manoeuvre or stand"
-    ):
-        replay(log(sensor("radar", RADAR, [0], [[]])), smoothed=True, model="vehicle", motion=motion)
-
-
 def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
     found = replay(log(sensor("radar", RADAR, range(3), [[], [], []])), smoothed=True)
     assert len(found["track"]) == 0
