@@ -1,6 +1,8 @@
 """Comparing: what two sides are made of, what is said of them, what is refused."""
 
 import json
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -182,3 +184,28 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
     shown = [str(each) for each in alone.contents]
     assert shown[:2] == ["map/robot1/**", "map/landmarks/**"]
     assert shown[2] == "- map/robot1/ukf\\:2/**"
+
+
+@pytest.mark.paper
+def test_the_page(fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its commands give its table, and a check of what has not changed."""
+    page = (Path(__file__).parents[2] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    told = [fuselog(*shlex.split(line)) for line in re.findall(r"^fuselog (.*)$", page, re.MULTILINE)]
+    assert [each.code for each in told] == [0] * 5
+    row = r"^ (\w+) +(low|high|[\d.]+)((?: +-?[\d.]+){5}) +(\w+)((?: +\d+){2}) *$"
+    shown, printed = (
+        {
+            name: [aim, numbers, *rest]
+            for name, aim, numbers, *rest in re.findall(row, text, re.MULTILINE)
+        }
+        for text in (page, told[2].out)
+    )
+    assert len(shown) == 4
+    for name, (aim, numbers, *rest) in shown.items():
+        assert [aim, *rest] == [printed[name][0], *printed[name][2:]]
+        values = [float(each) for each in printed[name][1].split()]
+        assert [float(each) for each in numbers.split()] == pytest.approx(values, rel=2e-3)
+    assert "all 430 fields" in told[4].out
+    assert (tmp_path / "check.xml").exists()
+    assert {path.suffix for path in Path("compared").rglob("*")} >= {".rrd", ".svg", ".csv", ".json"}

@@ -1,6 +1,8 @@
 """Diagnosing: the reference sheet's gains, faults that are named, what is unusual, what is refused."""
 
 import json
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -198,7 +200,7 @@ def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> No
     assert found.kind == "divergence"
     assert found.time_ns is not None
     assert 245e9 < found.time_ns < 260e9
-    assert "after the measurement of 7" in found.words
+    assert "after range_m of 7" in found.words
     locked = well & ~((np.arange(400) >= 100) & (np.arange(400) < 160))
     told = list(of_innovations(innovations(rng.chisquare(1, 400), locked), 0.999, 0, has_outliers=True))
     assert [each.kind for each in told] == ["gate"]
@@ -304,3 +306,18 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert any(note.startswith("no truth: errors and NEES are left out") for note in found.notes)
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
+
+
+def test_the_worked_example_of_the_page(
+    fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its commands give its sentences; what they say to try leaves nothing to be found."""
+    page = (Path(__file__).parents[2] / "docs" / "diagnosing.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^fuselog (record|diagnose) (.*)$", page, re.MULTILINE)
+    told = [fuselog(command, *shlex.split(options)) for command, options in commands]
+    assert [(each.code, each.err) for each in told] == [(0, "")] * 3
+    block = re.search(r"^1\. .*?(?=```)", page, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    assert " ".join(block[0].split()) in " ".join(told[1].out.split())
+    assert "nothing found" in told[2].out
