@@ -466,6 +466,8 @@ def run_named(
     label, experiment = stated.name, stated.with_settings(values, over)
     if experiment.logs and data is not None and named[0].endswith(".mcap"):
         raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
+    if workers is not None or scheduler is not None:
+        experiment.require_campaign("leave out --workers and --scheduler")
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})

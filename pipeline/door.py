@@ -153,6 +153,8 @@ def run(
     """
     over = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
     name, found = load_experiment(str(experiment), set or {}, over)
+    if workers > 1 or scheduler is not None or executor is not None:
+        found.require_campaign("leave out workers, scheduler and executor")
     folder = Path("out", name) if out is None else Path(out)
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []

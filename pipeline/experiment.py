@@ -89,6 +89,16 @@ class Experiment(Parameters):
         return self
 
     @property
+    def is_campaign(self) -> bool:
+        """Whether its study judges the runs and no more, so that others may work on parts of them."""
+        return self.study == "localization"
+
+    def require_campaign(self, mend: str) -> None:
+        """Raise BadInput where it is none."""
+        if not self.is_campaign:
+            raise BadInput(f"{self.title}: its study, {self.study}, does more than judge; {mend}")
+
+    @property
     def files(self) -> list[Path]:
         """The logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []

@@ -20,6 +20,7 @@ from replay.engine.tangent import WIDTHS, tangent_components
 from replay.inference.binding import number_fields, settings_type
 from replay.inference.generate import (
     Input,
+    adding_noise,
     derivative,
     differencing,
     retraction,
@@ -123,7 +124,8 @@ def check_model(
         for motion in motions.values():
             size = motion.noises or model.tangent
             for state in tried:
-                _check_noise(motion.noise, (tuple(state), DURATION_S, numbers), size)
+                arguments = (tuple(state), DURATION_S, numbers)
+                _check_noise(motion.noise, arguments, size, motion.noise_block)
             _check_noise(motion.control_noise, (DURATION_S, numbers), model.controls)
         for sensor in model.sensors:
             if not sensor.covariance:
@@ -340,7 +342,7 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
         )
 
 
-def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int) -> None:
+def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, block: int = 0) -> None:
     """Variances, or the rows of a lower triangle."""
     if noise is None:
         return
@@ -350,8 +352,7 @@ def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int) 
         scale = 0.0
     else:
         matrix = np.zeros((size, size))
-        matrix[np.tril_indices(size)] = numbers
-        matrix += np.tril(matrix, -1).T
+        adding_noise(size, block)(matrix, numbers)
         smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
     if not smallest >= -scale:
         raise AssertionError(f"{_place(noise)} gives a negative variance, {smallest:.6g}")

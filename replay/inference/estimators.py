@@ -217,13 +217,12 @@ def bind_model(
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
     modes = tuple((model.modes or {}).values()) if method.takes_all_modes else ()
-    walks = estimated(label, model, parameters)
-    names = tuple(walks)
-    lacking = method.lacks(augmented(model, names))
-    if names and lacking:
+    added = estimated(label, model, parameters)
+    lacking = method.lacks(augmented(model, added.parameters, added.errors))
+    if added.names and lacking:
         raise BadInput(
-            f"estimator {label}: with estimate = {', '.join(names)} the model lacks {lacking}, which "
-            "this method needs"
+            f"estimator {label}: with estimate = {', '.join(parameters.estimate)} the model lacks "
+            f"{lacking}, which this method needs"
         )
     renamed = parameters.topics or {}
     _check_topics(label, model, topics, renamed)
@@ -231,10 +230,10 @@ def bind_model(
         found = found._replace(origin=_origin_of(label, model, found, topics))
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        stage = augmented_stage(own, names)
+        stage = augmented_stage(own, added)
         name = label + found.prefix
         samplers = _samplers_of(stage, method, parameters)
-        settings = with_walks(numbers, walks)
+        settings = with_walks(numbers, added)
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
@@ -244,7 +243,7 @@ def bind_model(
         opening = Beginning(name, found, own, numbers, assumed).opening
         whole = filtering.whole(topics)
         priors = {found.prior.name: model.state}
-        begun = begin(label, found.prior.name, own, walks, numbers)
+        begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
         made = replace(made, opening=opening)

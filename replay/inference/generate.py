@@ -236,7 +236,11 @@ class Input(NamedTuple):
 
 
 def derivative(
-    function: Function, inputs: Sequence[Input], outputs: Sequence[str], rest: Sequence[str], values: str
+    function: Function,
+    inputs: Sequence[Input],
+    outputs: Sequence[str],
+    rest: Sequence[str],
+    values: str = "",
 ) -> Function:
     """The values and exact Jacobians of a component-first function, by jets.
 
@@ -245,7 +249,7 @@ def derivative(
         inputs: its first arguments.
         outputs: the kinds of what it returns.
         rest: the names of its further arguments.
-        values: the array of the workspace that gets the values (n,).
+        values: the array of the workspace that gets the values (n,), if they are wanted.
 
     Returns `linearise(inputs..., rest..., work)`, without the inputs that are zero. It fills the values
     and the wanted Jacobians (t of the outputs, t of the input), in the tangent spaces.
@@ -259,7 +263,7 @@ def derivative(
         f"def linearise({', '.join([*names, *rest, 'work'])}):",
         # unpacked first: numba takes seven times as long to compile slopes of a tuple's entries
         f"    {found} = function({', '.join([*given, *rest])})",
-        *(f"    work.{values}[{row}] = value_of(y{row})" for row in range(len(outputs))),
+        *(f"    work.{values}[{row}] = value_of(y{row})" for row in range(len(outputs)) if values),
     ]
     places = [
         (f"work.{each.into}", column, sum(sizes[:index]) + column)
@@ -290,16 +294,23 @@ def derivative(
 
 
 @lru_cache(maxsize=64)
-def adding_noise(size: int) -> Function:
-    """`add(covariance, noise)`: adds variances, or the rows of a lower triangle, given as a tuple."""
+def adding_noise(size: int, block: int = 0) -> Function:
+    """`add(covariance, noise)`: adds variances, or the rows of a lower triangle, given as a tuple.
+
+    The triangle is that of the first `block` components, behind which are variances of the others; of
+    all components unless it is given.
+    """
     diagonal = [f"        covariance[{row}, {row}] += noise[{row}]" for row in range(size)]
     triangle, entry = [], 0
-    for row in range(size):
+    for row in range(block or size):
         for column in range(row + 1):
             triangle.append(f"        covariance[{row}, {column}] += noise[{entry}]")
             if column < row:
                 triangle.append(f"        covariance[{column}, {row}] += noise[{entry}]")
             entry += 1
+    for row in range(block or size, size):
+        triangle.append(f"        covariance[{row}, {row}] += noise[{entry}]")
+        entry += 1
     lines = [f"    if len(noise) == {size}:", *diagonal, "    else:", *triangle]
     return function_of("\n".join(["def add(covariance, noise):", *lines, ""]))
 

@@ -115,6 +115,8 @@ class Motion:
             noise enter other than by addition, (state, control, noise, duration_s, parameters).
         noise: (state, duration_s, parameters) -> the variances of the additive noise in the tangent
             space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
+        noise_block: how many components the triangle is of, where variances of the others follow it; of
+            all of them for zero.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
             duration; it enters the state through the derivative by the control.
         lost: (state, duration_s, parameters) -> the variances in the tangent space that are added where
@@ -130,11 +132,17 @@ class Motion:
     move: Function
     noise: Function | None = None
     noises: int = 0
+    noise_block: int = 0
     control_noise: Function | None = None
     lost: Function | None = None
     linear: bool = False
     jacobians: Function | None = None
     moments: Function | None = None
+
+    def triangle(self, tangent: int) -> int:
+        """How many numbers `noise` returns where it is no variances alone."""
+        block = self.noise_block or tangent
+        return block * (block + 1) // 2 + tangent - block
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,6 +300,9 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
+        upright: whether filters correct its orientation, the only one, by a turn about the third axis of
+            the log's frame and then by a tilt of the body. Where that axis is up, a heading that is
+            hardly known then leaves the tilt, which is known well, as it is.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -340,6 +351,7 @@ class Model:
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
     takes_fixes: bool = True
+    upright: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
@@ -394,7 +406,7 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     returns what the model denies.
     """
     state, control = trial_state(model.kinds), (0.0,) * model.controls
-    sizes = (model.tangent, model.tangent * (model.tangent + 1) // 2)
+    sizes = (model.tangent, motion.triangle(model.tangent))
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
     if motion.noises and (motion.noise is None or motion.control_noise is not None):

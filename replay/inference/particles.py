@@ -343,7 +343,8 @@ def _additive_noise(stage: Stage, first: int) -> Function:
     """
     t, noise = stage.model.tangent, stage.motion.noise
     assert noise is not None
-    read_state, add_noise = tuple_of(stage.model.size), adding_noise(t)
+    read_state = tuple_of(stage.model.size)
+    add_noise = adding_noise(t, stage.motion.noise_block)
     read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
 
     def factored(lower: Floats, variances: Any) -> bool:

@@ -37,6 +37,7 @@ from replay.timeline.landmarks import (
     landmarks_of,
     tracks_of,
 )
+from replay.timeline.navigation import draw_navigation
 from replay.timeline.plane import (
     ROOT,
     Stroke,
@@ -87,6 +88,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     sensed = [scene.read(topic) for topic in scene.topics_near(case)]
     sensed = [stream for stream in sensed if len(stream)]
     boards: list[Board] = [
+        *draw_navigation(canvas, scene, case, sensed),
         *_draw_planes(canvas, scene, case, sensed),
         *_draw_earth(canvas, case, [each for each in sensed if each.schema.full_name == GEODETIC]),
         *_draw_space(canvas, case, [each for each in sensed if each.schema.full_name == ORIENTATION]),

@@ -25,6 +25,7 @@ DATA = {
     "broad": ("broad", ""),
     "mrclam": ("mrclam6", "mrclam6.tar.xz"),
     "score-matrices": ("bssr1", "bssr1_set1.tar.xz"),
+    "table": ("navigation", "navigation.tar.xz"),
 }
 
 
@@ -104,6 +105,16 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
     "extended-target-failing": Recipe("extended-target", run=117),
+    "gnss-ins": Recipe("gnss-ins", part="gnss_imu_rtk/walk_0827", span_s=30.0),
+    "quad-inertial": Recipe(
+        "quad-inertial",
+        estimators={
+            label: {"topics": {"inertial": "/imu1/inertial"}, "inertial_delay_s": 0.45}
+            for label in ("ekf", "smoother")
+        },
+        part="quad_mimu/path_9",
+        span_s=20.0,
+    ),
     # delays, outliers, outages; ranges and bearings alone; the gate that the estimators have by default
     "landmarks-adverse": Recipe(
         "landmarks",

@@ -1,0 +1,191 @@
+"""A trolley in a warehouse whose tags measure ranges to anchors on the walls.
+
+It moves as the model `ranging-pose` says: accelerations are white. Ranges err by white noise, by a
+common bias, by an error of each anchor that lasts for seconds (a first-order Gauss-Markov process, the
+same for all tags), and where something stands in the line of sight: then they are too long.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from recorders.models.states import state_metadata
+from recorders.parameters import Parameters
+from recorders.recording import Recording, Simulator, simulation_stamps_ns
+
+Floats = NDArray[np.float64]
+Point = tuple[float, float, float]
+
+POSE = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "turn_radps")
+
+
+class Blocked(Parameters):
+    """Lines of sight that are blocked: how often, for how long on average, and by how much ranges grow.
+
+    An anchor is blocked for all tags at once; the excess is uniform between its limits.
+    """
+
+    times_per_minute: NonNegativeFloat = 0.0
+    duration_s: PositiveFloat = 2.0
+    least_m: NonNegativeFloat = 0.5
+    most_m: PositiveFloat = 3.0
+
+
+class RangingParameters(Parameters):
+    """The scenario; densities are per square root of hertz, the prior's standard deviations the model's.
+
+    Anchors and tags are numbered from 0 on; all tags range to all anchors at once. Channels state the
+    white noise, and neither the bias nor the errors that last.
+    """
+
+    duration_s: Annotated[float, Field(gt=0)] = 60.0
+    rate_hz: PositiveFloat = 10.0
+    anchors_m: list[Point] = [
+        (-10.0, -6.0, 3.0),
+        (0.0, -6.0, 2.5),
+        (10.0, -6.0, 3.0),
+        (10.0, 6.0, 2.5),
+        (0.0, 6.0, 3.0),
+        (-10.0, 6.0, 2.5),
+    ]
+    tags_m: list[Point] = [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0), (-0.3, -0.3, 0.0)]
+    height_m: float = 1.0
+    acceleration_density: NonNegativeFloat = 0.01
+    turn_acceleration_density: NonNegativeFloat = 0.05
+    sigma_range_m: PositiveFloat = 0.05
+    bias_range_m: float = 0.0
+    error_sigma_m: NonNegativeFloat = 0.0
+    error_time_s: PositiveFloat = 5.0
+    blocked: Blocked = Blocked()
+    start_sigma_m: PositiveFloat = 0.2
+    start_sigma_rad: PositiveFloat = 0.2
+    start_sigma_mps: PositiveFloat = 0.1
+    start_sigma_radps: PositiveFloat = 0.1
+
+
+def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recording:
+    """Record one run; raises BadInput without anchors or tags."""
+    for name in ("anchors_m", "tags_m"):
+        if not getattr(parameters, name):
+            raise BadInput(f"{name} is empty; give one point or more, such as [[0, 0, 2]]")
+    start_rng, path_rng, error_rng, blocked_rng, noise_rng = rng.spawn(5)
+    times_s = np.arange(int(parameters.duration_s * parameters.rate_hz + 1e-9) + 1) / parameters.rate_hz
+    sigma = np.array(
+        [
+            *[parameters.start_sigma_m] * 2,
+            parameters.start_sigma_rad,
+            *[parameters.start_sigma_mps] * 2,
+            parameters.start_sigma_radps,
+        ]
+    )
+    truth = _path(parameters, len(times_s), sigma * start_rng.normal(size=6), path_rng)
+    anchors, tags = np.array(parameters.anchors_m), np.array(parameters.tags_m)
+    cosine, sine = np.cos(truth[:, 2, None]), np.sin(truth[:, 2, None])
+    places = np.stack(  # (steps, tags, 3)
+        [
+            truth[:, :1] + cosine * tags[:, 0] - sine * tags[:, 1],
+            truth[:, 1:2] + sine * tags[:, 0] + cosine * tags[:, 1],
+            np.broadcast_to(parameters.height_m + tags[:, 2], (len(truth), len(tags))),
+        ],
+        axis=2,
+    )
+    ranges = np.linalg.norm(places[:, None] - anchors[:, None], axis=3)  # (steps, anchors, tags)
+    error = _lasting(parameters, len(times_s), len(anchors), error_rng)
+    error += _excess(parameters.blocked, times_s, len(anchors), blocked_rng)
+    noise = parameters.sigma_range_m * noise_rng.normal(size=ranges.shape)
+    ranges += parameters.bias_range_m + error[:, :, None] + noise
+    shape, metadata = ranges.shape, state_metadata(POSE)
+    stated = ("height_m", "acceleration_density", "turn_acceleration_density", "sigma_range_m")
+    anchor_id, tag_id = (np.broadcast_to(each, shape).ravel() for each in np.indices(shape)[1:])
+    start_ns = simulation_stamps_ns([0.0])
+    return Recording(
+        [
+            make_stream(
+                "/anchors",
+                schemas.LANDMARK,
+                np.repeat(start_ns, len(anchors)),
+                landmark_id=np.arange(len(anchors)),
+                position_m=anchors,
+            ),
+            make_stream(
+                "/tags",
+                schemas.BODY_POINT,
+                np.repeat(start_ns, len(tags)),
+                point_id=np.arange(len(tags)),
+                position_m=tags,
+            ),
+            make_stream(
+                "/trolley/prior",
+                schemas.GAUSSIAN_ESTIMATE,
+                start_ns,
+                metadata=metadata,
+                mean=np.zeros((1, 6)),
+                covariance=np.diag(sigma**2).reshape(1, 36),
+            ),
+            make_stream(
+                "/trolley/truth",
+                schemas.TRUTH_STATE,
+                simulation_stamps_ns(times_s),
+                metadata=metadata,
+                state=truth,
+            ),
+            make_stream(
+                "/trolley/ranges",
+                schemas.ANCHOR_RANGE,
+                simulation_stamps_ns(np.repeat(times_s, shape[1] * shape[2])),
+                metadata={name: repr(getattr(parameters, name)) for name in stated},
+                anchor_id=anchor_id,
+                tag_id=tag_id,
+                range_m=ranges.ravel(),
+            ),
+        ]
+    )
+
+
+def _path(parameters: RangingParameters, steps: int, start: Floats, rng: np.random.Generator) -> Floats:
+    """The states (steps, 6) under white accelerations, exactly at every step."""
+    step_s = 1.0 / parameters.rate_hz
+    root = np.linalg.cholesky([[step_s**3 / 3.0, step_s**2 / 2.0], [step_s**2 / 2.0, step_s]])
+    density = np.array([*[parameters.acceleration_density] * 2, parameters.turn_acceleration_density])
+    noise = rng.normal(size=(steps, 3, 2)) @ root.T * density[:, None]
+    states = np.empty((steps, 6))
+    states[0] = start
+    for step in range(1, steps):
+        states[step] = states[step - 1]
+        states[step, :3] += step_s * states[step - 1, 3:] + noise[step, :, 0]
+        states[step, 3:] += noise[step, :, 1]
+    return states
+
+
+def _lasting(
+    parameters: RangingParameters, steps: int, anchors: int, rng: np.random.Generator
+) -> Floats:
+    """The errors of every anchor (steps, anchors): first-order Gauss-Markov processes."""
+    kept = np.exp(-1.0 / (parameters.rate_hz * parameters.error_time_s))
+    error = parameters.error_sigma_m * rng.normal(size=(steps, anchors))
+    for step in range(1, steps):
+        error[step] = kept * error[step - 1] + np.sqrt(1.0 - kept**2) * error[step]
+    return error
+
+
+def _excess(blocked: Blocked, times_s: Floats, anchors: int, rng: np.random.Generator) -> Floats:
+    """By how much blocked ranges are too long (times, anchors)."""
+    excess = np.zeros((len(times_s), anchors))
+    for anchor in range(anchors):
+        count = rng.poisson(blocked.times_per_minute * times_s[-1] / 60.0)
+        begins_s = rng.uniform(0.0, times_s[-1], count)
+        for begin_s, lasts_s in zip(begins_s, rng.exponential(blocked.duration_s, count), strict=True):
+            inside = (times_s >= begin_s) & (times_s < begin_s + lasts_s)
+            excess[inside, anchor] = rng.uniform(blocked.least_m, blocked.most_m, int(inside.sum()))
+    return excess
+
+
+RANGING = Simulator(
+    "a trolley with tags among anchors: ranges with bias, errors that last, and blocked lines of sight",
+    RangingParameters,
+    simulate,
+)

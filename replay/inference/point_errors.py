@@ -1,0 +1,206 @@
+"""Errors that last, of what is measured about each point of a map, as part of the state.
+
+Measurement noise that is not white: ranges to one anchor, or between an anchor and a tag, err alike for
+seconds. A transformation of models: the state gets a component for each point or pair of points, which
+is added to what is measured about it, and moves by itself: a random walk, or a first-order Gauss-Markov
+process of mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, section 8.2. Derivatives by these components are written here, for jets of many slopes
+take minutes to compile.
+"""
+
+import re
+from collections import namedtuple
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+from recorders.errors import BadInput
+from replay.engine.arrays import Function
+from replay.inference.binding import trial_parameters
+from replay.inference.generate import Input, derivative, function_of, tuple_of
+from replay.inference.model import Model, Motion, Sensor, trial_state
+from replay.inference.walks import kept, spread, with_walk_parameters
+
+Names = tuple[str, ...]
+
+
+class PointError(NamedTuple):
+    """The error of what is `measured` about the points with these numbers, one of each map."""
+
+    measured: str
+    numbers: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """The component of the state."""
+        return "_".join(["error", self.measured, *map(str, self.numbers)])
+
+
+Errors = tuple[PointError, ...]
+
+
+def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
+    """The errors that an entry of `estimate` names; none where it names a parameter.
+
+    `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
+    about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
+    Raises BadInput where the model measures nothing of the kind.
+    """
+    found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
+    if found is None:
+        return []
+    measured, numbers = found.groups()
+    spans = [re.fullmatch(r" *(\d+)(?::(\d+))? *", each) for each in numbers.split(",")]
+    ranges = [range(int(each[1]), int(each[2] or int(each[1]) + 1)) for each in spans if each]
+    maps = max((len(each.maps) for each in model.sensors if measured in each.measured), default=0)
+    if len(spans) > maps or len(ranges) < len(spans) or not all(ranges):
+        raise BadInput(
+            f"{where}: expected NUMBER or FIRST:END in the brackets, with a comma before those of a "
+            f"second map; this model measures {measured} about the points of {maps} maps"
+        )
+    return [PointError(measured, pair) for pair in product(*ranges)]
+
+
+@lru_cache(maxsize=64)
+def with_point_errors(model: Model, errors: Errors) -> Model:
+    """The model with these errors in its state."""
+    kinds = {name: kind for each in model.sensors for name, kind in each.measured.items()}
+    return replace(
+        model,
+        state={**model.state, **{each.name: kinds[each.measured] for each in errors}},
+        parameters=with_walk_parameters(model.parameters, _names(errors)),
+        sensors=tuple(sensor_with_errors(model, sensor, errors) for sensor in model.sensors),
+        motion=motion_with_errors(model, model.motion, errors),
+        modes=model.modes
+        and {name: motion_with_errors(model, each, errors) for name, each in model.modes.items()},
+    )
+
+
+@lru_cache(maxsize=256)
+def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
+    """The motion, beside which each error goes its own way."""
+    n, t = model.size, model.tangent
+    noises = motion.noises
+    arguments = "state, control, noise, duration_s" if noises else "state, control, duration_s"
+    stay = [f"{kept(each)} * state[{n + index}]" for index, each in enumerate(_names(errors))]
+    if noises:
+        stay = [f"{each} + noise[{noises + index}]" for index, each in enumerate(stay)]
+    move = function_of(
+        f"def move({arguments}, parameters):\n"
+        f"    moved = inner({arguments.replace('state', 'first(state)', 1)}, parameters)\n"
+        f"    return ({_listed([f'moved[{index}]' for index in range(n)] + stay)})\n",
+        inner=motion.move,
+        first=tuple_of(n),
+    )
+    spreads = [spread(each) for each in _names(errors)]
+    given = motion.noise and motion.noise(trial_state(model.kinds), 1.0, trial_parameters(model))
+    entries = [f"noise[{index}]" for index in range(len(given))] if given else ["0.0"] * t
+    noise = function_of(
+        "def noises(state, duration_s, parameters):\n"
+        + ("    noise = inner(first(state), duration_s, parameters)\n" if given else "")
+        + f"    return ({_listed(entries + spreads)})\n",
+        inner=motion.noise,
+        first=tuple_of(n),
+    )
+    return replace(
+        motion,
+        move=move,
+        noise=noise,
+        noises=noises + len(errors) if noises else 0,
+        noise_block=t if not noises and len(entries) != t else 0,
+        jacobians=None if noises else _motion_jacobians(model, motion, errors),
+        moments=None,
+    )
+
+
+def _motion_jacobians(model: Model, motion: Motion, errors: Errors) -> Function:
+    """`jacobians(state, control, duration_s, parameters, by_state, by_control)`; see `model.Motion`."""
+    t, end = model.tangent, model.tangent + len(errors)
+    inputs = [
+        Input("state", model.kinds, "transition"),
+        Input("control", ("linear",) * model.controls, "gain" if motion.control_noise else ""),
+    ]
+    linearise = derivative(motion.move, inputs, model.kinds, ("duration_s", "parameters"))
+    diagonal = [
+        f"    by_state[{t + row}, {t + row}] = {kept(each)}" for row, each in enumerate(_names(errors))
+    ]
+    return function_of(
+        "def jacobians(state, control, duration_s, parameters, by_state, by_control):\n"
+        "    linearise(state, control, duration_s, parameters, Target(by_state, by_control))\n"
+        f"    for row in range({end}):\n"
+        f"        for column in range({t} if row >= {t} else {end}):\n"
+        f"            if row >= {t} or column >= {t}:\n"
+        "                by_state[row, column] = by_state[column, row] = 0.0\n"
+        f"    for row in range({t}, {end}):\n"
+        f"        for column in range({t}, {end}):\n"
+        "            by_state[row, column] = 0.0\n"
+        f"        for column in range(by_control.shape[1]):\n"
+        "            by_control[row, column] = 0.0\n" + "\n".join([*diagonal, ""]),
+        linearise=linearise,
+        Target=namedtuple("Target", ("transition", "gain")),
+    )
+
+
+@lru_cache(maxsize=256)
+def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
+    """The sensor, to whose measurements the errors about their points are added."""
+    own = [
+        (model.size + index, list(sensor.measured).index(each.measured), each.numbers)
+        for index, each in enumerate(errors)
+        if each.measured in sensor.measured
+    ]
+    arguments = "state, noise" if sensor.noises else "state"
+    passed = arguments.replace("state", "first(state)")
+    entries = [f"seen[{index}]" for index in range(len(sensor.measured))]
+    for column, row, numbers in own:
+        entries[row] += f" + {_same(sensor, numbers)} * state[{column}]"
+    names = {"inner": sensor.measure, "first": tuple_of(model.size), "own": tuple_of(sensor.about_size)}
+    measure = function_of(
+        f"def measure({arguments}, about, parameters):\n"
+        f"    seen = inner({passed}, own(about), parameters)\n"
+        f"    return ({_listed(entries)})\n",
+        **names,
+    )
+    kinds = tuple(sensor.measured.values())
+    inputs = [Input("state", model.kinds, "rows")]
+    linearise = derivative(sensor.measure, inputs, kinds, ("about", "parameters"))
+    t = model.tangent - model.size
+    lines = [
+        f"    by_state[{row}, {column + t}] = {_same(sensor, numbers)}" for column, row, numbers in own
+    ]
+    jacobian = function_of(
+        "def jacobian(state, about, parameters, by_state):\n"
+        "    linearise(state, own(about), parameters, Target(by_state))\n"
+        f"    for row in range({len(kinds)}):\n"
+        f"        for column in range({model.tangent}, {model.tangent + len(errors)}):\n"
+        "            by_state[row, column] = 0.0\n" + "\n".join([*lines, ""]),
+        linearise=linearise,
+        own=names["own"],
+        Target=namedtuple("Target", ("rows",)),
+    )
+    return replace(
+        sensor,
+        measure=measure,
+        is_numbered=bool(own),
+        jacobian=None if sensor.noises else jacobian,
+        log_likelihood=None if own else sensor.log_likelihood,
+        moments=None,
+    )
+
+
+def _same(sensor: Sensor, numbers: Sequence[int]) -> str:
+    """1 where a message is about these points, 0 where not."""
+    first = sensor.about_size
+    return "1.0 * " + " * ".join(
+        f"(about[{first + index}] == {number})" for index, number in enumerate(numbers)
+    )
+
+
+def _names(errors: Errors) -> Names:
+    return tuple(each.name for each in errors)
+
+
+def _listed(entries: Sequence[str]) -> str:
+    return ", ".join(entries) + ","
