@@ -199,5 +199,4 @@ INERTIAL = Model(
     control=UNIT,
     start=Start({}, HANDHELD, find=align),
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
-    upright=True,
 )
