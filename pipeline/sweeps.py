@@ -264,6 +264,7 @@ def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
         for axis, places in ((axes.xaxis, own.columns), (axes.yaxis, own.index)):
             shown = range(0, len(places), -(-len(places) // 9))
             axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
+        axes.tick_params(axis="x", rotation=45)  # nine numbers side by side
         axes.set(xlabel=x.key, ylabel=y.key, title=label)
     figure.colorbar(picture, ax=figure.axes, label=name)
     return figure
