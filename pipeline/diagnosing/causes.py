@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from os import cpu_count
 from typing import NamedTuple
 
 from scipy.stats import chi2
 
 from pipeline.diagnosing.hypotheses import Hypothesis
-from pipeline.diagnosing.likelihood import Likelihood, Peak, Trial, interval, peak
+from pipeline.diagnosing.likelihood import Gains, Likelihood, Peak, Trial, interval, peak
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
@@ -54,9 +55,9 @@ def find_causes(
     least, found = least_gain(len(tried)), list[Cause]()
     candidates, now = list(tried), base
     while candidates and len(found) < most:
-        gain_of = _gains(likelihood, now)
+        gains_of = _gains(likelihood, now, candidates)
         with ThreadPoolExecutor(cpu_count()) as threads:
-            peaks = list(threads.map(lambda each, of=gain_of: _peak(of(each), each, least), candidates))
+            peaks = list(threads.map(partial(_peak, gains_of, least), candidates))
         ranked = sorted(
             (pair for pair in zip(peaks, candidates, strict=True) if pair[0].gain > least),
             key=lambda pair: -pair[0].gain,
@@ -64,9 +65,9 @@ def find_causes(
         if not ranked:
             break
         (best, first), *others = ranked
-        found.append(_cause(gain_of(first), best, first))
+        found.append(_cause(gains_of(first), best, first))
         found += [
-            _cause(gain_of(each), at, each)._replace(is_rival=True)
+            _cause(gains_of(each), at, each)._replace(is_rival=True)
             for at, each in others
             if at.gain > best.gain - RIVAL
         ]
@@ -75,22 +76,36 @@ def find_causes(
     return found[:most]
 
 
-Gain = Callable[[float], float]
+def _gains(
+    likelihood: Likelihood, now: Trial, candidates: Sequence[Hypothesis]
+) -> Callable[[Hypothesis], Gains]:
+    """For a hypothesis the gains of its number over a trial; the first of all are replayed at once."""
+    asked = [(each, value) for each in candidates for value in each.tried[:2]]
+    before, *after = likelihood([now, *(each.without(now, value) for each, value in asked)])
+    known = {
+        (id(each), value): found - before for (each, value), found in zip(asked, after, strict=True)
+    }
+
+    def of(each: Hypothesis) -> Gains:
+        def gains(values: Sequence[float]) -> list[float]:
+            if all((id(each), value) in known for value in values):
+                return [known[id(each), value] for value in values]
+            return [
+                found - before for found in likelihood([each.without(now, value) for value in values])
+            ]
+
+        return gains
+
+    return of
 
 
-def _gains(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis], Gain]:
-    """For a hypothesis the gain of its number, over a trial."""
-    before = likelihood(now)
-    return lambda each: lambda value: likelihood(each.without(now, value)) - before
+def _peak(gains_of: Callable[[Hypothesis], Gains], least: float, tried: Hypothesis) -> Peak:
+    return peak(gains_of(tried), tried.tried, tried.limit, least)
 
 
-def _peak(gain: Gain, tried: Hypothesis, least: float) -> Peak:
-    return peak(gain, tried.tried, tried.limit, least)
-
-
-def _cause(gain: Gain, at: Peak, of: Hypothesis) -> Cause:
+def _cause(gains: Gains, at: Peak, of: Hypothesis) -> Cause:
     if len(of.tried) == 1:  # it is, or is not
         return Cause(of, at.value, (at.value, at.value), at.gain)
     # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
     scale = abs(at.value) * min(1.0, (2.0 / at.gain) ** 0.5)
-    return Cause(of, at.value, interval(gain, at, scale), at.gain)
+    return Cause(of, at.value, interval(gains, at, scale), at.gain)

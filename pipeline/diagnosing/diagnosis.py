@@ -278,7 +278,7 @@ def diagnose(
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
         *of_messages([source.read([topic])[topic] for topic in streamed], source.epoch_ns),
         *of_estimates(estimates),
-        *_of_errors(done, label),
+        *(_of_errors(done, label) if not causes else []),
     ]
     sentences += [Sentence(*each) for each in findings]
     return Diagnosis(

@@ -45,12 +45,12 @@ NOISE = re.compile(r"(^|_)(sigma|density)(_|$)")
 BEGINNING = re.compile(
     r"^(start|tilt|heading|unmeasured|gyro_bias|force_bias)_.*sigma|_bias_sigma_|^start_"
 )
-SCALES = (-2.0, -0.7, 0.7, 2.0)  # logarithms
+SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
 DELAYS_S = (0.005, 0.02, 0.08)
-RATES = (-1e-3, -1e-4, -1e-5, 1e-5, 1e-4, 1e-3)
-ANGLES_RAD = (-0.3, -0.03, 0.03, 0.3)
-SHARES = (-0.1, -0.01, -0.001, 0.001, 0.01, 0.1)  # of how much what is measured varies
-SIGMAS = (-4.0, -1.0, 1.0, 4.0)  # of a prior
+RATES = (-1e-5, 1e-5, -1e-4, 1e-4, -1e-3, 1e-3)
+ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3)
+SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1)  # of how much what is measured varies
+SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # of a prior
 LONGEST_DELAY_S, LARGEST_RATE = 1.0, 0.01
 SUSPECT = 2.0  # a mean NIS per component, above which numbers may be exchanged
 SUSPECTS = 12  # of which all pairs are tried
@@ -66,7 +66,7 @@ class Hypothesis:
         kind: what those that cannot be told apart have in common.
         topic: the topic that it is of, or the parameter.
         part: the component of the topic, if it is of one.
-        tried: numbers to begin the search with; none where there is nothing to search.
+        tried: numbers to begin the search with, see `peak`; a single one where it is so, or is not.
         limit: of the number's magnitude.
         without: the trial without the fault of this number.
         words: what is wrong, from the number and the ends of its 95 % interval.
@@ -182,7 +182,7 @@ def _spreads(stream: Stream) -> Iterator[Hypothesis]:
             return f"{stream.topic}: of {field} {_times(at, low, high)}, so that R is too {_size(at)}"
 
         def mend(at: float, field: str = field) -> str:
-            return f"multiply its {field} by {np.exp(2.0 * at):.3g} where the log is written"
+            return f"multiplying its {field} by {np.exp(2.0 * at):.3g} where the log is written"
 
         def without(trial: Trial, logarithm: float, field: str = field) -> Trial:
             source = alter.altered(trial.source, stream.topic, alter.spread(field), logarithm)
@@ -231,7 +231,7 @@ def _bias(
         if own:
             value = at if own.startswith("bias_") else -at
             return f"--set {own}={value:.3g}, or {command} --free {own}"
-        return f"subtract {at:.3g} where the log is written"
+        return f"subtracting {at:.3g} where the log is written"
 
     yield Hypothesis(
         "bias or turned frame",
@@ -256,7 +256,7 @@ def _turn(stream: Stream, field: str) -> Hypothesis:
         return f"{stream.topic}: {field} is turned about the vertical by {size}"
 
     def mend(at: float) -> str:
-        return f"turn it back by {np.degrees(at):.3g} deg where the log is written"
+        return f"turning it back by {np.degrees(at):.3g} deg where the log is written"
 
     without = _in_topic(stream.topic, alter.turned(field))
     return Hypothesis(
@@ -280,15 +280,15 @@ def _clocks(
         if _has(parameters, own):
             return f"--set {own}={at:.3g}"
         return (
-            f"fuselog cut LOG --topics '{topic}' -o late.mcap, and merge it with the others by "
-            f"--offset late.mcap={-at:.3g}"
+            f"fuselog cut LOG --topics '{topic}' -o late.mcap, and fuselog merge with the other topics "
+            f"and --offset late.mcap={-at:.3g}"
         )
 
     def gaining(at: float, low: float, high: float) -> str:
         return f"{topic}: its clock gains {at:.3g} s a second ({low:.3g} to {high:.3g})"
 
     def mend_gaining(at: float) -> str:
-        return f"divide the times of its stamps by {1.0 + at:.8g} where the log is written"
+        return f"dividing the times of its stamps by {1.0 + at:.8g} where the log is written"
 
     yield Hypothesis(
         "delay", topic, "", DELAYS_S, LONGEST_DELAY_S, _in_topic(topic, delay), late, mend_late
@@ -331,7 +331,7 @@ def _start(
         )
 
     def mend(at: float) -> str:
-        return f"give a prior that is right, or one whose sigma of {name} is at least {abs(at):.2g}"
+        return f"another prior, or one whose sigma of {name} is at least {abs(at):.2g}"
 
     tried = tuple(sigma * each for each in SIGMAS if sigma * abs(each) < limit)
     return Hypothesis("start", topic, name, tried, limit, _in_topic(topic, alteration), words, mend)
@@ -381,22 +381,21 @@ def _exchanges(
     )
     for topic, field in maps.items():
         known = set(source.streams[topic][field].tolist())
-        for first, second in combinations([each for each in targets if each in known], 2):
-            yield _exchange(
-                topic,
-                f"{field} {first} and {second}",
-                _in_topic(topic, alter.renumbered(field, first, second)),
-            )
+        for first, second in combinations(sorted(each for each in targets if each in known), 2):
+            without = _in_topic(topic, alter.renumbered(field, first, second))
+            words = f"{topic}: {field} {first} and {second} are exchanged"
+            yield _exchange(topic, f"{first} {second}", words, without)
     of_case = {split_topic(each.name + "/_")[1]: each.streams for each in bound}
     cases = _suspects((split_topic(topic)[1], stream) for topic, stream in innovations.items())
-    for one, other in combinations([each for each in cases if each in of_case], 2):
-        for first, second in zip(of_case[one], of_case[other], strict=False):
-            if source.topics[first].schema_name == source.topics[second].schema_name:
+    for one, other in combinations(sorted(each for each in cases if each in of_case), 2):
+        for here, there in zip(of_case[one], of_case[other], strict=False):
+            if source.topics[here].schema_name == source.topics[there].schema_name:
+                yield _exchange(here, there, f"{here} and {there} are exchanged", _back(here, there))
 
-                def without(trial: Trial, _: float, first: str = first, second: str = second) -> Trial:
-                    return trial._replace(source=alter.exchanged(trial.source, first, second))
 
-                yield _exchange(first, second, without)
+def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
+    """The trial with the messages of two topics exchanged."""
+    return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
 
 
 def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
@@ -411,7 +410,7 @@ def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
     return worst if worst and means[worst[0]] > SUSPECT else []
 
 
-def _exchange(topic: str, part: str, without: Callable[[Trial, float], Trial]) -> Hypothesis:
+def _exchange(topic: str, part: str, words: str, without: Callable[[Trial, float], Trial]) -> Hypothesis:
     return Hypothesis(
         "exchanged numbers",
         topic,
@@ -419,6 +418,6 @@ def _exchange(topic: str, part: str, without: Callable[[Trial, float], Trial]) -
         (1.0,),
         1.0,
         without,
-        lambda *_: f"{topic}: stands exchanged: {part}",
-        lambda _: "exchange them where the log is written",
+        lambda *_: words,
+        lambda _: "exchanging them where the log is written",
     )

@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
-from pipeline.tuning.objective import innovations_in
 from recorders.errors import BadInput
-from recorders.log import Stream
-from replay.engine.blocks import Ragged
+from recorders.log import Stream, schemas
 from replay.engine.estimator import Bound, bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import Ensemble, MemorySource
 
 Floats = NDArray[np.float64]
+Gains = Callable[[Sequence[float]], Sequence[float]]  # of the values of one number
 DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a parameter end
 EVALUATIONS = 16  # of a refinement at most
 DOUBLINGS = 12  # of the way to an end
+LARGEST = 1e12  # a loss, of what cannot be used
 
 
 class Trial(NamedTuple):
@@ -40,6 +40,8 @@ class Trial(NamedTuple):
 class Likelihood:
     """The log-likelihood of trials that have the measurements of one run.
 
+    Trials of equal settings are replayed together, as the runs of an ensemble.
+
     Attributes:
         label: the estimator's.
         volumes: by topic, the extents (m,) of the innovations' components, of which outliers may lie
@@ -52,41 +54,60 @@ class Likelihood:
     count: int = 0
     _bound: dict[str, list[Bound]] = field(default_factory=dict)
 
-    def innovations(self, trial: Trial) -> dict[str, Stream]:
-        """The innovations of a trial by topic; none where the estimator fails."""
-        key = repr(sorted(trial.settings.items()))
-        try:
-            if key not in self._bound:
-                self._bound[key] = bind(self.label, [trial.source], trial.settings)
-            outputs: dict[str, Ragged] = collect(replay(Ensemble([trial.source]), self._bound[key]))
-        except BadInput:  # no run can be followed with these
-            return {}
-        return dict(innovations_in(outputs))
-
     def begin(self, trial: Trial) -> dict[str, Stream]:
-        """Take a trial for the one that others are compared with; its innovations."""
-        found = self.innovations(trial)
+        """Take a trial for the one that others are compared with; its innovations by topic."""
+        [found] = self._innovations([trial])
         self.count = sum(map(len, found.values()))
         self.volumes = {topic: _extents(stream) for topic, stream in found.items()}
         return found
 
-    def __call__(self, trial: Trial) -> float:
-        """The log-likelihood; minus infinity where the estimator fails or loses measurements."""
-        found = self.innovations(trial)
-        if sum(map(len, found.values())) != self.count:
+    def __call__(self, trials: Sequence[Trial]) -> list[float]:
+        """The log-likelihoods; minus infinity where the estimator fails or loses measurements."""
+        together: dict[str, list[int]] = {}
+        for place, trial in enumerate(trials):
+            together.setdefault(_key(trial), []).append(place)
+        found = [-np.inf] * len(trials)
+        for places in together.values():
+            outputs = self._innovations([trials[place] for place in places])
+            for place, of_run in zip(places, outputs, strict=True):
+                found[place] = self._total(of_run)
+        return found
+
+    def _innovations(self, trials: Sequence[Trial]) -> list[dict[str, Stream]]:
+        """The innovations of trials of equal settings, by topic; none where the estimator fails."""
+        key, sources = _key(trials[0]), [trial.source for trial in trials]
+        try:
+            if key not in self._bound:
+                self._bound[key] = bind(self.label, sources[:1], trials[0].settings)
+            outputs = collect(replay(Ensemble(sources), self._bound[key], is_part=True))
+        except BadInput:  # no run can be followed with these
+            return [{} for _ in trials]
+        told = {
+            topic: rows
+            for topic, rows in outputs.items()
+            if rows.stream.schema.full_name == schemas.INNOVATION.full_name
+        }
+        return [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(trials))]
+
+    def _total(self, innovations: Mapping[str, Stream]) -> float:
+        if sum(map(len, innovations.values())) != self.count:
             return -np.inf
         kept_out = 0
         total = 0.0
-        for topic, stream in found.items():
+        for topic, stream in innovations.items():
             is_in = stream["accepted"] != 0
             total += float(np.sum(stream["log_likelihood"][is_in]))
             missing = np.isnan(stream["innovation"][~is_in])
             total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
             kept_out += len(missing)
-        share = kept_out / self.count
+        share = kept_out / self.count if self.count else 0.0
         if 0.0 < share < 1.0:
             total += kept_out * np.log(share) + (self.count - kept_out) * np.log(1.0 - share)
         return total if np.isfinite(total) else -np.inf
+
+
+def _key(trial: Trial) -> str:
+    return repr(sorted(trial.settings.items()))
 
 
 def _extents(stream: Stream) -> Floats:
@@ -107,63 +128,74 @@ class Peak(NamedTuple):
     gain: float
 
 
-def peak(gain: Callable[[float], float], tried: Sequence[float], limit: float, floor: float) -> Peak:
+def peak(gains: Gains, tried: Sequence[float], limit: float, floor: float) -> Peak:
     """The greatest gain of a number, from the best of those that are tried on.
 
     Args:
-        gain: of a value; zero at zero.
-        tried: values beside zero, in order.
+        gains: of several values; zero at zero.
+        tried: values beside zero, the first two of them nearest to it, to either side where it has two.
         limit: of its magnitude.
         floor: a gain that is less than this is not worth a search.
     """
-    below, above = [each for each in tried if each < 0.0], [each for each in tried if each > 0.0]
-    near = [max(below), min(above)] if below else []
-    known = {0.0: 0.0} | {value: gain(value) for value in near}
-    if near and _by_parabola(known) < 0.5 * floor and max(known.values()) < 0.5 * floor:
+    known = {0.0: 0.0}
+
+    def look(values: Sequence[float]) -> None:
+        new = [value for value in values if value not in known]
+        known.update(zip(new, gains(new), strict=True) if new else ())
+
+    has_sides = tried[0] < 0.0
+    look(tried[:2])
+    if has_sides and max(known.values()) < 0.5 * floor and _by_parabola(known) < 0.5 * floor:
         return Peak(0.0, 0.0)  # a smooth function that is about greatest here
-    known |= {value: gain(value) for value in tried if value not in known}
-    values = np.array(sorted(known))
-    gains = np.array([known[value] for value in values.tolist()])
-    best = int(np.argmax(gains))
-    if len(tried) == 1 or (gains[best] < floor and not near):
-        return Peak(float(values[best]), float(gains[best]))
+    look(tried)
     for _ in range(DOUBLINGS):
-        if best not in (0, len(values) - 1) or abs(values[best]) >= limit:
+        best, low, high = _around(known)
+        if len(tried) == 1 or best == 0.0 or low != high or abs(best) >= limit:
             break
-        further = float(np.clip(2.0 * values[best], -limit, limit))
-        place = 0 if best == 0 else len(values)
-        values, gains = np.insert(values, place, further), np.insert(gains, place, gain(further))
-        best = int(np.argmax(gains))
-    low, high = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
+        look([float(np.clip(2.0 * best, -limit, limit))])
+    if len(tried) == 1 or (best == 0.0 and not has_sides):
+        return Peak(best, known[best])
     options = {"maxiter": EVALUATIONS, "xatol": 1e-3 * (high - low)}
-    found = minimize_scalar(
-        lambda value: -max(gain(float(value)), -1e12),
-        bounds=(low, high),
-        method="bounded",
-        options=options,
-    )
-    if -found.fun > gains[best]:
-        return Peak(float(found.x), -float(found.fun))
-    return Peak(float(values[best]), float(gains[best]))
+
+    def loss(value: float) -> float:
+        look([float(value)])
+        return -max(known[float(value)], -LARGEST)
+
+    if low < high:
+        minimize_scalar(loss, bounds=(low, high), method="bounded", options=options)
+    best = max(known, key=lambda value: known[value])
+    return Peak(best, known[best])
+
+
+def _around(known: Mapping[float, float]) -> tuple[float, float, float]:
+    """The value of the greatest gain and its neighbours; itself and itself where it is the last one."""
+    values = sorted(known)
+    place = max(range(len(values)), key=lambda place: known[values[place]])
+    if place in (0, len(values) - 1):
+        return values[place], values[place], values[place]
+    return values[place], values[place - 1], values[place + 1]
 
 
 def _by_parabola(known: Mapping[float, float]) -> float:
     """The greatest gain of the parabola through three of its values; infinite if it has none."""
     values, gains = np.array(sorted(known.items())).T
+    if not gains.any():  # nothing depends on the number
+        return 0.0
     if not np.isfinite(gains).all():
         return np.inf
     bend, slope, _ = np.polyfit(values / values[-1], gains, 2)
     return float(-(slope**2) / (4.0 * bend)) if bend < 0.0 else np.inf
 
 
-def interval(gain: Callable[[float], float], at: Peak, scale: float) -> tuple[float, float]:
+def interval(gains: Gains, at: Peak, scale: float) -> tuple[float, float]:
     """The 95 % interval of a number: where the gain is less than its greatest by DROP_95.
 
     `scale` is a length that is not too long; an end that is not found is infinite.
     """
 
     def rest(value: float) -> float:
-        return max(gain(value), -1e12) - (at.gain - DROP_95)
+        [gain] = gains([value])
+        return max(gain, -LARGEST) - (at.gain - DROP_95)
 
     def end(sign: float) -> float:
         inner, step = at.value, sign * scale

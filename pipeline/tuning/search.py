@@ -21,8 +21,8 @@ Cost = Callable[[Floats], Floats]
 
 STEP, CURVATURE_STEP = 1e-4, 1e-2  # of the differences, in coordinates
 ITERATIONS = 200
-FACTORS = np.array([0.1, 10**-0.5, 10**0.5, 10.0])  # of a scan along each positive parameter
-LEAST_GAIN = 1e-3  # of a round of the search: far less than any log tells
+FACTORS = 10.0 ** np.array([-1.0, -0.5, -0.2, 0.2, 0.5, 1.0])  # of a positive parameter in a scan
+LEAST_GAIN = 1e-3  # of a step of the scan: far less than any log tells
 FIRST_SIMPLEX = 0.7  # the sides of the first one: times two, of what is positive
 LOOKS = 3  # at how far a parameter that is not positive reaches
 UNIT = 10.0  # standard errors that it has alone
@@ -153,16 +153,16 @@ def least(
     which two modes have changed their parts. So it begins, and ends, where no change of a single
     parameter by one of `FACTORS` costs less.
     """
-    point, here = _scanned(cost, coordinates, start)
-    while True:  # a descent may stick where a valley bends, and goes on when it begins anew
-        point, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
-        before, (point, here) = here, _scanned(cost, coordinates, point)
-        if before - here < LEAST_GAIN or not has_converged:
-            return point, has_converged
+    point = _scanned(cost, coordinates, start)
+    while True:
+        ended, has_converged = _minimum(cost, coordinates, point, is_smooth=is_smooth)
+        point = _scanned(cost, coordinates, ended)
+        if point is ended or not has_converged:
+            return ended, has_converged
 
 
-def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> tuple[Floats, float]:
-    """A point (k,) from which no change of one positive parameter costs less, and what it costs."""
+def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
+    """A point (k,) from which no change of one positive parameter costs less: the start, or another."""
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
@@ -178,7 +178,7 @@ def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> tuple[Float
         costs = cost(coordinates.values(points))
         best = int(np.argmin(costs))
         if costs[best] > costs[0] - LEAST_GAIN:
-            return point, float(costs[0])
+            return point
         point = points[best]
 
 

@@ -394,8 +394,8 @@ STARTED = _declare(
 )
 DIAGNOSED = _declare(
     "Diagnosed",
-    "A diagnosis found that something is wrong from here on; the channel's metadata says what,"
-    " by number, as JSON.",
+    "A diagnosis found that something is wrong from here on; the channel's metadata lists what by "
+    "number, as JSON.",
     _identifier("reason"),
 )
 REWOUND = _declare(

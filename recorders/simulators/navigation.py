@@ -73,6 +73,24 @@ class Receiver(Parameters):
     multipath_m: WayPoint = (3.0, -2.0, 5.0)
 
 
+class Carried(Parameters):
+    """What else is on board: rates, of which zero leaves a sensor out, and standard deviations.
+
+    Wheels at the axle measure one and their error of scale, drawn with its standard deviation, times how
+    fast it moves forward. A compass tells the orientation, of which the heading errs, a barometer the
+    height.
+    """
+
+    wheel_rate_hz: NonNegativeFloat = 0.0
+    wheel_sigma_mps: PositiveFloat = 0.05
+    wheel_scale_sigma: NonNegativeFloat = 0.0
+    axle_m: WayPoint = (0.0, 0.0, 0.0)
+    compass_rate_hz: NonNegativeFloat = 0.0
+    compass_sigma_rad: PositiveFloat = 0.05
+    barometer_rate_hz: NonNegativeFloat = 0.0
+    barometer_sigma_m: PositiveFloat = 0.5
+
+
 class Prior(Parameters):
     """Standard deviations of what is told of the start; the biases' are the unit's."""
 
@@ -102,6 +120,7 @@ class NavigationParameters(Parameters):
     origin_altitude_m: float = 500.0
     unit: Unit = Unit()
     gnss: Receiver = Receiver()
+    carried: Carried = Carried()
     prior: Prior = Prior()
 
 
@@ -131,7 +150,7 @@ class Path(NamedTuple):
 
 def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Recording:
     """Record one run."""
-    path_rng, unit_rng, gnss_rng, prior_rng = rng.spawn(4)
+    path_rng, unit_rng, gnss_rng, prior_rng, carried_rng = rng.spawn(5)
     unit = parameters.unit
     times_s = np.arange(int(parameters.duration_s * unit.rate_hz + 1e-9) + 1) / unit.rate_hz
     path = _path(parameters, path_rng)
@@ -149,6 +168,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
     streams = [
         inertial,
         *_gnss(parameters, path, gnss_rng),
+        *_carried(parameters, path, carried_rng),
         make_stream(
             "/body/truth",
             schemas.TRUTH_STATE,
@@ -332,6 +352,60 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
             "/body/fix/outages", schemas.OUTAGE, spans_ns[:, 0], end_time_ns=spans_ns[:, 1]
         )
         streams.append(outages)
+    return streams
+
+
+def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
+    """What wheels, compass and barometer say, of those that are on board."""
+    carried, streams = parameters.carried, []
+
+    def times(rate_hz: float) -> Floats:
+        return np.arange(0.0, parameters.duration_s + 1e-9, 1.0 / rate_hz)
+
+    if carried.wheel_rate_hz > 0:
+        times_s, axle = times(carried.wheel_rate_hz), np.array(carried.axle_m)
+        turned, rate = path.orientation(times_s).inv(), path.turn_rate(times_s)
+        velocity = turned.apply(path.position.derivative()(times_s)) + np.cross(rate, axle)
+        scale = 1.0 + carried.wheel_scale_sigma * rng.normal()
+        streams.append(
+            make_stream(
+                "/body/wheel",
+                schemas.ODOMETRY,
+                simulation_stamps_ns(times_s),
+                metadata={"sigma_wheel_mps": repr(carried.wheel_sigma_mps)}
+                | dict(zip(("axle_x_m", "axle_y_m", "axle_z_m"), map(repr, axle.tolist()), strict=True)),
+                forward_mps=scale * velocity[:, 0]
+                + carried.wheel_sigma_mps * rng.normal(size=len(rate)),
+                turn_radps=rate[:, 2],
+            )
+        )
+    if carried.compass_rate_hz > 0:
+        times_s = times(carried.compass_rate_hz)
+        error = Rotation.from_rotvec(
+            np.outer(carried.compass_sigma_rad * rng.normal(size=len(times_s)), [0.0, 0.0, 1.0])
+        )
+        seen = (error * path.orientation(times_s)).as_quat(canonical=True, scalar_first=True)
+        streams.append(
+            make_stream(
+                "/body/heading",
+                schemas.ORIENTATION,
+                simulation_stamps_ns(times_s),
+                metadata={"sigma_heading_rad": repr(carried.compass_sigma_rad)},
+                quaternion=seen,
+            )
+        )
+    if carried.barometer_rate_hz > 0:
+        times_s = times(carried.barometer_rate_hz)
+        error_m = carried.barometer_sigma_m * rng.normal(size=(len(times_s), 1))
+        streams.append(
+            make_stream(
+                "/body/height",
+                schemas.VECTOR_MEASUREMENT,
+                simulation_stamps_ns(times_s),
+                metadata={"sigma_height_m": repr(carried.barometer_sigma_m)},
+                value=path.position(times_s)[:, 2:] + error_m,
+            )
+        )
     return streams
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, gravity, into_plane, strapdown
+from recorders.models.inertial import cross, into_plane, strapdown
 from recorders.models.planar import Components
 from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
@@ -28,7 +28,6 @@ MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("ro
 SCALES: Mapping[str, Kind] = {
     f"{of}_scale_{axis}": "linear" for of in ("force", "gyro") for axis in "xyz"
 }
-LAGS: Mapping[str, Kind] = {"fix_lag_s": "linear", "velocity_lag_s": "linear"}
 WHEEL: Mapping[str, Kind] = {"wheel_scale": "linear", **{f"axle_{axis}_m": "linear" for axis in "xyz"}}
 STATE = components_of(NAVIGATION)
 POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6])
@@ -39,9 +38,8 @@ class NavigationParameters(AlignmentParameters):
 
     Noise densities are per square root of hertz, those of the biases' random walks per square root of a
     second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
-    the body's axes; the axle is where wheels are. A fix was measured `fix_lag_s` before its time, beyond
-    its delay, and a velocity `velocity_lag_s`: as lags they may be estimated. The magnetic field is that
-    of the place, in the plane's axes. Gravity and the turn of the earth are those of the plane's origin.
+    the body's axes; the axle is where wheels are. The magnetic field is that of the place, along east,
+    north, up. Gravity and the turn of the earth are those of the plane's origin.
 
     Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body
     may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
@@ -60,11 +58,9 @@ class NavigationParameters(AlignmentParameters):
     lever_x_m: float = 0.0
     lever_y_m: float = 0.0
     lever_z_m: float = 0.0
-    fix_lag_s: float = 0.0
-    velocity_lag_s: float = 0.0
-    axle_x_m: float = 0.0
-    axle_y_m: float = 0.0
-    axle_z_m: float = 0.0
+    axle_x_m: float | None = None
+    axle_y_m: float | None = None
+    axle_z_m: float | None = None
     wheel_scale: float = 0.0
     field_east_ut: float | None = None
     field_north_ut: float | None = None
@@ -123,25 +119,20 @@ def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
 
 
 def position(state: Components, about: Any, parameters: Any) -> Components:
-    """Where the end of the lever arm was a lag ago."""
+    """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
-    px, py, pz, vx, vy, vz, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     x, y, z = into_plane((qw, qx, qy, qz), lever)
-    lag_s = parameters.fix_lag_s
-    return px + x - lag_s * vx, py + y - lag_s * vy, pz + z - lag_s * vz
+    return px + x, py + y, pz + z
 
 
 def velocity(state: Components, samples: Components, parameters: Any) -> Components:
-    """How fast the end of the lever arm, which turns with the body, moved a lag ago."""
-    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
-    force = specific_force(samples, (bx, by, bz), parameters)
+    """How fast the end of the lever arm moves, which turns with the body."""
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     rate = turn_rate(samples, (gx, gy, gz), parameters)
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
     x, y, z = into_plane((qw, qx, qy, qz), cross(rate, lever))
-    ax, ay, az = into_plane((qw, qx, qy, qz), force)
-    az = az - gravity(parameters.origin_latitude_deg, parameters.origin_altitude_m)
-    lag_s = parameters.velocity_lag_s
-    return vx + x - lag_s * ax, vy + y - lag_s * ay, vz + z - lag_s * az
+    return vx + x, vy + y, vz + z
 
 
 def fix_noise(parameters: Any) -> Components:
@@ -163,6 +154,9 @@ HANDHELD = {
     "gyro_bias_density": 2e-6,
     "origin_latitude_deg": 45.0,
     "origin_altitude_m": 0.0,
+    "axle_x_m": 0.0,
+    "axle_y_m": 0.0,
+    "axle_z_m": 0.0,
 }
 UNIT = Control(
     "inertial",
@@ -204,5 +198,6 @@ INERTIAL = Model(
     Motion(move, move_noise, lost=lost),
     control=UNIT,
     start=Start({}, HANDHELD, find=align),
-    estimable={**LEVER, **MOUNTING, **SCALES, **LAGS, **WHEEL},
+    estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
+    upright=True,
 )

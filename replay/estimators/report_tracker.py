@@ -30,6 +30,8 @@ from replay.engine.blocks import Block, Ragged
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.measurements import PLANE, read_vectors
+from replay.inference.association import Memory as AssociationMemory
+from replay.inference.association import Weights, memory_for, nearest
 
 LEVELS = 4
 # How fast the usual interval of a track follows what it does.
@@ -130,12 +132,15 @@ class Told(NamedTuple):
     spread: Floats
 
 
-class Candidates(NamedTuple):
-    """The best track of each report of one stamp, and how much better it is than a new one."""
+class Memory(NamedTuple):
+    """What the reports of one stamp are associated in: see `replay.inference.association`.
 
-    place: Integers
-    score: Floats
-    is_open: Booleans
+    Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
+    """
+
+    weights: Weights
+    probability: Floats
+    association: AssociationMemory
 
 
 def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
@@ -208,13 +213,13 @@ def birth_density(velocity: Floats, own_variance: float, settings: Settings) -> 
     return settings.births * ((1.0 - share) * moving + share * resting)
 
 
-def score_of(
+def ratio_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
 ) -> float:
-    """The log of how much likelier a report is of a track than of a vessel not met before."""
+    """How much likelier a report is of a track than of a vessel not met before."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     if duration_s <= 0.0:
-        return -np.inf
+        return 0.0
     difference = differences(
         tracks.mean[run, place], reports.position[event], reports.velocity[event], duration_s
     )
@@ -222,7 +227,7 @@ def score_of(
     widest, _, _ = widened(spread, settings.acceleration_density[LEVELS - 1], duration_s)
     widest += settings.position_variance[LEVELS - 1]
     if difference[0] ** 2 + difference[2] ** 2 > GATE * widest:
-        return -np.inf
+        return 0.0
     density = 0.0
     for level in range(LEVELS):
         a, b, c = reported(spread, level, duration_s, reports.velocity_variance[event], settings)
@@ -239,24 +244,7 @@ def score_of(
             factor += np.pi / settings.course_width_rad * held / (held + turned)
         density *= factor
     born = birth_density(reports.velocity[event], reports.velocity_variance[event], settings)
-    return np.log(density / born) if density > 0.0 else -np.inf
-
-
-def find_best(
-    run: int,
-    event: int,
-    slot: int,
-    reports: Reports,
-    tracks: Tracks,
-    settings: Settings,
-    candidates: Candidates,
-) -> None:
-    """Note the likeliest track of a report; none where a new one is likelier."""
-    candidates.place[slot], candidates.score[slot] = NO_TRACK, 0.0
-    for place in range(tracks.used[run]):
-        score = score_of(run, place, event, reports, tracks, settings)
-        if score > candidates.score[slot]:
-            candidates.place[slot], candidates.score[slot] = place, score
+    return density / born
 
 
 def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Settings) -> int:
@@ -380,34 +368,29 @@ def track(
     tracks: Tracks,
     settings: Settings,
     told: Told,
-    candidates: Candidates,
+    memory: Memory,
 ) -> None:
     """Take one run's reports in, stamp by stamp, the surest pair of report and track first."""
+    weights, probability = memory.weights, memory.probability
     first, end = reports.offsets[run], reports.offsets[run + 1]
     while first < end:
         count = 1
         while not reports.is_last[first + count - 1]:
             count += 1
         forget(run, reports.time_ns[first], tracks, settings)
-        for slot in range(count):
-            candidates.is_open[slot] = True
-            find_best(run, first + slot, slot, reports, tracks, settings, candidates)
-        remaining = count
-        while remaining > 0:
-            surest = -1
-            for slot in range(count):
-                if candidates.is_open[slot] and (
-                    surest < 0 or candidates.score[slot] > candidates.score[surest]
-                ):
-                    surest = slot
-            event, place = first + surest, candidates.place[surest]
-            if place != NO_TRACK and tracks.time_ns[run, place] == reports.time_ns[event]:
-                # another report of this stamp has it by now
-                find_best(run, event, surest, reports, tracks, settings, candidates)
-            else:
-                take_in(run, event, place, reports, tracks, settings, told)
-                candidates.is_open[surest] = False
-                remaining -= 1
+        used = tracks.used[run]
+        for row in range(count):
+            weights.missed[row] = 1.0
+            for place in range(used):
+                ratio = ratio_of(run, place, first + row, reports, tracks, settings)
+                weights.detected[row, place] = ratio
+        nearest(weights, count, used, probability, memory.association)
+        for row in range(count):
+            chosen = NO_TRACK
+            for place in range(used):
+                if probability[row, 1 + place] > 0.0:
+                    chosen = place
+            take_in(run, first + row, chosen, reports, tracks, settings, told)
         first += count
 
 
@@ -432,7 +415,9 @@ def run(
     told = Told(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
     ends = np.flatnonzero(reports.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
-    _compiled()(runs, reports, tracks, settings, told, scratch=partial(_candidates, together))
+    _compiled()(
+        runs, reports, tracks, settings, told, scratch=partial(_memory, together, tracks.number.shape[1])
+    )
     stream = make_stream(
         f"/estimates/{name}/track",
         schemas.TRACK_ESTIMATE,
@@ -504,8 +489,12 @@ def _trimmed(tracks: Tracks) -> Tracks:
     return Tracks(*(each if each.ndim == 1 else each[:, :most].copy() for each in columns))
 
 
-def _candidates(count: int) -> Candidates:
-    return Candidates(np.empty(count, np.int64), np.empty(count), np.empty(count, bool))
+def _memory(reports: int, places: int) -> Memory:
+    return Memory(
+        Weights(np.empty((reports, places)), np.empty(reports)),
+        np.empty((reports, 1 + places)),
+        memory_for(reports, places),
+    )
 
 
 def settings_of(parameters: ReportTrackerParameters) -> Settings:

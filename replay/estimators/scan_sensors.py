@@ -183,6 +183,7 @@ RANGES_BEARINGS = ScanSensor(
     polar_birth,
 )
 KINDS = (PLACES, BEARINGS, RANGES_BEARINGS)
+SEEN = {(kind.leaf, kind.schema.full_name) for kind in KINDS}  # of topics with detections
 # What a channel need not state, by kind: none of what it does not say is there.
 UNSTATED: dict[str, float] = {
     "sigma_across_rad": 0.0,
@@ -194,6 +195,11 @@ UNSTATED: dict[str, float] = {
     "bias_range_m": 0.0,
     "bias_rad": 0.0,
     "interval_s": 0.0,
+    "registration_sigma_m": 0.0,
+    "registration_sigma_rad": 0.0,
+    "correlated_sigma_m": 0.0,
+    "correlated_sigma_rad": 0.0,
+    "correlation_s": np.inf,
     "blind_from_rad": np.nan,
     "blind_to_rad": np.nan,
     "near_range_m": np.inf,
@@ -208,7 +214,18 @@ UNSTATED: dict[str, float] = {
 }
 # What is of other kinds alone.
 FOREIGN = {
-    PLACES.leaf: ("sigma_rad", "clutter_per_rad"),
-    BEARINGS.leaf: ("sigma_m", "clutter_per_m2", "joined_within_m"),
+    PLACES.leaf: (
+        "sigma_rad",
+        "clutter_per_rad",
+        "registration_sigma_rad",
+        "correlated_sigma_rad",
+    ),
+    BEARINGS.leaf: (
+        "sigma_m",
+        "clutter_per_m2",
+        "joined_within_m",
+        "registration_sigma_m",
+        "correlated_sigma_m",
+    ),
     RANGES_BEARINGS.leaf: ("clutter_per_rad", "joined_within_m"),
 }

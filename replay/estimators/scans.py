@@ -26,6 +26,11 @@ class Found(NamedTuple):
     detections: tuple[str, ...]
     origins: tuple[str, ...]
 
+    @property
+    def sensors(self) -> list[str]:
+        """Their names: what their topics begin with."""
+        return [scan.rpartition("/")[0].strip("/") for scan in self.scans]
+
 
 class Fix(NamedTuple):
     """A sensor's own position (2,)."""

@@ -65,12 +65,12 @@ class Targets(NamedTuple):
 
     Attributes:
         stage: their model, with one motion or all modes.
-        numbers: the model's parameters by name; NaN where one is not used.
+        parameters: the model's numbers; NaN where one is not used.
         newborn: a target of which only the position is known.
     """
 
     stage: Stage
-    numbers: dict[str, float]
+    parameters: Any
     newborn: Newborn
 
 
@@ -108,11 +108,11 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
                 f"it with --set motion.{each}=..."
             )
         numbers[each] = float(number)
-    mode = np.ones(1)
+    mode, own = np.ones(1), settings_type(names)(**numbers)
     if stage.modes:
-        _, mode = switching_of(where, model, settings_type(names)(*numbers.values()))
+        _, mode = switching_of(where, model, own)
     mean, sigma = _unknown(where, model, parameters.birth_sigma_mps)
-    return Targets(stage, numbers, Newborn(mean, np.diag(sigma**2), mode))
+    return Targets(stage, own, Newborn(mean, np.diag(sigma**2), mode))
 
 
 def _check(where: str, model: Model) -> None:

@@ -10,7 +10,6 @@ from recorders.errors import BadInput
 from replay.engine.blocks import Block, Ragged, join
 from replay.engine.estimator import Recursive
 from replay.estimators.targets import Targets
-from replay.inference.binding import settings_type
 from replay.inference.track_smoothing import smooth_tracks
 
 
@@ -65,7 +64,7 @@ def _smoothed(tracks: Ragged, targets: Targets) -> Ragged:
     )
     mean, covariance = smooth_tracks(
         targets.stage,
-        settings_type(tuple(targets.numbers))(*targets.numbers.values()),
+        targets.parameters,
         track.ravel(),
         stream.publish_time_ns,
         stream["mean"],

@@ -33,13 +33,13 @@ from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
 from replay.engine.failures import reason_stream
 from replay.engine.results import innovation_stream, named
-from replay.estimators.scan_sensors import FOREIGN, KINDS, UNSTATED
+from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
 from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.binding import number_fields
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
-from replay.inference.steps import Stage
 from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
 from replay.inference.tracks import NEVER, Tracks, no_tracks
 
@@ -78,6 +78,10 @@ class TrackerParameters(Parameters):
     `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
     `confirming_existence` on until it falls below `keeping_existence`, and ends below
     `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
+
+    With `registration_sigma_m` or `_rad`, a sensor has a constant error in all it measures, which the
+    tracks estimate together; with `correlated_sigma_m` or `_rad` one of its own for every track, which
+    is another one after `correlation_s`. Both are components of the tracks' states.
 
     `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
     detections that its track ever had.
@@ -134,6 +138,11 @@ class TrackerParameters(Parameters):
     blind_from_rad: float | None = None
     blind_to_rad: float | None = None
     interval_s: NonNegativeFloat | None = None
+    registration_sigma_m: NonNegativeFloat | None = None
+    registration_sigma_rad: NonNegativeFloat | None = None
+    correlated_sigma_m: NonNegativeFloat | None = None
+    correlated_sigma_rad: NonNegativeFloat | None = None
+    correlation_s: PositiveFloat | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -160,6 +169,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
     rows = []
+    _check_scans(topics, wanted)
     for scan in topics.values():
         prefix, _, leaf = scan.name.rpartition("/")
         if leaf != "scan" or scan.schema_name != schemas.SCAN.full_name:
@@ -190,28 +200,54 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
     return found
 
 
+def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
+    """Raise BadInput where detections are of scans that nobody recorded."""
+    for seen in topics.values():
+        prefix, _, leaf = seen.name.rpartition("/")
+        is_wanted = not wanted or prefix.strip("/") in wanted
+        if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
+            raise BadInput(
+                f"topic {seen.name}: detections without scans; record {prefix}/scan "
+                f"({schemas.SCAN.full_name}), which says how many each scan has, also where that is none"
+            )
+
+
+class Settings(NamedTuple):
+    """What the loop reads, a row for every sensor; and the errors that sensors have beside noise."""
+
+    names: tuple[str, ...]
+    numbers: Floats
+    errors: Errors
+
+
 def settings_of(
-    topics: Mapping[str, Topic],
-    found: Found,
-    parameters: TrackerParameters,
-    targets: Targets,
-) -> tuple[tuple[str, ...], Floats]:
-    """What the loop reads, by name, and for every sensor (sensors, names)."""
-    names = number_fields(TrackerParameters)
-    rows, own = [], {name: value for name, value in targets.numbers.items() if name not in names}
-    for kind, scan in zip(found.kinds, found.scans, strict=True):
-        values = {}
+    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters, targets: Targets
+) -> Settings:
+    """What parameters and channels say of the sensors and targets."""
+    names, own = number_fields(TrackerParameters), targets.parameters._asdict()
+    kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
+    for kind, scan in zip(kinds, found.scans, strict=True):
+        values = {name: number for name, number in own.items() if name not in names}
         for name in names:
             given = getattr(parameters, name)
-            if name in FOREIGN[KINDS[kind].leaf]:
+            if name in FOREIGN[kind.leaf]:
                 given = np.nan
             if given is None:
                 needed = name not in UNSTATED
                 given = stated([topics[scan]], name, TrackerParameters, needed=needed)
             values[name] = UNSTATED.get(name, np.nan) if np.isnan(given) else float(given)
-        gate = float(chi2.ppf(values["gate_probability"], len(KINDS[kind].measured)))
-        rows.append([*values.values(), *own.values(), gate])
-    return (*names, *own, "gate"), np.array(rows)
+        values["gate"] = float(chi2.ppf(values["gate_probability"], len(kind.measured)))
+        by_sensor.append(values)
+    errors = errors_of(found.sensors, kinds, by_sensor)
+    of_errors = {f"{name}_sigma": sigma for name, sigma in zip(errors.names, errors.sigma, strict=True)}
+    of_errors |= {
+        f"{name}_s": each for name, each in zip(errors.names, errors.correlation_s, strict=True)
+    }
+    size = targets.stage.model.size
+    for values, places in zip(by_sensor, errors.places, strict=True):
+        values |= {name: place if place < 0 else size + place for name, place in places.items()}
+        values |= of_errors
+    return Settings(tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors)
 
 
 # The estimator
@@ -229,7 +265,9 @@ class Setup(NamedTuple):
 
     def no_tracks(self, runs: int) -> Tracks:
         """Runs in which nothing was met yet."""
-        return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans))
+        first, count = self.tracker.shared
+        shared = self.newborn.covariance[first : first + count, first : first + count]
+        return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
     def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
         """The tracks after some scans, and what is said of them."""
@@ -367,7 +405,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
     pair = filled(told.pair, 1)
     scan = pair[:, 1]
     pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
-    sensors = ",".join(each.rpartition("/")[0].strip("/") for each in found.scans)
+    sensors = ",".join(found.sensors)
     approximated = np.flatnonzero(told.approximated)
     late = told.confirmed == NEVER
     unused = np.repeat(np.arange(len(late)), told.turned_away + late)
@@ -489,12 +527,20 @@ def _innovations(
         yield Ragged(stream, np.searchsorted(rows, ends))
 
 
-def tracker_of(parameters: TrackerParameters, stage: Stage, names: tuple[str, ...]) -> Tracker:
-    """The parts that the parameters ask for, for targets of a stage without sensors."""
+def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
+    """The parts that the parameters ask for."""
+    stage, shared = targets.stage, settings.errors.shared
     sensors = tuple(measuring(stage.model, kind) for kind in KINDS)
     association = "jpda" if parameters.association in EXISTING else parameters.association
     assert parameters.management is not None
-    return Tracker(stage._replace(sensors=sensors), KINDS, association, parameters.management, names)
+    return Tracker(
+        stage._replace(sensors=sensors),
+        KINDS,
+        association,
+        parameters.management,
+        settings.names,
+        (stage.model.size - len(settings.errors.names), shared),
+    )
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
@@ -504,9 +550,10 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
         return []
     scans = [topics[scan] for scan in found.scans]
     targets = targets_of(f"estimator {name}", parameters, scans)
-    names, settings = settings_of(topics, found, parameters, targets)
-    tracker = tracker_of(parameters, targets.stage, names)
-    setup = Setup(name, found, tracker, settings, targets.newborn, parameters.most_tracks)
+    settings = settings_of(topics, found, parameters, targets)
+    targets = with_errors(f"estimator {name}", targets, settings.errors)
+    tracker = tracker_of(parameters, targets, settings)
+    setup = Setup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
     seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
     read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
 
@@ -514,7 +561,11 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
         return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
 
     tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
-    return [smoothing_tracks(tracking, targets) if parameters.smoothed else tracking]
+    if not parameters.smoothed:
+        return [tracking]
+    if settings.errors.names:
+        raise BadInput(f"estimator {name}: errors of sensors are not smoothed; leave out one of both")
+    return [smoothing_tracks(tracking, targets)]
 
 
 TRACKER = Estimator(

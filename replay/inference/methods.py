@@ -144,7 +144,8 @@ def iterated_update(stage: Stage, number: int) -> Function:
     flat = is_flat(model.kinds)
     read_state, read_about = tuple_of(n), reading(sensor).about
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    tell, correct = noting(stage, number), correcting(model)
+    # the iterates are those of the one rotation, whatever the model's other corrections are
+    tell, correct = noting(stage, number), correcting(replace(model, upright=False))
     add, turn = retraction(model.kinds), resetting(model.kinds)
 
     def relinearise(

@@ -300,6 +300,9 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
+        upright: whether filters correct its orientation, the only one, by a turn about the third axis of
+            the log's frame and then by a tilt of the body. Where that axis is up, a heading that is
+            hardly known then leaves the tilt, which is known well, as it is.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -348,6 +351,7 @@ class Model:
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
     takes_fixes: bool = True
+    upright: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:

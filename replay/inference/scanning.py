@@ -30,6 +30,7 @@ from replay.inference.association import Weights, memory_for
 from replay.inference.gaussian import Innovation, kalman_step, whiten, wrap
 from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
+from replay.inference.shared_bias import Pool, pool_of
 from replay.inference.steps import Stage, Workspace, correcting, sensor_derivative, workspace
 from replay.inference.tracks import Tracks
 
@@ -118,6 +119,7 @@ class Memory(NamedTuple):
     Attributes:
         motion: of the motion of tracks, see `replay.inference.steps.Steps`.
         step: of the derivatives of sensors.
+        pool: of what all tracks share.
         place: (detections, 2), those of a scan, joined.
         group: (detections,), which ones are joined.
         clutter: (detections,), how dense it is there, with what has never been detected before.
@@ -136,6 +138,7 @@ class Memory(NamedTuple):
 
     motion: Any
     step: Workspace
+    pool: Pool
     place: Floats
     group: Integers
     clutter: Floats
@@ -158,12 +161,13 @@ class Memory(NamedTuple):
     shift: Floats
 
 
-def memory_of(stage: Stage, motion: Any, places: int, detections: int) -> Memory:
-    """Memory for so many tracks, and detections in a scan."""
+def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> Memory:
+    """Memory for so many errors that tracks share, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
     return Memory(
         motion=motion,
         step=workspace(stage),
+        pool=pool_of(shared, size, places),
         place=np.empty((detections, 2)),
         group=np.empty(detections, np.int64),
         clutter=np.empty(detections),
@@ -202,6 +206,27 @@ def measuring(model: Model, kind: ScanSensor) -> Sensor:
     return Sensor(kind.leaf, kind.schema, kind.measured, measure)
 
 
+@lru_cache(maxsize=4)
+def errors_at(component: int) -> Function:
+    """`errors(parameters)`: where in the state errors of a measured component stand; -1 for nowhere."""
+    places = f"parameters.registration_at_{component}, parameters.correlated_at_{component}"
+    return function_of(f"def errors(parameters):\n    return {places}\n")
+
+
+def adding_errors(components: int) -> Function:
+    """`add(rows, predicted, mean, parameters)`: the errors that the state has of what is measured."""
+    of_first, of_second = errors_at(0), errors_at(1)
+
+    def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
+        for i in range(components):
+            for place in of_first(parameters) if i == 0 else of_second(parameters):
+                if place >= 0.0:
+                    rows[i, int(place)] += 1.0
+                    predicted[i] += mean[int(place)]
+
+    return add
+
+
 def observing(model: Model, kind: ScanSensor) -> Function:
     """`observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
 
@@ -210,7 +235,7 @@ def observing(model: Model, kind: ScanSensor) -> Function:
     """
     m, read_state, read_origin = len(kind.measured), tuple_of(model.size), tuple_of(2)
     linearise, noise = sensor_derivative(model, measuring(model, kind)), kind.noise
-    add_noise, target = adding_noise(m), target_of(model)
+    add_noise, target, add_errors = adding_noise(m), target_of(model), adding_errors(m)
 
     def observe(
         track: int,
@@ -224,6 +249,7 @@ def observing(model: Model, kind: ScanSensor) -> Function:
         state, here = read_state(mean), read_origin(origin)
         linearise(state, here, parameters, memory.step)
         rows, predicted = memory.step.rows, memory.step.predicted
+        add_errors(rows, predicted, mean, parameters)
         innovation = Innovation(
             memory.difference[track, mode], memory.spread[track, mode], memory.cross[track, mode]
         )
@@ -245,6 +271,44 @@ def observing(model: Model, kind: ScanSensor) -> Function:
         return np.exp(-0.5 * determinant) / (2.0 * np.pi) ** (0.5 * m)
 
     return observe
+
+
+def correlating(model: Model, kind: ScanSensor, corner: tuple[int, int]) -> Function:
+    """`correlate(mean, covariance, origin, parameters, work)`: a newborn's position with sensor errors.
+
+    The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
+    by the position, whose components stand at `corner`.
+    """
+    x, y = corner
+    read_state, read_origin = tuple_of(model.size), tuple_of(2)
+    of_first, of_second = errors_at(0), errors_at(1)
+    linearise = sensor_derivative(model, measuring(model, kind))
+
+    def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
+        """Move the position by so much of an error."""
+        mean[x] += by_x * mean[error]
+        mean[y] += by_y * mean[error]
+        for k in range(len(covariance)):
+            covariance[x, k] += by_x * covariance[error, k]
+            covariance[y, k] += by_y * covariance[error, k]
+        for k in range(len(covariance)):
+            covariance[k, x] += by_x * covariance[k, error]
+            covariance[k, y] += by_y * covariance[k, error]
+
+    def correlate(
+        mean: Floats, covariance: Floats, origin: Floats, parameters: Any, work: Workspace
+    ) -> None:
+        linearise(read_state(mean), read_origin(origin), parameters, work)
+        a, b, c, d = work.rows[0, x], work.rows[0, y], work.rows[1, x], work.rows[1, y]
+        determinant = a * d - b * c
+        for place in of_first(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), -d / determinant, c / determinant)
+        for place in of_second(parameters):
+            if place >= 0.0:
+                shift(mean, covariance, int(place), b / determinant, -a / determinant)
+
+    return correlate
 
 
 def comparing(kind: ScanSensor) -> Function:

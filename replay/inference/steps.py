@@ -36,6 +36,7 @@ from replay.inference.generate import (
     is_flat,
     resetting,
     retraction,
+    things,
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
@@ -49,6 +50,7 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
+Axis = tuple[float, float, float]
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
@@ -515,6 +517,8 @@ def noting(stage: Stage, number: int) -> Function:
 def correcting(model: Model) -> Function:
     """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it."""
     add = retraction(model.kinds)
+    if model.upright:
+        return _correcting_upright(model, add)
     if is_flat(model.kinds):
 
         def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
@@ -529,6 +533,53 @@ def correcting(model: Model) -> Function:
         reset(work.step, covariance.T)
 
     return move_and_turn
+
+
+def _correcting_upright(model: Model, add: Function) -> Function:
+    """The same of a state whose orientation turns about up first, and is then tilted.
+
+    With up e in the body's axes, a correction d turns by a = e'd and tilts by p = d - a e; covariances
+    follow by e+ e' + Jr(p) (I - e e'), e+ being up after it. To first order nothing else than
+    `correcting` does; but what is unknown about e stays unknown about e+ alone.
+    """
+    reset = resetting(model.kinds)
+    place, row = next((c, t) for kind, c, t, _ in things(model.kinds) if kind == "quaternion")
+
+    def up(mean: Floats) -> Axis:
+        w, x, y, z = mean[place], mean[place + 1], mean[place + 2], mean[place + 3]
+        return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z
+
+    def take_out(rows: Floats, axis: Axis, along: Floats) -> None:
+        for column in range(len(along)):
+            a, b, c = rows[row, column], rows[row + 1, column], rows[row + 2, column]
+            along[column] = axis[0] * a + axis[1] * b + axis[2] * c
+        put_in(rows, (-axis[0], -axis[1], -axis[2]), along)
+
+    def put_in(rows: Floats, axis: Axis, along: Floats) -> None:
+        for column in range(len(along)):
+            for k in range(3):
+                rows[row + k, column] += axis[k] * along[column]
+
+    def carry(rows: Floats, before: Axis, after: Axis, step: Floats, along: Floats) -> None:
+        take_out(rows, before, along)
+        reset(step, rows)
+        put_in(rows, after, along)
+
+    def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
+        step, turned, before = work.step, work.turned, up(mean)
+        turn = before[0] * step[row] + before[1] * step[row + 1] + before[2] * step[row + 2]
+        for k in range(len(turned)):
+            turned[k] = 0.0
+        for k in range(3):
+            turned[row + k] = turn * before[k]
+            step[row + k] -= turned[row + k]
+        add(mean, turned)
+        add(mean, step)
+        after = up(mean)
+        carry(covariance, before, after, step, turned)
+        carry(covariance.T, before, after, step, turned)
+
+    return move
 
 
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:

@@ -66,13 +66,13 @@ def _motion(stage: Stage, parameters: Any, mean: Floats, duration_s: Floats) -> 
     """The matrices (n, size, size) of a linear motion over so long each, and of its noise."""
     size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
     assert stage.motion.noise is not None
-    transition, noise = np.empty((count, size, size)), np.empty((count, size, size))
+    transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))
     for column, unit in enumerate(np.eye(size)):
         moved = stage.motion.move(tuple(unit), (), duration_s, parameters)
         for row, entry in enumerate(moved):
             transition[:, row, column] = entry
     lower = stage.motion.noise(state, duration_s, parameters)
-    rows, columns = np.tril_indices(size)
+    rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
     for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):
         noise[:, i, j] = noise[:, j, i] = entry
     return transition, noise

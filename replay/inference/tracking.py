@@ -26,6 +26,7 @@ from replay.inference.scanning import (
     Scans,
     ScanSensor,
     comparing,
+    correlating,
     join_near,
     memory_of,
     observing,
@@ -34,7 +35,8 @@ from replay.inference.scanning import (
     target_of,
     updating,
 )
-from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion
+from replay.inference.shared_bias import pool_errors
+from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion, nothing
 from replay.inference.track_management import MANAGEMENTS, Evidence
 from replay.inference.tracks import NEVER, Tracks, are_near, drop, expected
 
@@ -47,6 +49,8 @@ class Tracker(NamedTuple):
         kinds: of sensors.
         association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
         names: the parameters that the parts read, in the order of the columns of the settings.
+        shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
+            `replay.inference.shared_bias`.
     """
 
     stage: Stage
@@ -54,6 +58,7 @@ class Tracker(NamedTuple):
     association: str
     management: str
     names: tuple[str, ...]
+    shared: tuple[int, int]
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -170,7 +175,12 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     detection_of = choosing([kind.detection for kind in kinds], "target, origin, parameters")
     clutter_of = choosing([kind.clutter for kind in kinds], "detection, parameters")
     begins = tuple(kind.birth is not None for kind in kinds)
+    shared_at, shared = tracker.shared
     births = [kind.birth for kind in kinds if kind.birth is not None]
+    correlate = nothing
+    if shared_at < model.size:
+        correlations = [correlating(model, kind, corner) for kind in kinds if kind.birth is not None]
+        correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
     birth_number = tuple(sum(begins[:k]) for k in range(len(kinds)))
     birth = choosing(births, "detection, origin, parameters")
     read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
@@ -253,15 +263,19 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
         for place in range(tracks.used[run]):
             probability = memory.probability[place, : 1 + count]
+            memory.pool.is_updated[place] = False
             waited_s = (now_ns - tracks.updated_ns[run, place, sensor]) * 1e-9
             if probability[0] < 1.0 and waited_s >= p.interval_s:
                 correct(run, place, count, kind, tracks, memory)
+                memory.pool.is_updated[place] = True
                 tracks.updated_ns[run, place, sensor] = now_ns
             if begins[kind]:
                 if probability[0] < 0.5:
                     tracks.seen_ns[run, place] = now_ns
                 inside = memory.detectable[place] * p.gate_probability
                 judge(run, place, Evidence(inside, probability, memory.weights), tracks, p)
+        if shared > 0:
+            pool_errors(run, shared_at, tracks, memory.pool)
 
     def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
         """Whether an older confirmed track is about where this confirmed one is, and moves alike."""
@@ -340,6 +354,13 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     triangle[2],
                 )
                 covariance[corner[0], corner[1]] = covariance[corner[1], corner[0]] = triangle[1]
+                for i in range(shared):
+                    mean[shared_at + i] = tracks.shared_mean[run, i]
+                    for j in range(shared):
+                        known = tracks.shared_covariance[run, i, j]
+                        covariance[shared_at + i, shared_at + j] = known
+                number = birth_number[kind]
+                correlate(number, mean, covariance, scans.origin[scan], p, memory.step)
                 probability = newborn.mode[mode]
                 tracks.mode[run, place, mode] = probability
                 tracks.log_mode[run, place, mode] = np.log(probability) if probability > 0.0 else -np.inf
@@ -452,14 +473,15 @@ def track_scans(
             **{name: getattr(scans, name)[rows] for name in BY_SCAN},
         )
         told = _no_told(batch, runs, places, tracker.sizes)
-        memory = partial(_memory, tracker.stage, places, largest)
+        memory = partial(_memory, tracker, places, largest)
         _compiled(tracker)(runs, batch, settings, newborn, tracks, told, scratch=memory)
         said.append((batch, told))
     return tracks, said
 
 
-def _memory(stage: Stage, places: int, detections: int) -> Memory:
-    return memory_of(stage, moving(stage).memory(()), places, detections)
+def _memory(tracker: Tracker, places: int, detections: int) -> Memory:
+    motion = moving(tracker.stage).memory(())
+    return memory_of(tracker.stage, motion, tracker.shared[1], places, detections)
 
 
 def _no_told(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> Told:

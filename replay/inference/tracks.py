@@ -27,6 +27,7 @@ class Tracks(NamedTuple):
         score, best_score: (runs, places), the log-likelihood ratio since its birth, and its highest.
         seen_ns: (runs, places), when a sensor that begins tracks saw it last.
         updated_ns: (runs, places, sensors), when each sensor updated it last.
+        shared_mean, shared_covariance: (runs, ...), of what all share: `replay.inference.shared_bias`.
     """
 
     used: Integers
@@ -45,12 +46,17 @@ class Tracks(NamedTuple):
     best_score: Floats
     seen_ns: Integers
     updated_ns: Integers
+    shared_mean: Floats
+    shared_covariance: Floats
 
 
-def no_tracks(runs: int, places: int, sizes: tuple[int, int, int], sensors: int) -> Tracks:
+def no_tracks(
+    runs: int, places: int, sizes: tuple[int, int, int], sensors: int, shared: Floats
+) -> Tracks:
     """Runs in which nothing was met yet, with room for so many tracks.
 
-    `sizes` are those of the modes, of the state and of its tangent space.
+    `sizes` are those of the modes, of the state and of its tangent space; `shared` (k, k) is how
+    uncertain what all tracks share is at first.
     """
     modes, n, t = sizes
     return Tracks(
@@ -70,6 +76,8 @@ def no_tracks(runs: int, places: int, sizes: tuple[int, int, int], sensors: int)
         best_score=np.zeros((runs, places)),
         seen_ns=np.zeros((runs, places), np.int64),
         updated_ns=np.zeros((runs, places, sensors), np.int64),
+        shared_mean=np.zeros((runs, len(shared))),
+        shared_covariance=np.tile(shared, (runs, 1, 1)),
     )
 
 

@@ -6,7 +6,7 @@ which draws one standard deviation: a band of k sigma is sent with k^2 times the
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import cycle
+from itertools import compress, cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -41,9 +41,13 @@ POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
 
 
 class Squares(NamedTuple):
-    """Chi-square values of an estimator and their degrees of freedom."""
+    """Chi-square values of an estimator and their degrees of freedom; `of` is what they are of.
+
+    It is empty where the degrees tell.
+    """
 
     degrees: int
+    of: str
     estimator: str
     time_ns: Times
     values: Floats
@@ -107,7 +111,7 @@ def draw_nees(
 ) -> list[rrb.TimeSeriesView]:
     """NEES of each estimator with the bounds of a single run; one plot per number of components."""
     found = [
-        Squares(len(errors.components), errors.estimator, errors.time_ns, errors.nees)
+        Squares(len(errors.components), "", errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
         if not errors.is_bound
     ]
@@ -115,14 +119,19 @@ def draw_nees(
 
 
 def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """NIS of each estimator, a point per measurement; one plot per number of measured components."""
+    """NIS of each estimator, a point per measurement; one plot per set of measured components."""
     found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         innovations = innovations_of(gather([stream]))
-        for degrees in np.unique(innovations.degrees[innovations.degrees > 0]).tolist():
-            rows = innovations.degrees == degrees
-            of_degrees = (innovations.time_ns[rows], innovations.squared[rows])
-            found.append(Squares(degrees, estimator, *of_degrees))
+        patterns, of_pattern = np.unique(np.isfinite(stream["innovation"]), axis=0, return_inverse=True)
+        degrees = patterns.sum(axis=1)
+        for number in np.flatnonzero(degrees > 0).tolist():
+            rows, own = of_pattern.ravel() == number, int(degrees[number])
+            is_named = len(stream.components) == patterns.shape[1]
+            alike = np.count_nonzero(degrees == own) > 1
+            of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
+            squares = innovations.time_ns[rows], innovations.squared[rows]
+            found.append(Squares(own, of, estimator, *squares))
     return _draw_squares(canvas, scene, case, "NIS", found, POINTS)
 
 
@@ -138,10 +147,10 @@ def _draw_squares(
 ) -> list[rrb.TimeSeriesView]:
     """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
     views = []
-    for degrees in sorted({each.degrees for each in found}):
-        plot = entity_path("plots", case, f"{name.lower()}_{degrees}")
+    for degrees, of in sorted({(each.degrees, each.of) for each in found}):
+        plot = entity_path("plots", case, f"{name.lower()}_{degrees}{of and '_' + of.partition(',')[0]}")
         low, high = chi_square_interval(degrees, 1)
-        alike = [each for each in found if each.degrees == degrees]
+        alike = [each for each in found if (each.degrees, each.of) == (degrees, of)]
         ends = [min(each.time_ns[0] for each in alike), max(each.time_ns[-1] for each in alike)]
         band = rr.Measurements.columns(
             values=[0.5 * (low + high)] * 2, variances=[0.25 * (high - low) ** 2] * 2
@@ -149,9 +158,9 @@ def _draw_squares(
         look = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
         canvas.send(f"{plot}/bounds", np.array(ends), band)
         canvas.fix(f"{plot}/bounds", look)
-        for _, estimator, time_ns, values in alike:
+        for _, _, estimator, time_ns, values in alike:
             draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
-        title = f"{name} of {degrees} component{'s' * (degrees != 1)}"
+        title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
         views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
     return views
 

@@ -252,7 +252,7 @@ def _draw_gospa(
     """GOSPA at the instants."""
     for name, of_tracker in errors.items():
         draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
-    return plot_view("plots/gospa", "GOSPA (m), c = 20 m, without what has no truth")
+    return plot_view("plots/gospa", "GOSPA (m), c = 20 m")
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:

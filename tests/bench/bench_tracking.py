@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.ensemble import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.blocks import Block, gather, merge_events
 from replay.engine.sources import MemorySource
@@ -61,23 +62,43 @@ def main() -> list[Row]:
     return [
         ("JPDA tracker, us per scan", ours_us, theirs_us, theirs_us / ours_us),
         ("largest difference of a marginal", 0.0, 0.0, apart),
+        pmbm_in_time(),
     ]
+
+
+def pmbm_in_time() -> Row:
+    """How long PMBM takes for a scan of 20 targets and 30 false detections, and has at 10 Hz.
+
+    Scans are a second apart, so that gates are wider than at 10 Hz.
+    """
+    scene = simulate(0, things=20, scans=100, clutter=30.0)
+    log = source(scene, clutter=30.0)
+    settings = {"sigma_m": VARIANCE_M2**0.5, "acceleration_density": 0.04, "most_tracks": 300}
+    settings |= {"undetected_per_m2": 20 / FIELD_M**2 / len(scene.scans), "same_within_m": 0.0}
+    times = []
+    for _ in range(1 + REPEATS):
+        begin = perf_counter()
+        outputs = replay_in_memory([log], {"tracker:pmbm": settings})
+        times.append(perf_counter() - begin)
+    assert not len(outputs["/estimates/tracker:pmbm/unused"])
+    seconds = median(times[1:]) / len(scene.scans)
+    return "PMBM, ms per scan and from scan to scan at 10 Hz", 1e3 * seconds, 100.0, 0.1 / seconds
 
 
 def run_ours(scene: Scene, log: MemorySource) -> Tracked:
     """Our tracker on a scene."""
     found = find_sensors(log.topics, ())
     targets = targets_of("bench", PARAMETERS, [log.topics[scan] for scan in found.scans])
-    names, settings = settings_of(log.topics, found, PARAMETERS, targets)
+    settings = settings_of(log.topics, found, PARAMETERS, targets)
     streams = {topic: gather([log.streams[topic]]) for topic in (*found.scans, *found.detections)}
     scans = scans_of(Block(streams, merge_events(streams, "publish_time")), found, KINDS, {})
-    tracker = tracker_of(PARAMETERS, targets.stage, names)
+    tracker = tracker_of(PARAMETERS, targets, settings)
     tracks = begun(scene.states[0])
-    _, said = track_scans(tracker, scans, settings, targets.newborn, tracks)
+    _, said = track_scans(tracker, scans, settings.numbers, targets.newborn, tracks)
     times = []
     for _ in range(REPEATS):
         begin = perf_counter()
-        track_scans(tracker, scans, settings, targets.newborn, tracks)
+        track_scans(tracker, scans, settings.numbers, targets.newborn, tracks)
         times.append(perf_counter() - begin)
     return Tracked(marginals_of(scans, said, len(scene.states[0])), median(times) / len(scans.time_ns))
 
@@ -85,7 +106,7 @@ def run_ours(scene: Scene, log: MemorySource) -> Tracked:
 def begun(states: np.ndarray) -> Tracks:
     """Confirmed tracks with these states (things, 4)."""
     count = len(states)
-    tracks = no_tracks(1, count, (1, 4, 4), 1)
+    tracks = no_tracks(1, count, (1, 4, 4), 1, np.empty((0, 0)))
     tracks.used[:] = tracks.met[:] = count
     tracks.time_ns[:] = tracks.seen_ns[:] = SIMULATION_EPOCH_NS
     tracks.number[0] = np.arange(count)

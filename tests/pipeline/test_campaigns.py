@@ -10,6 +10,7 @@ import time
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from recorders.errors import BadInput
 from recorders.log import write_log
 from recorders.recording import record_run
 from replay.judging.sums import BinnedSums
+from tests.bench import scaling
 
 # Three cells, of which the last is small.
 RUNS = 260
@@ -327,6 +329,12 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     assert main([*begin, "--workers", "2", "--scheduler", "local:2"]) == 2
     assert "the scheduler has its own; give one" in capsys.readouterr().err
     assert main([*begin, "--workers", "0"]) == 2
+    capsys.readouterr()
+    assert main(["run", "ispace", "--workers", "2", *out]) == 2
+    assert (
+        "networks, replays all runs together, in one process; leave out --workers"
+        in capsys.readouterr().err
+    )
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
     assert "give local:N with a number of workers" in capsys.readouterr().err
@@ -336,6 +344,27 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
 def test_the_version_of_the_code_is_of_all_sources():
     assert version_of_code() == version_of_code.__wrapped__()
     assert len(version_of_code()) == 64
+
+
+def test_the_page_and_its_figure_say_what_was_measured():
+    measured = scaling.kept()
+    page = scaling.PAGE.read_text(encoding="utf-8")
+    assert scaling.rendered(page, measured) == page, "python -m tests.bench.scaling --keep makes it anew"
+    drawn = ElementTree.parse(scaling.FIGURE).find(".//{http://purl.org/dc/elements/1.1/}description")
+    assert drawn is not None
+    assert drawn.text == scaling.chart(measured).model_dump_json()
+    slower = measured._replace(driver_s=2 * measured.driver_s)
+    assert scaling.rendered(page, slower) != page
+
+
+def test_the_simulated_driver_is_the_limit_where_it_is_busy():
+    """A cell of 1 s, and .1 s of the driver: ten workers and one more keep it busy."""
+    network = scaling.NETWORK_BYTES_PER_S
+    measured = scaling.Measured(1.0, 0.05, round(0.05 * network), (100.0, 200.0))
+    assert measured.limit_workers == 11
+    assert scaling.simulated(measured, 1) == pytest.approx(128 / 1.1, rel=0.01)
+    assert scaling.simulated(measured, 4) == pytest.approx(4 * 128 / 1.1, rel=0.05)
+    assert scaling.simulated(measured, 100) == pytest.approx(measured.limit_runs_per_s, rel=0.01)
 
 
 @pytest.mark.paper
@@ -372,8 +401,13 @@ def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
 
 @pytest.mark.paper
 def test_dask_workers_give_the_same_bytes(tmp_path):
-    pytest.importorskip("distributed")
+    """Of a cluster of its own, and of one that is there, whose workers share no files with it."""
+    distributed = pytest.importorskip("distributed")
     place = tmp_path / "result"
     files = run(place)
     shutil.rmtree(place)
     assert run(place, crew_of(None, "local:2", RUNS)) == files
+    shutil.rmtree(place)
+    loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **loopback) as cluster:
+        assert run(place, crew_of(None, cluster.scheduler_address, RUNS)) == files

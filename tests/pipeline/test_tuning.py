@@ -356,6 +356,52 @@ def test_what_need_not_be_positive_is_found_too() -> None:
         assert row["high"] - row["low"] < 0.2
 
 
+@pytest.mark.paper
+@pytest.mark.parametrize(
+    ("scenario", "duration", "estimator", "free"),
+    [
+        (
+            "landmarks",
+            {"duration_s": 30.0, "range_bearing": {"rate_hz": 2.0}},
+            "ekf",
+            ["forward_noise_density", "turn_noise_density", "sigma_range_m", "sigma_bearing_rad"],
+        ),
+        (
+            "manoeuvres",
+            {},
+            "imm:ekf",
+            ["acceleration_sigma_mps2", "manoeuvring_sigma_mps2", "standing_sigma_mps"],
+        ),
+        (
+            "extended-target",
+            {},
+            "analytic",
+            ["size_drift_m2", "position_drift_m2", "point_variance_m2"],
+        ),
+        ("batch-reactor", {}, "lrkf:ukf", ["process_variance", "pressure_variance"]),
+        ("navigation", {"duration_s": 20.0}, "ekf", ["force_noise_density", "gyro_noise_density"]),
+    ],
+)
+def test_a_start_ten_times_off_leads_to_the_same_optimum(
+    scenario: str, duration: dict[str, Any], estimator: str, free: list[str]
+) -> None:
+    """Each parameter and all together, times and divided by ten: within a hundredth of the likelihood.
+
+    What logs tell so little of that this leaves it more than its interval is said in words.
+    """
+    log = fl.record(scenario, seed=1, **duration)
+    near = fl.tune(log, estimator, free)
+    starts = near.parameters.set_index("parameter")["start"]
+    bounds = {each.name: (each.low, each.high) for each in near.found.coordinates.free}
+    for factor in (0.1, 10.0):
+        for changed in (free, *([name] for name in free)):
+            far = fl.tune(log, estimator, free, set=dict(factor * starts[changed]), bounds=bounds)
+            assert far.costs[1] == pytest.approx(near.costs[1], abs=0.01), (changed, factor)
+            for row in near.parameters.assign(far=far.found.optimum).to_dict("records"):
+                is_said = any(row["parameter"] in note for note in near.notes_of_search)
+                assert row["low"] <= row["far"] <= row["high"] or is_said, (changed, factor, row)
+
+
 def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:
     """Values of every run and parameter, and over the runs how often their intervals hold the truth."""
     out = tmp_path / "tuning"
@@ -368,3 +414,30 @@ def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None
     covered = table.groupby("parameter")["is_covered"].mean()
     for name in FREE:
         assert told.json["metrics"][f"ekf.covered_share.{name}-20s"] == covered[name]
+
+
+def test_values_of_some_vehicles_are_judged_on_others(fuselog: Fuselog, tmp_path: Path) -> None:
+    """Those held out are no part of the search: as if there were two logs."""
+    own = tmp_path / "mine.toml"
+    experiment = """
+        title = "two robots tune, one judges"
+        study = "tuning-held-out"
+        record = { scenario = "landmarks", parameters = { robots = 3, duration_s = 10.0 } }
+        estimators.ekf = { sigma_range_m = 0.5, gate_probability = 1.0 }
+        options.free = ["sigma_range_m"]
+        options.tuned_by = ["robot1", "robot2"]
+        options.held_out = ["robot3"]
+    """
+    own.write_text(experiment)
+    metrics = fuselog("run", own, "--logs", "0", "--out", tmp_path / "r", "--json").json["metrics"]
+    assert metrics["start.sigma_range_m"] == 0.5
+    assert metrics["tuned.sigma_range_m"] == pytest.approx(0.1, rel=0.1)
+    for label in ("start", "tuned"):
+        alone = metrics[f"{label}-held-out.log_likelihood.robot3"]
+        assert metrics[f"{label}-held-out.open_gate_log_likelihood"] == pytest.approx(alone)
+        assert f"{label}.log_likelihood.robot3" not in metrics
+        assert f"{label}-held-out.log_likelihood.robot1" not in metrics
+    own.write_text(experiment.replace("robot3", "robot7"))
+    refused = fuselog("run", own, "--out", tmp_path / "other")
+    assert (refused.code, len(refused.err.splitlines())) == (2, 1)
+    assert "no topic begins with /robot7/" in refused.err

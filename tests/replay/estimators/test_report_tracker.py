@@ -192,7 +192,7 @@ def test_levels_in_another_order_are_refused():
 def test_table_of_tracks_by_hand():
     """A track that swallows two vessels is the own track of the one with more reports."""
     things = np.array([7, 7, 7, 8, 8, 7, 7, 9])
-    table = track_table(things, np.array([1, 1, 2, 1, 1, 1, 1, 4])).set_index("thing")
+    table = track_table(things, np.array([1, 1, 2, 1, 1, 1, 1, 4])).set_index("target")
     assert table["track"].to_dict() == {7: 1, 8: -1, 9: 4}
     assert table["share"].to_dict() == {7: 0.8, 8: 0.0, 9: 1.0}
     assert table["largest_share"].to_dict() == {7: 0.8, 8: 1.0, 9: 1.0}

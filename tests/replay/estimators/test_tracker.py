@@ -510,7 +510,11 @@ def _numbered(streams: list[Stream], number: list[int]) -> list[Stream]:
         ),
         (_numbered(sensor("radar", RADAR, [0, 1], [[], []]), [4, 4]), {}, "two scans have the number 4"),
         (_numbered(sensor("radar", RADAR, [0], [[(1, 2)]]), [7]), {}, "says 1 detections, there are 0"),
-        (_without(sensor("radar", RADAR, [0], [[(1, 2)]]), "/radar/scan"), {}, "does not fit this log"),
+        (
+            _without(sensor("radar", RADAR, [0], [[(1, 2)]]), "/radar/scan"),
+            {},
+            "detections without scans; record",
+        ),
         (sensor("radar", {"sigma_m": "1"}, [0], [[]]), {}, "does not state clutter_per_m2.*--set"),
         (sensor("radar", RADAR, [0], [[]]), {"sensors": ["lidar"]}, "no scans of sensor lidar"),
         (

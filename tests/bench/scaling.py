@@ -1,0 +1,183 @@
+"""How far campaigns scale: measured on one and two workers here, simulated from there to a thousand.
+
+`python -m tests.bench.scaling` measures, keeps what it measured, and makes the table and the figure of
+docs/many-runs.md; `python -m tests.bench.scaling --keep` makes them from what is kept. The simulation is
+of one driver, which serves finished cells one after another: their results come over its network, are
+kept and merged, and the worker gets its next cell.
+"""
+
+import heapq
+import json
+import re
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import process_time
+from typing import NamedTuple
+
+import matplotlib as mpl
+
+from pipeline.campaigns import Cell, cells_of
+from pipeline.charts import Axis, Chart, Panel, curve, draw, level
+from pipeline.ensemble import RUNS_AT_ONCE
+from pipeline.executors import processes
+from pipeline.experiment import Setting, load_experiment, run_experiment
+from pipeline.kept import kept_cells
+from tests.bench.timing import seconds
+
+DOCS = Path(__file__).parents[2] / "docs"
+KEPT, PAGE, FIGURE = DOCS / "many-runs.json", DOCS / "many-runs.md", DOCS / "figures" / "many-runs.svg"
+RUNS = 2000
+WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
+NETWORK_BYTES_PER_S = 125e6  # of the driver: a gigabit a second
+LATENCY_S = 1e-3
+CELLS_EACH = 20  # of every worker in the simulation
+_TABLE = re.compile(r"(<!-- scaling -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+class Measured(NamedTuple):
+    """What was measured; seconds are of CPU time.
+
+    Attributes:
+        cell_s: a worker of one core works a cell of 128 runs off.
+        driver_s: the driver keeps, reads and merges what a cell left.
+        cell_bytes: the size of that.
+        runs_per_s: of whole campaigns of 2000 runs, with one worker and with two.
+    """
+
+    cell_s: float
+    driver_s: float
+    cell_bytes: int
+    runs_per_s: tuple[float, float]
+
+    @property
+    def served_s(self) -> float:
+        """How long the driver is busy with a cell: its results come in, and are kept and merged."""
+        return self.cell_bytes / NETWORK_BYTES_PER_S + self.driver_s
+
+    @property
+    def limit_runs_per_s(self) -> float:
+        """More the driver cannot serve."""
+        return RUNS_AT_ONCE / self.served_s
+
+    @property
+    def limit_workers(self) -> int:
+        """So many workers keep the driver busy."""
+        return round((self.cell_s + 2 * LATENCY_S) / self.served_s) + 1
+
+
+def measure() -> Measured:
+    """Measure; rates are of wall time, so that two cores must have nothing else to do for a minute."""
+    with tempfile.TemporaryDirectory() as scratch:
+        rates = [RUNS / seconds(partial(_campaign, Path(scratch), count)) for count in (1, 2)]
+        return Measured(*_measured_cells(Path(scratch)), (rates[0], rates[1]))
+
+
+def _campaign(folder: Path, workers: int) -> None:
+    name, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
+    run_experiment(name, experiment, folder / "result", logs=0, crew=processes(workers))
+
+
+def _measured_cells(folder: Path) -> tuple[float, float, int]:
+    """CPU time of a cell and of the driver with it, and the bytes that come to the driver."""
+    _, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
+    cells = cells_of(experiment, Setting(folder, folder, logs=0, draws=False))[:7]
+    cell_s, driver_s, left, whole = [], [], b"", None
+    with processes(1)() as team, kept_cells(folder / "cells") as kept:
+        kept.begin()
+        for cell in cells:
+            left, taken_s = team.executor.submit(_timed, cell, kept.place_of(cell.key)).result()
+            begin_s = process_time()
+            kept.write(cell.key, left)
+            done = kept.read(cell.key)
+            if whole is None:
+                whole = done
+            else:
+                whole.merge(done)
+            driver_s.append(process_time() - begin_s)
+            cell_s.append(taken_s)
+    return median(cell_s), median(driver_s), len(left)
+
+
+def _timed(cell: Cell, folder: Path) -> tuple[bytes, float]:
+    begin_s = process_time()
+    return cell.packed(folder), process_time() - begin_s
+
+
+def simulated(measured: Measured, workers: int) -> float:
+    """Runs per second of so many workers, each with `CELLS_EACH` cells to do, when all have begun."""
+    cells = CELLS_EACH * workers
+    waiting = workers  # cells that are handed out
+    arriving = [measured.cell_s + LATENCY_S] * workers
+    free_s = 0.0
+    for _ in range(cells):
+        free_s = max(free_s, heapq.heappop(arriving)) + measured.served_s
+        if waiting < cells:
+            waiting += 1
+            heapq.heappush(arriving, free_s + measured.cell_s + 2 * LATENCY_S)
+    return cells * RUNS_AT_ONCE / free_s
+
+
+def table(measured: Measured) -> str:
+    """What the page says of it."""
+    rows = [
+        f"| {workers} | {simulated(measured, workers):.0f} | "
+        f"{simulated(measured, workers) / simulated(measured, 1) / workers:.0%} |"
+        for workers in WORKERS
+    ]
+    one, two = measured.runs_per_s
+    said = f"""\
+Measured on two cores, {RUNS} runs of `landmarks` with the start of processes and figures:
+{one:.0f} runs/s with one worker, {two:.0f} with two. A cell takes a worker {measured.cell_s:.2f} s
+and leaves {measured.cell_bytes / 1e6:.1f} MB, which the driver keeps and merges in \
+{1e3 * measured.driver_s:.0f} ms. Simulated
+from these, with a gigabit network, the driver is the limit from {measured.limit_workers} workers on,
+at {measured.limit_runs_per_s:.0f} runs/s:
+
+| workers | runs/s, simulated | of what they could do |
+|---|---|---|
+"""
+    return said + "\n".join(rows) + "\n"
+
+
+def chart(measured: Measured) -> Chart:
+    """Runs per second over workers: measured, simulated, and what the driver can serve."""
+    rates = [simulated(measured, workers) for workers in WORKERS]
+    series = [
+        curve(
+            "as many times one worker", WORKERS, [rates[0] * workers for workers in WORKERS], "dashed"
+        ),
+        level("the driver's limit", WORKERS, measured.limit_runs_per_s),
+        curve("simulated", WORKERS, rates, "line+markers"),
+        curve("measured, whole campaigns", (1, 2), measured.runs_per_s, "markers"),
+    ]
+    panel = Panel(
+        x=Axis(label="workers", log=True), y=Axis(label="runs per second", log=True), series=series
+    )
+    return Chart(title="landmarks, cells of 128 runs, a gigabit network", panels=[panel])
+
+
+def kept() -> Measured:
+    """What was measured last."""
+    return Measured(**json.loads(KEPT.read_text(encoding="utf-8")))
+
+
+def rendered(page: str, measured: Measured) -> str:
+    """The page with its table made anew."""
+    return _TABLE.sub(lambda found: f"{found[1]}{table(measured)}{found[2]}", page)
+
+
+def main() -> None:
+    """Measure, unless `--keep` is given, and make the page's table and figure."""
+    if "--keep" not in sys.argv[1:]:
+        KEPT.write_text(json.dumps(measure()._asdict(), indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8"), kept()), encoding="utf-8")
+    with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+        said = {"Date": None, "Description": chart(kept()).model_dump_json()}
+        draw(chart(kept())).savefig(FIGURE, metadata=said)
+
+
+if __name__ == "__main__":
+    main()

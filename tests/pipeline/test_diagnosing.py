@@ -1,0 +1,348 @@
+"""Diagnosing: the reference sheet's gains, faults that are named, what is unusual, what is refused."""
+
+import json
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.diagnosing import alterations as alter
+from pipeline.diagnosing import study
+from pipeline.diagnosing.causes import find_causes, least_gain
+from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
+from pipeline.diagnosing.hypotheses import hypotheses
+from pipeline.diagnosing.likelihood import Likelihood, Peak, Trial, interval, peak
+from replay.engine.estimator import bind
+from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
+
+Fuselog = Callable[..., Any]
+OPEN = {"gate_probability": 1.0}
+SEEN = "/robot1/range_bearing"
+
+
+def gains_of(source: fl.MemorySource, settings: dict[str, float]) -> dict[str, Peak]:
+    """What scaling each noise alone gains, and by how much (logarithms)."""
+    given = {"kind": "ekf", **settings, **OPEN}
+    base, likelihood = Trial(source, given), Likelihood("ekf")
+    tried = hypotheses("ekf", bind("ekf", [source], given), base, likelihood.begin(base))
+    [before] = likelihood([base])
+    return {
+        each.topic: peak(
+            lambda values, each=each: [
+                found - before for found in likelihood([each.without(base, value) for value in values])
+            ],
+            each.tried,
+            each.limit,
+            0.0,
+        )
+        for each in tried
+        if each.topic in FREE
+    }
+
+
+def test_the_largest_gain_of_the_sheet_names_the_sensor_not_the_largest_scale() -> None:
+    """Section 9, a bearing's sigma 3 times too small: the speed's scale is larger, its gain is not."""
+    found = gains_of(recorded(600, 300.0), of_sigmas(0.1, 0.05, 0.2, 0.01))
+    scales = [np.exp(found[name].value) for name in FREE]
+    assert scales == pytest.approx([11.97, 3.63, 1.00, 3.0763], abs=0.006)
+    assert [found[name].gain for name in FREE] == pytest.approx([184.6, 650.1, 0.004, 758.9], abs=0.06)
+    clean = gains_of(recorded(600, 300.0), of_sigmas(0.1, 0.05, 0.2, 0.03))
+    assert max(each.gain for each in clean.values()) < 1.8
+
+
+def test_a_peak_far_from_where_the_search_begins_has_its_interval() -> None:
+    """A parabola of standard error 0.1 about 30: the interval is 1.96 errors to each side."""
+
+    def gain(values: Sequence[float]) -> list[float]:
+        return [0.5 * ((30.0 / 0.1) ** 2 - ((value - 30.0) / 0.1) ** 2) for value in values]
+
+    def little(values: Sequence[float]) -> list[float]:
+        return [0.1 * value - value**2 for value in values]
+
+    found = peak(gain, (-1.0, 1.0), np.inf, 5.0)
+    assert found == pytest.approx((30.0, 45000.0), rel=1e-6)
+    assert interval(gain, found, 1.0) == pytest.approx((29.804, 30.196), abs=2e-3)
+    assert peak(gain, (-1.0, 1.0), 10.0, 5.0).value == pytest.approx(10.0, abs=0.02)
+    assert peak(little, (-1.0, 1.0), np.inf, 5.0) == (0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def run() -> fl.MemorySource:
+    """A robot for half a minute, without a fault."""
+    return fl.record("landmarks", seed=3, duration_s=30.0, speed_mps=2.0)
+
+
+def first(source: fl.MemorySource, **settings: float) -> Any:
+    """The first sentence of a diagnosis."""
+    return fl.diagnose(source, "ekf", set={**OPEN, **settings}).sentences[0]
+
+
+def test_nothing_is_found_where_nothing_is_wrong(run: fl.MemorySource) -> None:
+    found = fl.diagnose(run, "ekf")
+    assert found.sentences == []
+    assert found.told[0].startswith(f"nothing found: of {found.hypotheses} faults none gains")
+    assert found.least_gain == least_gain(found.hypotheses)
+    assert found.components["mean_square"].between(0.8, 1.2).all()
+
+
+def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySource) -> None:
+    told = first(run, sigma_range_m=0.025)
+    assert (told.kind, told.topic) == ("measurement noise", "sigma_range_m")
+    low, high = np.exp(told.cause.ends)
+    assert 3.5 < low < 4.0 < high < 4.5
+    assert "so that R is too small" in told.words
+    assert "try --set sigma_range_m=0.09" in told.words
+    assert "fuselog tune LOG -e ekf --free sigma_range_m" in told.words
+    told = first(run, turn_noise_density=0.1)
+    assert (told.kind, told.topic) == ("process noise", "turn_noise_density")
+    assert "so that Q is too large" in told.words
+
+
+@pytest.mark.parametrize(
+    ("alteration", "by", "kind", "topic", "said"),
+    [
+        (alter.shifted("range_m"), 0.2, "bias or turned frame", SEEN, "range_m is too large by"),
+        (alter.shifted("bearing_rad"), 0.05, "bias or turned frame", SEEN, "or the sensor's frame is"),
+        (alter.thinned(5), 0.3, "lost messages", SEEN, "of its messages are lost"),
+        (alter.shifted("mean", 2), 0.6, "start", "/robot1/prior", "heading_rad at the start is"),
+        (
+            alter.renumbered("landmark_id", 3, 9),
+            0,
+            "exchanged numbers",
+            "/landmarks",
+            "3 and 9 are exchanged",
+        ),
+    ],
+)
+def test_a_fault_of_the_log_is_named_first(
+    run: fl.MemorySource, alteration: alter.Alteration, by: float, kind: str, topic: str, said: str
+) -> None:
+    told = first(alter.altered(run, topic, alteration, by))
+    assert (told.kind, told.topic) == (kind, topic)
+    assert said in told.words
+    if told.cause is not None and len(told.cause.hypothesis.tried) > 1:
+        low, high = told.cause.ends
+        assert low - 0.02 < by < high + 0.02
+
+
+def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
+    """The odometry is so good that the stamps of the sightings matter."""
+    scenario = {"duration_s": 60.0, "speed_mps": 2.0, "forward_noise_density": 0.002}
+    scenario["turn_noise_density"] = 0.001
+    exact = {"rate_hz": 5.0, "maximum_range_m": 60.0}
+    late = fl.record("landmarks", seed=5, **scenario, range_bearing={**exact, "stamp_offset_s": 0.05})
+    told = first(late)
+    assert (told.kind, told.topic) == ("delay", SEEN)
+    assert told.cause.ends[0] < 0.05 < told.cause.ends[1]
+    assert f"--offset late.mcap={-told.cause.value:.3g}" in told.words
+    wild = fl.record(
+        "landmarks", seed=5, **scenario, range_bearing={**exact, "outlier_probability": 0.02}
+    )
+    assert first(wild).kind == "outliers"
+    clean = fl.record("landmarks", seed=5, **scenario, range_bearing=exact)
+    clock = alter.drifted(*clean.extent("publish_time"))
+    told = first(alter.altered(clean, SEEN, clock, 2e-3))
+    assert (told.kind, told.topic) == ("clock drift", SEEN)
+
+
+def test_two_faults_are_named_one_after_the_other(run: fl.MemorySource) -> None:
+    """The second gains what it gains after the first is undone."""
+    faulty = alter.altered(run, SEEN, alter.shifted("range_m"), 0.2)
+    found = fl.diagnose(faulty, "ekf", set={**OPEN, "sigma_bearing_rad": 0.01}).sentences
+    assert {each.kind for each in found[:2]} == {"bias or turned frame", "measurement noise"}
+    assert found[0].cause.gain > found[1].cause.gain
+    assert len(found) == 2
+
+
+def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
+    """A robot with a single sighting: what is wrong with it may be its range or the start."""
+    source = fl.record("landmarks", seed=4, duration_s=2.0, landmarks=3)
+    faulty = alter.altered(source, "/robot1/prior", alter.shifted("mean", 0), 2.0)
+    given = {"kind": "ekf", **OPEN}
+    base, likelihood = Trial(faulty, given), Likelihood("ekf")
+    tried = hypotheses("ekf", bind("ekf", [faulty], given), base, likelihood.begin(base))
+    alike = [each for each in tried if each.part == "x_m"] * 2
+    causes = find_causes(likelihood, base, alike, 5)
+    assert [each.is_rival for each in causes] == [False, True]
+    assert causes[1].words.startswith("Or instead, nearly as likely: /robot1/prior: x_m at the start")
+
+
+def innovations(nis: np.ndarray, accepted: np.ndarray) -> dict[str, fl.Stream]:
+    """Innovations of one component, one a second."""
+    count = len(nis)
+    stream = fl.make_stream(
+        "/estimates/ekf/robot1/innovation",
+        fl.schemas.INNOVATION,
+        np.arange(count) * 10**9,
+        metadata={"components": "range_m", "kinds": "linear"},
+        target_id=np.full(count, 7),
+        accepted=accepted.astype(int),
+        innovation=np.sqrt(nis)[:, None],
+        covariance=np.ones((count, 1)),
+        normalised_innovation_squared=nis,
+        log_likelihood=-0.5 * nis,
+    )
+    return {stream.topic: stream}
+
+
+def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> None:
+    rng = np.random.default_rng(1)
+    nis = rng.chisquare(1, 400)
+    well = np.ones(400, bool)
+    assert not list(of_innovations(innovations(nis, well), 0.999, 0, has_outliers=False))
+    nis[250:] *= 50.0
+    [found] = of_innovations(innovations(nis, well), 1.0, 0, has_outliers=False)
+    assert found.kind == "divergence"
+    assert found.time_ns is not None
+    assert 245e9 < found.time_ns < 260e9
+    assert "after range_m of 7" in found.words
+    locked = well & ~((np.arange(400) >= 100) & (np.arange(400) < 160))
+    told = list(of_innovations(innovations(rng.chisquare(1, 400), locked), 0.999, 0, has_outliers=True))
+    assert [each.kind for each in told] == ["gate"]
+    assert "keeps out all 60 measurements from 100 s to 159 s" in told[0].words
+    rare = np.arange(400) % 10 > 0
+    told = list(of_innovations(innovations(rng.chisquare(1, 400), rare), 0.999, 0, has_outliers=False))
+    assert "keeps out 10 % of the measurements, where 0.1 % are expected" in told[0].words
+
+
+def fixes(position: np.ndarray, **stamps: Any) -> fl.Stream:
+    """Position fixes, one a second."""
+    count = len(position)
+    return fl.make_stream(
+        "/robot1/fix",
+        fl.schemas.POSITION_FIX,
+        **{"publish_time_ns": np.arange(count) * 10**9, **stamps},
+        position_m=position,
+        covariance_m2=np.tile(np.eye(2).ravel(), (count, 1)),
+    )
+
+
+def test_what_is_wrong_with_messages_is_said() -> None:
+    rng = np.random.default_rng(2)
+    place = np.cumsum(rng.normal(size=(300, 2)), axis=0)
+    assert not list(of_messages([fixes(place)], 0))
+
+    def told(stream: fl.Stream) -> str:
+        [found] = of_messages([stream], 0)
+        return found.words
+
+    twice = np.repeat(np.arange(300), 1 + (np.arange(300) % 30 == 0))
+    assert "10 messages are there twice" in told(fixes(place).take(twice))
+    assert "saturates: " in told(fixes(np.minimum(place, [np.quantile(place[:, 0], 0.9), 99.0])))
+    rounded = np.cumsum(rng.normal(size=(3000, 2)), axis=0)
+    rounded[:, 0] = np.round(rounded[:, 0] / 2.0) * 2.0
+    assert "position_m[0] is rounded to 2, more than half of its noise" in told(fixes(rounded))
+    late_ns = np.arange(300) * 10**9 + (np.arange(300) % 10 == 0) * 2_500_000_000
+    assert "30 messages came after newer ones, up to 2 s behind" in told(
+        fixes(place, log_time_ns=late_ns)
+    )
+    silent = np.arange(300) + 60 * (np.arange(300) > 100)
+    assert "silent for 61 s from 100 s on" in told(fixes(place, publish_time_ns=silent * 10**9))
+
+
+def test_a_floor_of_the_covariance_is_told_from_a_steady_state() -> None:
+    """A variance that settles comes ever closer to its least; one with a floor stops there."""
+
+    def estimates(variance: np.ndarray) -> dict[str, fl.Stream]:
+        count = len(variance)
+        stream = fl.make_stream(
+            "/estimates/ekf/robot1/pose",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            np.arange(count),
+            metadata={"components": "x_m", "kinds": "linear"},
+            mean=np.zeros((count, 1)),
+            covariance=variance[:, None],
+        )
+        return {stream.topic: stream}
+
+    settles = 1.0 + np.exp(-0.5 * np.arange(200))
+    assert not list(of_estimates(estimates(settles)))
+    [found] = of_estimates(estimates(np.maximum(0.97 ** np.arange(200), 0.2)))
+    assert found.kind == "covariance floor"
+    assert "is 0.2 in 7" in found.words
+
+
+def test_the_command_the_report_and_the_timeline_say_the_same(
+    tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
+) -> None:
+    log, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
+    fl.write(log, run)
+    wrong = ["--set", "sigma_range_m=0.025"]
+    fuselog("replay", log, "-e", "ekf", *wrong, "-o", estimates)
+    told = fuselog("diagnose", log, "-e", "ekf", *wrong, "--out", tmp_path / "out", "--json")
+    found = json.loads(told.out)
+    sentence = found["sentences"][0]["sentence"]
+    assert found["sentences"][0]["low"] < np.log(4.0) < found["sentences"][0]["high"]
+    of_estimates = fuselog("diagnose", estimates).out  # the label and its settings are stated there
+    assert f"1. {sentence}" in " ".join(of_estimates.split())
+    fuselog("report", tmp_path / "out", "-o", tmp_path / "page.html")
+    assert sentence in (tmp_path / "page.html").read_text(encoding="utf-8")
+    marks = fl.diagnose(log, "ekf", set={"sigma_range_m": 0.025}).marks
+    [stream] = marks.values()
+    assert stream.topic == "/estimates/ekf/robot1/diagnosis"
+    assert sentence in stream.metadata["reasons"]
+    rrd = (tmp_path / "out" / "timeline.rrd").read_bytes()
+    assert b"the standard deviation is" in rrd or len(rrd) > 1000
+
+
+def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySource) -> None:
+    with pytest.raises(fl.BadInput, match="dead-reckoning gives no innovations, by which it could be"):
+        fl.diagnose(run, "dead-reckoning")
+    with pytest.raises(fl.BadInput, match="name the estimator to diagnose with -e"):
+        fl.diagnose(run)
+    with pytest.raises(fl.BadInput, match="one estimator is diagnosed at a time"):
+        fl.diagnose(run, {"ekf": {}, "ukf": {}})
+    log = tmp_path / "run.mcap"
+    fl.write(log, run)
+
+
+def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource) -> None:
+    streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/truth")}
+    found = fl.diagnose(replace(run, streams=streams), "ekf")
+    assert any(note.startswith("no truth: errors and NEES are left out") for note in found.notes)
+    assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
+
+
+def test_the_worked_example_of_the_page(
+    fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its commands give its sentences; what they say to try leaves nothing to be found."""
+    page = (Path(__file__).parents[2] / "docs" / "diagnosing.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^fuselog (record|diagnose) (.*)$", page, re.MULTILINE)
+    told = [fuselog(command, *shlex.split(options)) for command, options in commands]
+    assert [(each.code, each.err) for each in told] == [(0, "")] * 3
+    block = re.search(r"^1\. .*?(?=```)", page, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    assert " ".join(block[0].split()) in " ".join(told[1].out.split())
+    assert "nothing found" in told[2].out
+
+
+def test_the_study_counts_what_is_named_and_what_a_removal_gains(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs each: a bias that is named, one too small to be counted, and runs without a fault."""
+    landmarks = study.SCENARIOS["landmarks"]
+    small = study.Fault(
+        "bias or turned frame", SEEN, 0.002, record={"range_bearing": {"bias_range_m": 0.002}}
+    )
+    short = landmarks._replace(
+        parameters={"duration_s": 20.0}, faults={"bias": landmarks.faults["bias"], "small": small}
+    )
+    monkeypatch.setattr(study, "SCENARIOS", {"landmarks": short})
+    file = tmp_path / "few.toml"
+    file.write_text('title = "few"\nstudy = "diagnosis"\nruns = 2\nseed = 3\n')
+    told = fuselog("run", file, "--out", tmp_path / "out", "--json").json["metrics"]
+    assert told["diagnosis.worth.landmarks-bias"] > 50.0
+    assert told["diagnosis.first_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.covered_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.counted.landmarks-small"] == 0.0
+    assert told["diagnosis.first_share.landmarks-small"] is None
+    assert told["diagnosis.nothing_share"] == 1.0
+    assert told["diagnosis.counted"] == 2.0

@@ -1,0 +1,112 @@
+"""What is wrong with a log is said, and a run goes on where it can: gaps, clocks, no numbers."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorders.log import Stream
+from recorders.recording import Recording, record_run
+from replay.engine.sources import MemorySource, memory_source
+from replay.engine.tangent import difference
+from replay.estimators.alignment import align
+from replay.estimators.navigation import INERTIAL, NavigationParameters
+from tests.replay.inference.replays import outputs
+
+
+def drive(change: Any, run: int = 0, **values: Any) -> MemorySource:
+    """A simulated drive, each of whose streams `change` may change."""
+    recording, metadata = record_run("navigation", {"duration_s": 40.0, **values}, 1, run)
+    return memory_source(Recording([change(stream) for stream in recording.streams]), metadata)
+
+
+def since_s(stream: Stream) -> Any:
+    """Seconds since its first message."""
+    return (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9
+
+
+def silent(stream: Stream) -> Stream:
+    """The inertial unit without its samples from 20 to 23 s."""
+    if not stream.topic.endswith("/inertial"):
+        return stream
+    return stream.take(np.flatnonzero((since_s(stream) <= 20.0) | (since_s(stream) >= 23.0)))
+
+
+def spoiled(stream: Stream) -> Stream:
+    """The inertial unit with a sample that is no number, and the fixes with one that is none."""
+    columns = dict(stream.columns)
+    for name, row in (("specific_force_mps2", 1500), ("position_m", 70)):
+        if name in columns:
+            columns[name] = columns[name].copy()
+            columns[name][row] = np.nan
+    return replace(stream, columns=columns)
+
+
+def skipped(found: Any) -> dict[str, int]:
+    """How many messages were passed over, by the reason."""
+    stream = found["skipped"].stream
+    reasons = json.loads(stream.metadata["reasons"])
+    names, counts = np.unique(stream["reason"], return_counts=True)
+    return {reasons[name]: int(count) for name, count in zip(names, counts, strict=True)}
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("method", ["ekf", "smoother"])
+def test_after_a_gap_of_the_unit_all_but_its_biases_is_found_again(method: str):
+    """No estimate in it, the fixes in it are counted, and the position is soon known as before.
+
+    The filter is consistent after it; a smoother is less so, as from any heading that is hardly known.
+    """
+    sources = [drive(silent, run) for run in range(6)]
+    found = outputs(INERTIAL, method, sources)
+    assert len(found["failure"].stream) == 0
+    counted = skipped(found)
+    assert len(counted) == 2  # fixes and velocities
+    for reason, count in counted.items():
+        assert "nothing is known while inertial is silent for longer than inertial_gap_s" in reason
+        assert count == pytest.approx(6 * 15, abs=6)
+    early, late = [], []
+    for run, source in enumerate(sources):
+        truth, own = source.read(["/body/truth"])["/body/truth"], found["state"].of_run(run)
+        stamp_s = (own.publish_time_ns - truth.publish_time_ns[0]) * 1e-9
+        assert not ((stamp_s > 20.01) & (stamp_s < 22.99)).any()
+        assert stamp_s[-1] == pytest.approx(40.0)
+        row = np.searchsorted(truth.publish_time_ns, own.publish_time_ns)
+        error = difference(own["mean"], truth["state"][row], INERTIAL.kinds)
+        spread = own["covariance"].reshape(-1, 15, 15)
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
+        early.append(nees[(stamp_s > 23.0) & (stamp_s < 25.0)].mean())
+        late.append(np.linalg.norm(error[stamp_s > 30.0, :3], axis=1).mean())
+    if method == "ekf":
+        assert np.mean(early) < 30.0
+    assert np.mean(late) < 0.5
+
+
+@pytest.mark.paper
+def test_what_is_no_number_is_passed_over_and_counted():
+    found = outputs(INERTIAL, "ekf", [drive(spoiled)])
+    assert len(found["failure"].stream) == 0
+    counted = skipped(found)
+    assert counted["topic /body/inertial: it is not finite"] == 1
+    assert sum(count for reason, count in counted.items() if "/body/fix" in reason) == 1
+    assert np.isfinite(found["state"]["mean"]).all()
+
+
+@pytest.mark.parametrize("shift_s", [18, -18, 0])
+def test_a_shift_by_leap_seconds_is_told(shift_s: int):
+    """The unit's clock against the receiver's; a body rests long enough for both to overlap."""
+    recording, _ = record_run("navigation", {"duration_s": 60.0, "rest_s": 25.0}, seed=2)
+    streams = {stream.topic.removeprefix("/body/"): stream for stream in recording.streams}
+    unit = streams["inertial"]
+    moved = {
+        **streams,
+        "inertial": replace(unit, publish_time_ns=unit.publish_time_ns + shift_s * 10**9),
+    }
+    how = align(moved, NavigationParameters()).how
+    assert ("leap seconds" in how) == (shift_s != 0)
+    if shift_s:
+        assert f"inertial_delay_s={shift_s} moves the unit's" in how
+        mended = align(moved, NavigationParameters(inertial_delay_s=float(shift_s)))
+        assert "leap seconds" not in mended.how
