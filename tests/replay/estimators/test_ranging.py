@@ -264,6 +264,14 @@ def every_tenth_row(folder: Path) -> MemorySource:
     )
 
 
+LIKELIEST = {
+    "sigma_range_m": 0.0757,
+    "bias_range_m": 0.1714,
+    "acceleration_density": 0.037,
+    "turn_acceleration_density": 0.068,
+}
+
+
 @pytest.mark.paper
 def test_the_likelihood_of_innovations_is_largest_where_the_sheet_says(
     navigation: Path, tmp_path: Path
@@ -280,14 +288,17 @@ def test_the_likelihood_of_innovations_is_largest_where_the_sheet_says(
         "bias_range_m": 0.1,
     }
     tuned = fl.tune(tmp_path / "tenth.mcap", "ekf", ["sigma_range_m", "bias_range_m"], set=begin)
-    found = tuned.tables["parameters"].set_index("parameter")["value"]
+    found = tuned.parameters.set_index("parameter")["value"]
     assert found["sigma_range_m"] == pytest.approx(0.0763, abs=0.002)
     assert found["bias_range_m"] == pytest.approx(0.1714, abs=0.002)
-    densities = ["acceleration_density", "turn_acceleration_density"]
-    tuned = fl.tune(
-        tmp_path / "tenth.mcap", "ekf", ["sigma_range_m", "bias_range_m", *densities], set=begin
-    )
-    found = tuned.tables["parameters"].set_index("parameter")["value"]
-    assert found["sigma_range_m"] == pytest.approx(0.0757, abs=0.002)
-    assert found["acceleration_density"] == pytest.approx(0.037, rel=0.1)
-    assert found["turn_acceleration_density"] == pytest.approx(0.068, rel=0.1)
+    assert -tuned.costs[1] == pytest.approx(33550, abs=5)
+
+    def likelihood(**values: float) -> float:
+        found = outputs(RANGING_POSE, "ekf", [source], **LIKELIEST | {"height_m": 0.9675} | values)
+        return float(found["innovation"]["log_likelihood"].sum())
+
+    largest = likelihood()
+    assert largest == pytest.approx(35450, abs=10)
+    for name, value in LIKELIEST.items():
+        for factor in (0.9, 1.1):
+            assert likelihood(**{name: value * factor}) < largest, (name, factor)
