@@ -211,7 +211,9 @@ def _kept_rows(count: int, most: int) -> NDArray[np.int64]:
 
 def checksums(columns: Mapping[str, Floats]) -> NDArray[np.uint16]:
     """A checksum (rows,) of each row's bits: which tells where the first that differs is."""
-    parts = [column.reshape(len(column), -1) for _, column in sorted(columns.items())]
+    parts = [
+        column.reshape(len(column), math.prod(column.shape[1:])) for _, column in sorted(columns.items())
+    ]
     words = np.ascontiguousarray(np.hstack(parts)).view(np.uint64)
     odd = np.random.default_rng(0).integers(1, 2**63, words.shape[1], np.uint64) * 2 + 1
     mixed = (words ^ (words >> np.uint64(32))) * odd

@@ -23,8 +23,13 @@ class State(NamedTuple):
 def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
     """The tracker, which keeps what it says until the end and says its tracks smoothed.
 
-    Its targets have one motion, which is linear.
+    Raises BadInput where the motion of its targets is not linear, or they have several.
     """
+    if targets.stage.modes or not targets.stage.motion.linear:
+        raise BadInput(
+            f"estimator {tracker.name}: smoothed tracks are of targets with one linear motion; leave "
+            "out smoothed, or take another model, or one of its modes"
+        )
 
     def start(whole: Mapping[str, Ragged]) -> State:
         return State(tracker.start(dict(whole)), ())

@@ -491,8 +491,7 @@ def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[
         )
         outputs.append(Ragged(modes, ends))
     of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
-    innovations = _innovations(setup, scans, pair_ends, *of_pairs)
-    return [*outputs, *innovations]
+    return [*outputs, *_innovations(setup, scans, pair_ends, *of_pairs)]
 
 
 def _innovations(

@@ -90,9 +90,8 @@ class Told(NamedTuple):
         number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
             `probability` is that of their modes.
         pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), how probable.
-        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation, and
-            Cholesky's factor of the innovation covariance; a bearing's stand first. Of several modes
-            they are those of the mode in which the detection is likeliest.
+        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation in its
+            likeliest mode, and Cholesky's factor of the innovation covariance; a bearing's stand first.
     """
 
     end: Integers
@@ -383,11 +382,13 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     told.pair[run, row, 0] = tracks.number[run, place]
                     told.pair[run, row, 1], told.pair[run, row, 2] = scan, detection
                     told.associated[run, row] = memory.probability[place, 1 + detection]
-                    mode = 0
-                    for other in range(1, modes):
-                        likelihood = memory.likelihood[place, other, detection]
-                        mode = other if likelihood > memory.likelihood[place, mode, detection] else mode
-                    white, factor = memory.white[place, mode, detection], memory.spread[place, mode]
+                    likeliest = 0
+                    for mode in range(1, modes):
+                        likelihood = memory.likelihood[place, mode, detection]
+                        if likelihood > memory.likelihood[place, likeliest, detection]:
+                            likeliest = mode
+                    white = memory.white[place, likeliest, detection]
+                    factor = memory.spread[place, likeliest]
                     copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
                     told.end[run, 1] = row + 1
 
@@ -441,8 +442,8 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
 BATCH = 1000
-BY_PAIR = ("associated", "white", "factor")
 BY_TRACK = ("number", "mean", "covariance", "probability", "existence")
+BY_PAIR = ("associated", "white", "factor")
 
 
 @lru_cache(maxsize=16)

@@ -47,7 +47,8 @@ def replayed(name: str, places: Mapping[str, Path]) -> Replayed:
             tolerances=allowed(name),
         )
     with tempfile.TemporaryDirectory() as folder:
-        result = run_experiment(recipe.experiment, recipe.loaded, Path(folder) / "out")
+        place, data = Path(folder) / "out", places.get(recipe.importer)
+        result = run_experiment(recipe.experiment, recipe.loaded, place, data=data)
     return Replayed(golden_of(metrics=result.metrics), {})
 
 

@@ -13,6 +13,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.diagnosing import alterations as alter
+from pipeline.diagnosing import study
 from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
 from pipeline.diagnosing.hypotheses import hypotheses
@@ -321,3 +322,27 @@ def test_the_worked_example_of_the_page(
     assert block is not None
     assert " ".join(block[0].split()) in " ".join(told[1].out.split())
     assert "nothing found" in told[2].out
+
+
+def test_the_study_counts_what_is_named_and_what_a_removal_gains(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs each: a bias that is named, one too small to be counted, and runs without a fault."""
+    landmarks = study.SCENARIOS["landmarks"]
+    small = study.Fault(
+        "bias or turned frame", SEEN, 0.002, record={"range_bearing": {"bias_range_m": 0.002}}
+    )
+    short = landmarks._replace(
+        parameters={"duration_s": 20.0}, faults={"bias": landmarks.faults["bias"], "small": small}
+    )
+    monkeypatch.setattr(study, "SCENARIOS", {"landmarks": short})
+    file = tmp_path / "few.toml"
+    file.write_text('title = "few"\nstudy = "diagnosis"\nruns = 2\nseed = 3\n')
+    told = fuselog("run", file, "--out", tmp_path / "out", "--json").json["metrics"]
+    assert told["diagnosis.worth.landmarks-bias"] > 50.0
+    assert told["diagnosis.first_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.covered_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.counted.landmarks-small"] == 0.0
+    assert told["diagnosis.first_share.landmarks-small"] is None
+    assert told["diagnosis.nothing_share"] == 1.0
+    assert told["diagnosis.counted"] == 2.0

@@ -11,6 +11,8 @@ from replay.estimators.targets import TARGET
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, replay, replay_late, sensor
 from tests.replay.inference.replays import outputs
 
+MOTION = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
+
 
 @pytest.mark.parametrize("targets", [1, 2])
 def test_with_certain_association_a_track_is_smoothed_as_its_target_alone(
@@ -65,3 +67,9 @@ def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
     assert len(found["track"]) == 0
     assert found["set"]["elements"].tolist() == [0, 0, 0]
     assert found["set"].publish_time_ns[0] == SIMULATION_EPOCH_NS + 0 * SECOND
+
+
+def test_modes_are_not_smoothed(uncompiled: None):
+    source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
+    with pytest.raises(BadInput, match="smoothed tracks are of targets with one linear motion"):
+        replay(source, smoothed=True, model="vehicle", motion=MOTION)
