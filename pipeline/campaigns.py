@@ -206,11 +206,10 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
         parameters = merge(values, experiment.record.parameters)
         record = Record(scenario=recorder, parameters=parameters)
         experiment = experiment.model_copy(update={"record": record})
-    cells = []
+    cells, place = [], setting.place.resolve()
     for now in parts_of(experiment.runs):
         logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
         draws = setting.draws and now.start == 0
-        place = setting.place.resolve()
         cells.append(Cell(experiment, now.start, now.stop, logs, draws, setting.errors, place))
     return cells
 

@@ -766,6 +766,44 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     compare_sides(list(sides), list(labels), **options)
 
 
+@fuselog.command(short_help="Check that estimators still give what a golden has.")
+@click.argument("path", type=ANY_PATH)
+@click.option("--against", "golden", type=FILE, required=True, help="The golden, a .golden.xz file.")
+@click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
+@click.option("-e", "--estimator", "labels", multiple=True, help="With --update: of what (repeatable).")
+@arrival_option
+@late_option
+@click.option(
+    "--keep",
+    "columns",
+    multiple=True,
+    metavar="PATTERN",
+    help="With --update: keep these of all 'TOPIC COLUMN' (repeatable) [default: all].",
+)
+@click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="PATTERN=RELATIVE",
+    help="With --update: how far apart, relative to its size, such a 'TOPIC COLUMN' may be (repeatable) "
+    "[default: 1e-12, 1e-6 on another CPU].",
+)
+@click.option("--junit", type=FILE, help="Write the results for continuous integration, as JUnit's XML.")
+@json_option
+@settings_option
+@set_option
+def check(path: Path, golden: Path, **options: Any) -> None:
+    """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
+
+    It exits with 1 where something is different, and tells the first difference with its stamp. An
+    intended change updates the golden in the same commit.
+    """
+    from pipeline.checking.command import check_path
+
+    if not check_path(path, golden, **options):
+        click.get_current_context().exit(1)
+
+
 @fuselog.command(short_help="Render results as one self-contained HTML page.")
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
@@ -840,7 +878,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logging.getLogger("fuselog").setLevel(logging.INFO)
     try:
         with _stopped_by_signals():
-            fuselog(arguments, prog_name="fuselog", standalone_mode=False)
+            code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)
             print(end="", flush=True)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
@@ -861,7 +899,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         place = "" if _drop_output() else "standard output"
         return _fail(_sentence(error, place or f"fuselog {shlex.join(arguments or sys.argv[1:])}"))
-    return 0
+    return code or 0
 
 
 class Stopped(KeyboardInterrupt):

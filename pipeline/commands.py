@@ -12,7 +12,13 @@ from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.executors import crew_of
-from pipeline.experiment import Stated, experiment_of_logs, read_experiment, run_experiment
+from pipeline.experiment import (
+    Stated,
+    experiment_of_logs,
+    read_experiment,
+    require_campaign,
+    run_experiment,
+)
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import (
     ErrorTables,
@@ -467,7 +473,7 @@ def run_named(
     if experiment.logs and data is not None and named[0].endswith(".mcap"):
         raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
     if workers is not None or scheduler is not None:
-        experiment.require_campaign("leave out --workers and --scheduler")
+        require_campaign(experiment, "leave out --workers and --scheduler")
     folder = out or Path("out") / label
     inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})

@@ -18,7 +18,13 @@ import pandas as pd
 from pipeline import catalog
 from pipeline.catalog import Entry
 from pipeline.executors import crew_of, of_executor
-from pipeline.experiment import load_experiment, load_scenario, read_experiment, run_experiment
+from pipeline.experiment import (
+    load_experiment,
+    load_scenario,
+    read_experiment,
+    require_campaign,
+    run_experiment,
+)
 from pipeline.outputs import LOG, check_files, check_folder
 from pipeline.results import Result
 from pipeline.studies.localization import summary_table
@@ -154,7 +160,7 @@ def run(
     over = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
     name, found = load_experiment(str(experiment), set or {}, over)
     if workers > 1 or scheduler is not None or executor is not None:
-        found.require_campaign("leave out workers, scheduler and executor")
+        require_campaign(found, "leave out workers, scheduler and executor")
     folder = Path("out", name) if out is None else Path(out)
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []

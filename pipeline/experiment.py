@@ -89,16 +89,6 @@ class Experiment(Parameters):
         return self
 
     @property
-    def is_campaign(self) -> bool:
-        """Whether its study judges the runs and no more, so that others may work on parts of them."""
-        return self.study == "localization"
-
-    def require_campaign(self, mend: str) -> None:
-        """Raise BadInput where it is none."""
-        if not self.is_campaign:
-            raise BadInput(f"{self.title}: its study, {self.study}, does more than judge; {mend}")
-
-    @property
     def files(self) -> list[Path]:
         """The logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
@@ -137,12 +127,14 @@ class Setting:
 class Study:
     """A registered study does an experiment's work.
 
-    `run` writes its logs and timeline into the setting's folder, and returns what it found.
+    `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
+    replays by `pipeline.campaigns` alone, `is_campaign` says so: others may work on parts of the runs.
     """
 
     summary: str
     run: Callable[[Experiment, Setting], Outcome]
     options: type[Parameters] = Parameters
+    is_campaign: bool = False
 
 
 def shipped(kind: str) -> dict[str, Path]:
@@ -284,6 +276,16 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
     if not isinstance(recorder, str) or not isinstance(parameters, dict):
         raise BadInput(f'{path}: a scenario file has recorder = "NAME" and a [parameters] table')
     return recorder, parameters, path.stem
+
+
+def require_campaign(experiment: Experiment, mend: str) -> None:
+    """Raise BadInput where an experiment's study replays all runs together, in one process."""
+    study: Study = load("studies", experiment.study, Study)
+    if not study.is_campaign:
+        raise BadInput(
+            f"experiment '{experiment.title}': its study, {experiment.study}, replays all runs "
+            f"together, in one process; {mend}"
+        )
 
 
 def run_experiment(

@@ -167,7 +167,10 @@ def run_sweep(
     where an experiment is of a study that does more than judge, or cannot be run.
     """
     for experiment in experiments:
-        experiment.require_campaign("run single points")
+        if experiment.study != "localization":
+            raise BadInput(
+                f"{name}: its study, {experiment.study}, does more than judge; run single points"
+            )
         for label, values in experiment.estimators.items():
             configure(label, values)
     with kept_cells(folder) as kept, result_folder(folder) as part:

@@ -98,15 +98,6 @@ def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return _unpacked(archive, tmp_path_factory) / "navigation"
 
 
-@pytest.fixture(scope="session")
-def torus_angles(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of dihedral angles and wind directions, unpacked once."""
-    archive = real_data / "torus.tar.xz"
-    if not archive.exists():
-        pytest.skip(f"no {archive}")
-    return _unpacked(archive, tmp_path_factory) / "torus"
-
-
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("data")
     with tarfile.open(path) as archive:

@@ -78,7 +78,7 @@ class Paired(NamedTuple):
         if found.runs < FEWEST_RUNS and np.isnan(found.low):
             return (
                 f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
-                f"and there is {_runs(found.runs)}"
+                f"and this is of {_runs(found.runs)}"
             )
         interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
         margin = f"{_runs(found.runs)}, margin {found.margin:.3g}"
@@ -418,7 +418,7 @@ def _unlike(first: Side, second: Side) -> Iterator[str]:
     judged = [run for run in common if run in first.truths and run in second.truths]
     apart = [run for run in judged if first.truths[run] != second.truths[run]]
     if apart:
-        yield f"{_runs(len(apart))} have different truths in {first.name} and {second.name}: {apart[0]}"
+        yield f"{first.name} and {second.name} have different truths in {_runs(len(apart))}: {apart[0]}"
     missing = "not stated"
     names = dict.fromkeys([*first.settings, *second.settings])
     values = {name: [side.settings.get(name, missing) for side in (first, second)] for name in names}

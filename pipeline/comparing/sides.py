@@ -308,10 +308,13 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> S
     """What was kept of a result made again, a part of the runs at a time."""
     label = kept.label
     if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
-        raise BadInput("its settings do not say how to replay it")
+        raise BadInput("its settings do not say how to replay it; estimates logs can be compared")
     fields = {each.alias or name for name, each in Experiment.model_fields.items()}
     entries = {key: value for key, value in result.settings.items() if key in fields}
+    if "record" not in entries:  # recorded data have as many runs as there are
+        entries = {key: value for key, value in entries.items() if key not in ("runs", "seed")}
     experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")
+    experiment = experiment.model_copy(update={"runs": len(experiment.files) or experiment.runs})
     data = result.settings.get("data")
     setting = Setting(folder, folder, data=Path(data) if data else None)
     if experiment.import_ and setting.data is None:

@@ -123,12 +123,14 @@ def _divergence(topic: str, case: str, stream: Stream, epoch_ns: int) -> Iterato
         return
     row = int(used[min(last + WINDOW, len(used) - 1)])
     later = used[last + WINDOW :]
-    about = f" of {int(stream['target_id'][row])}" if stream["target_id"][row] else ""
+    there = np.isfinite(stream["innovation"][row])
+    about = ", ".join(np.array(stream.components)[there])
+    if stream["target_id"][row]:
+        about = f"{about} of {int(stream['target_id'][row])}"
     yield Finding(
         "divergence",
         topic,
-        f"{case}: diverges at {_at(stream.publish_time_ns[row], epoch_ns)}, after the measurement"
-        f"{about}: "
+        f"{case}: diverges at {_at(stream.publish_time_ns[row], epoch_ns)}, after {about}: "
         f"NIS per component is {nis[later].sum() / degrees[later].sum():.3g} from there on, and was as "
         "expected before",
         int(stream.publish_time_ns[row]),

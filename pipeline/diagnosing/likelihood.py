@@ -179,6 +179,8 @@ def _around(known: Mapping[float, float]) -> tuple[float, float, float]:
 def _by_parabola(known: Mapping[float, float]) -> float:
     """The greatest gain of the parabola through three of its values; infinite if it has none."""
     values, gains = np.array(sorted(known.items())).T
+    if not gains.any():  # nothing depends on the number
+        return 0.0
     if not np.isfinite(gains).all():
         return np.inf
     bend, slope, _ = np.polyfit(values / values[-1], gains, 2)

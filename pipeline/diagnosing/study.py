@@ -1,6 +1,7 @@
 """The study of diagnosing: faults put into logs and settings, and how often a diagnosis names them.
 
-Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame. What
+Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame; and it is
+only between two frames, or two clocks, that a turn or a drift is seen, so that either may be named. What
 removing a fault gains in log-likelihood says whether it can be seen at all: of ten faults in three
 scenarios some cannot, as a delay of the only sensor of a vehicle that nothing else moves.
 """
@@ -142,8 +143,8 @@ SCENARIOS = {
             "Q": Fault(
                 "process noise",
                 "force_noise_density",
-                np.log(5.0),
-                settings={"force_noise_density": 0.02 / 5.0},
+                np.log(10.0),
+                settings={"force_noise_density": 0.02 / 10.0},
             ),
             "bias": Fault(
                 BIAS,
@@ -170,8 +171,8 @@ SCENARIOS = {
             ),
             "frame": Fault(
                 BIAS,
-                VELOCITY,
-                2.0 * DEGREE,
+                "",
+                None,
                 altered=VELOCITY,
                 alteration=_plain(alter.turned("velocity_mps")),
                 by=2.0 * DEGREE,

@@ -51,4 +51,5 @@ CONSISTENCY = Study(
     "consistency: whether errors are what covariances say, once estimators are aligned",
     study,
     ConsistencyOptions,
+    is_campaign=True,
 )

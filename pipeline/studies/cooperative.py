@@ -85,4 +85,6 @@ def claims(metrics: Mapping[str, MetricValue]) -> list[Claim]:
     return [judged(claim, "section 4.2, no numbers", ours, holds, why) for claim, ours, holds in rows]
 
 
-COOPERATIVE = Study("robots that share their estimates: what each way of fusing costs", study)
+COOPERATIVE = Study(
+    "robots that share their estimates: what each way of fusing costs", study, is_campaign=True
+)

@@ -77,23 +77,19 @@ def _claims(every: pd.DataFrame) -> list[Claim]:
     claims = []
     if {"jipda", "jpda", "hungarian", "nearest"} <= estimators:
         claims += _association_claims(every)
+    if {"pmbm", "jipda"} <= estimators:
+        claims += [_lower_gospa(every, clutter, "pmbm", "jipda") for clutter in _clutters(every)]
     if {"modes", "drive", "manoeuvre"} <= estimators:
         claims += _mode_claims(every)
     return claims
 
 
 def _association_claims(every: pd.DataFrame) -> list[Claim]:
-    clutters = every["clutter_per_scan"].unique()
-    least, most = min(clutters), max(clutters)
+    least, most = min(_clutters(every)), max(_clutters(every))
     claims = [
-        lower(
-            f"{label} has a lower GOSPA than {other} at {clutter:g} false detections a scan",
-            "expected",
-            "m",
-            _differences(every, clutter, "gospa_m", label, other),
-        )
+        _lower_gospa(every, clutter, label, other)
         for label, other in (("jipda", "nearest"), ("jpda", "nearest"), ("jpda", "hungarian"))
-        for clutter in clutters
+        for clutter in _clutters(every)
     ]
     gained = {
         f"p_D {probability:g}": _change(every, probability, "jpda", "nearest")
@@ -104,6 +100,19 @@ def _association_claims(every: pd.DataFrame) -> list[Claim]:
     statement = f"jpda switches tracks less often than nearest at {most:g} false detections a scan"
     fewer = _differences(every, most, "switches", "jpda", "nearest")
     return [*claims, lower(statement, "expected", "", fewer)]
+
+
+def _clutters(every: pd.DataFrame) -> list[float]:
+    return every["clutter_per_scan"].unique().tolist()
+
+
+def _lower_gospa(every: pd.DataFrame, clutter: float, label: str, other: str) -> Claim:
+    return lower(
+        f"{label} has a lower GOSPA than {other} at {clutter:g} false detections a scan",
+        "expected",
+        "m",
+        _differences(every, clutter, "gospa_m", label, other),
+    )
 
 
 def _mode_claims(every: pd.DataFrame) -> list[Claim]:

@@ -154,4 +154,6 @@ def late_chart(late: pd.DataFrame, case: str) -> Chart:
     return Chart(title=f"{case or 'messages'}, messages that came late", panels=panels)
 
 
-LOCALIZATION = Study("errors, consistency and innovations of estimators, over time and runs", study)
+LOCALIZATION = Study(
+    "errors, consistency and innovations of estimators, over time and runs", study, is_campaign=True
+)

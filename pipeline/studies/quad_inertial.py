@@ -76,7 +76,7 @@ class QuadInertialOptions(Parameters):
     filter: str = "ekf"
     smoother: str = "smoother"
     offsets_s: dict[str, float] = {}
-    search_s: tuple[float, float, float] = (-1.2, 0.4, 0.05)
+    search_s: tuple[float, float, PositiveFloat] = (-1.0, 0.2, 0.1)
     truth_sigma_m: PositiveFloat = 0.1
     scored_from_s: NonNegativeFloat = 5.0
     sheet: list[Row] = []

@@ -59,10 +59,10 @@ def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -
     """The recordings one by one; logs are kept of all, the timeline of the first."""
     assert experiment.import_ is not None
     delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
-    estimators = {
-        label: {**values, "range_delay_s": values.get("range_delay_s", 0.0) + delay_s}
-        for label, values in experiment.estimators.items()
-    }
+    estimators = dict(experiment.estimators)
+    if delay_s:
+        for label, values in estimators.items():
+            estimators[label] = {**values, "range_delay_s": values.get("range_delay_s", 0.0) + delay_s}
     for number, recording in enumerate(found):
         values = {**experiment.import_.parameters, "more": [str(path) for path in recording.more]}
         source = memory_source(*import_run(experiment.import_.source, recording.path, values))

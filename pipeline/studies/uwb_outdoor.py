@@ -49,21 +49,28 @@ class Place(Parameters):
 
 
 class Window(Parameters):
-    """The part of a path that is scored, and what the filters and the smoother are held to there."""
+    """The part of a path that is scored."""
 
     begin: Place = Place()
     end: Place = Place()
-    filter_m: PositiveFloat | None = None
-    smoother_m: PositiveFloat | None = None
+
+
+class Target(Parameters):
+    """What the best filter and the smoother are held to."""
+
+    filter_m: PositiveFloat
+    smoother_m: PositiveFloat
 
 
 class UwbOutdoorOptions(RangingOptions):
     """Windows by the name of a folder that a recording lies in; without one all of it is scored.
 
-    `level_m` is how far from the path's median height a row of the truth may lie.
+    Targets are those of single recordings, by name. `level_m` is how far from the path's median height
+    a row of the truth may lie.
     """
 
     windows: dict[str, Window] = {}
+    targets: dict[str, Target] = {}
     level_m: PositiveFloat = 0.5
 
 
@@ -105,7 +112,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             {"estimator": f"published-{track}", "recording": name, "position_rmse_m": rmse[0]}
             for track, rmse in published.items()
         ]
-        claims += _claims(each, published, own, window)
+        claims += _claims(each, published, own, options.targets.get(name))
     outcome, _ = outcome_of(found, rows)
     outcome.metrics = {key: value for key, value in outcome.metrics.items() if value == value}
     outcome.figures["errors"] = errors_chart(drawn, f"position error (m), {found[0].recording.name}")
@@ -155,7 +162,7 @@ def _claims(
     of: Replayed,
     published: dict[str, tuple[float, float]],
     own: dict[str, dict[str, float]],
-    window: Window | None,
+    target: Target | None,
 ) -> list[Claim]:
     """What is claimed of one recording, as far as its files and the estimators that were run allow."""
     name, paper = of.recording.name, printed(of.recording.path)
@@ -174,24 +181,24 @@ def _claims(
     filters = {each: rmse[each] for each in ("ekf", "earlier", "student") if each in rmse}
     if filters and published:
         best, rival = min(filters, key=lambda each: filters[each]), min(published.values())[0]
-        limit = window.filter_m if window and window.filter_m else rival
+        limit = target.filter_m if target else rival
         claims.append(
             judged(
                 f"{name}: robust filters of ranges alone are better than the published tracks",
                 ", ".join(f"{track} {each[0]:.3f} m" for track, each in published.items())
-                + (f"; own target {limit:g} m" if limit != rival else ""),
+                + (f"; own target {limit:g} m" if target else ""),
                 f"{', '.join(f'{label} {value:.3f} m' for label, value in filters.items())}",
                 max(filters.values()) < rival and filters[best] <= limit,
                 "one setting for all recordings",
             )
         )
-    if window and window.smoother_m and "smoother:ekf" in rmse:
+    if target and "smoother:ekf" in rmse:
         claims.append(
             judged(
                 f"{name}: the smoother gains over the filter",
-                f"own target {window.smoother_m:g} m",
+                f"own target {target.smoother_m:g} m",
                 f"{rmse['smoother:ekf']:.3f} m",
-                rmse["smoother:ekf"] <= window.smoother_m,
+                rmse["smoother:ekf"] <= target.smoother_m,
             )
         )
     wanted = ("ekf", "not-robust", "dropping", "dropping-with-a-way-back", "earlier")

@@ -6,14 +6,14 @@ chapter 7.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.executors import crew_of, of_executor
+from pipeline.executors import Team, crew_of, of_executor
 from pipeline.replays import Kind, Log, settings_of, sources_of
 from pipeline.tuning.confidence import confidence
 from pipeline.tuning.objective import (
@@ -109,10 +109,7 @@ def tune(
     opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
     names = [each.name for each in searched]
 
-    crew = of_executor(executor) if executor else None
-    if workers is not None or scheduler is not None:
-        crew = crew_of(workers, scheduler, len(sources))
-    with crew() if crew else nullcontext() as team:
+    with _team(workers, scheduler, executor) as team:
 
         def objective(runs: Sequence[Run]) -> Objective:
             made = Objective(label, opened, names, runs, by, gap_limit_s, on_best, team)
@@ -144,6 +141,17 @@ def tune(
         folds=pd.DataFrame(rows),
         gate=_gate(bound) if opened is not settings else 1.0,
     )
+
+
+def _team(
+    workers: int | None, scheduler: str | None, executor: Executor | None
+) -> AbstractContextManager[Team | None]:
+    """Who evaluates; None stands for threads of this process."""
+    if executor is not None:
+        return of_executor(executor)()
+    if workers is None and scheduler is None:
+        return nullcontext()
+    return crew_of(workers, scheduler, 1)()
 
 
 def _gate(bound: Sequence[Bound]) -> float:

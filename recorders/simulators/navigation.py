@@ -381,7 +381,9 @@ def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Genera
         )
     if carried.compass_rate_hz > 0:
         times_s = times(carried.compass_rate_hz)
-        error = Rotation.from_euler("Z", carried.compass_sigma_rad * rng.normal(size=len(times_s)))
+        error = Rotation.from_rotvec(
+            np.outer(carried.compass_sigma_rad * rng.normal(size=len(times_s)), [0.0, 0.0, 1.0])
+        )
         seen = (error * path.orientation(times_s)).as_quat(canonical=True, scalar_first=True)
         streams.append(
             make_stream(

@@ -173,8 +173,8 @@ def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]
     if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
         in_g = "; it looks like g: import it with that unit" if 0.8 < length < 1.25 else ""
         raise BadInput(
-            f"topic {topic}: gravity reads {length:.3g} m/s2 in the first {parameters.level_s:g} s; "
-            f"it is 9.8{in_g}"
+            f"topic {topic}: gravity reads {length:.3g} m/s2 in the first {parameters.level_s:g} s, "
+            f"where it is 9.8{in_g}"
         )
     if z < -0.5 * length:
         raise BadInput(

@@ -50,6 +50,7 @@ FAILURES = (
 )
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
+Axis = tuple[float, float, float]
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
@@ -544,20 +545,25 @@ def _correcting_upright(model: Model, add: Function) -> Function:
     reset = resetting(model.kinds)
     place, row = next((c, t) for kind, c, t, _ in things(model.kinds) if kind == "quaternion")
 
-    def up(mean: Floats) -> tuple[float, float, float]:
+    def up(mean: Floats) -> Axis:
         w, x, y, z = mean[place], mean[place + 1], mean[place + 2], mean[place + 3]
         return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z
 
-    def take_out(rows: Floats, axis: tuple[float, float, float], along: Floats) -> None:
+    def take_out(rows: Floats, axis: Axis, along: Floats) -> None:
         for column in range(len(along)):
             a, b, c = rows[row, column], rows[row + 1, column], rows[row + 2, column]
             along[column] = axis[0] * a + axis[1] * b + axis[2] * c
         put_in(rows, (-axis[0], -axis[1], -axis[2]), along)
 
-    def put_in(rows: Floats, axis: tuple[float, float, float], along: Floats) -> None:
+    def put_in(rows: Floats, axis: Axis, along: Floats) -> None:
         for column in range(len(along)):
             for k in range(3):
                 rows[row + k, column] += axis[k] * along[column]
+
+    def carry(rows: Floats, before: Axis, after: Axis, step: Floats, along: Floats) -> None:
+        take_out(rows, before, along)
+        reset(step, rows)
+        put_in(rows, after, along)
 
     def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
         step, turned, before = work.step, work.turned, up(mean)
@@ -570,10 +576,8 @@ def _correcting_upright(model: Model, add: Function) -> Function:
         add(mean, turned)
         add(mean, step)
         after = up(mean)
-        for rows in (covariance, covariance.T):
-            take_out(rows, before, turned)
-            reset(step, rows)
-            put_in(rows, after, turned)
+        carry(covariance, before, after, step, turned)
+        carry(covariance.T, before, after, step, turned)
 
     return move
 

@@ -23,6 +23,10 @@ NOT_SENSED = frozenset(
 )
 
 
+# Of a receiver's solution, as RTKLIB numbers them.
+QUALITIES = {1: "fixed", 2: "float", 3: "SBAS", 4: "differential", 5: "single", 6: "PPP"}
+
+
 class Happened(NamedTuple):
     """What happened to an estimator or a sensor: a text for each time, all of one level."""
 
@@ -115,7 +119,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
-    """Spans in which a sensor was dead, stated by the log or seen as a gap."""
+    """Spans in which a sensor was dead, stated by the log or seen as a gap; how good solutions are."""
     for topic in scene.topics_near(case):
         if scene.source.topics[topic].schema_name in NOT_SENSED:
             continue
@@ -126,8 +130,20 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
         gaps = _gaps(scene.read(topic))
         explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
         sensor = topic.removeprefix(f"/{case}").removeprefix("/")
+        yield _qualities(sensor, scene.read(topic))
         yield _spans(sensor, "dead for", outages)
         yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])
+
+
+def _qualities(sensor: str, stream: Stream) -> Happened:
+    """Where the quality of a receiver's solution changes, by RTKLIB's numbers."""
+    is_vector = stream.schema.full_name == schemas.VECTOR_MEASUREMENT.full_name
+    if not (is_vector and "quality" in stream.components):
+        return Happened(sensor, "INFO", stream.publish_time_ns[:0], [])
+    quality = stream["value"][:, stream.components.index("quality")]
+    rows = np.flatnonzero(np.diff(quality, prepend=np.nan) != 0.0)
+    texts = [f"solution {QUALITIES.get(number, f'{number:g}')}" for number in quality[rows].tolist()]
+    return Happened(sensor, "INFO", stream.publish_time_ns[rows], texts)
 
 
 def _gaps(stream: Stream) -> Times:

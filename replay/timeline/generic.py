@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.log import Field, Stream, schemas
+from recorders.models.geodesy import out_of_tangent_plane
+from replay.engine.geodetic import stated_origin
 from replay.judging.evaluation import Floats
 from replay.timeline.about import draw_about
 from replay.timeline.canvas import (
@@ -29,7 +31,7 @@ from replay.timeline.canvas import (
 )
 from replay.timeline.directional import draw_triads, space_view
 from replay.timeline.events import NOT_SENSED, above_events, draw_events
-from replay.timeline.geodetic import degrees_of, draw_fixes, map_view
+from replay.timeline.geodetic import degrees_of, draw_fixes, draw_way, map_view
 from replay.timeline.landmarks import (
     ARROW_SHARE,
     draw_sights,
@@ -90,7 +92,9 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     boards: list[Board] = [
         *draw_navigation(canvas, scene, case, sensed),
         *_draw_planes(canvas, scene, case, sensed),
-        *_draw_earth(canvas, case, [each for each in sensed if each.schema.full_name == GEODETIC]),
+        *_draw_earth(
+            canvas, scene, case, [each for each in sensed if each.schema.full_name == GEODETIC]
+        ),
         *_draw_space(canvas, case, [each for each in sensed if each.schema.full_name == ORIENTATION]),
         *_draw_sensors(canvas, case, sensed),
     ]
@@ -169,9 +173,17 @@ def _draw_plane(
     return [plane_view(canvas, root, [], paths, np.concatenate(shown), name=name)] if shown else []
 
 
-def _draw_earth(canvas: Canvas, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
-    """Geodetic fixes on a map of the earth."""
+def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
+    """Geodetic fixes on a map of the earth, and the ways of estimates where an origin is stated."""
     root = entity_path("geodetic", case)
+    origin = stated_origin({each.topic: scene.source.topics[each.topic] for each in fixes[:1]})
+    for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
+        if origin is not None and {"x_m", "y_m"} <= set(stream.components):
+            east, north = (stream["mean"][:, stream.components.index(name)] for name in ("x_m", "y_m"))
+            latitude, longitude, _ = out_of_tangent_plane((east, north), origin)
+            way = np.stack([latitude, longitude], axis=1)[thin(stream.publish_time_ns)]
+            known = way[np.isfinite(way).all(axis=1)]
+            draw_way(canvas, f"{root}/{estimator}", known, scene.colour(estimator))
     for stream, colour in zip(fixes, cycle(PALETTE), strict=False):
         draw_fixes(canvas, f"{root}/{_name(stream, case)}", stream, colour)
     degrees = [degrees_of(stream) for stream in fixes]

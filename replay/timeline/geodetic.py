@@ -15,6 +15,13 @@ from replay.judging.evaluation import Floats
 from replay.timeline.canvas import Canvas, Colour, escaped, thin
 from replay.timeline.plane import TRAIL_S, trail_of
 
+# Fixes up to these standard deviations in m: an ambiguity that is fixed, one that floats, code alone.
+QUALITIES: tuple[tuple[float, Colour], ...] = (
+    (0.05, (0, 158, 115)),
+    (0.5, (240, 228, 66)),
+    (5.0, (230, 159, 0)),
+)
+POOR: Colour = (204, 121, 167)
 SHOWN_SHARE = 0.9
 # So many times the shown extent beyond it is far off.
 FAR = 10.0
@@ -28,17 +35,37 @@ def degrees_of(stream: Stream) -> Floats:
 
 
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
-    """Geodetic fixes as points, and the whole way past them as a thin line; none that are far off."""
+    """Geodetic fixes as points, and the whole way past them as a thin line; none that are far off.
+
+    Points have the colour of the deviation that fixes state, else the one that is given.
+    """
     degrees = degrees_of(stream)
     rows = np.flatnonzero(are_near(degrees))
     rows = rows[thin(stream.publish_time_ns[rows])]
-    points = rr.GeoPoints.columns(positions=degrees[rows])
+    colours = by_deviation(stream["covariance_m2"][rows], colour)
+    packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 255
+    points = rr.GeoPoints.columns(positions=degrees[rows], colors=packed)
     canvas.send(entity, stream.publish_time_ns[rows], points)
-    canvas.fix(entity, rr.GeoPoints.from_fields(colors=[colour], radii=rr.Radius.ui_points(4.0)))
-    way = rr.GeoLineStrings(
-        lat_lon=[degrees[rows]], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0)
-    )
-    canvas.fix(f"{entity}/way", way)
+    canvas.fix(entity, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(4.0)))
+    draw_way(canvas, f"{entity}/way", degrees[rows], colour)
+
+
+def draw_way(canvas: Canvas, entity: str, degrees: Floats, colour: Colour) -> None:
+    """A whole way past places (n, 2) as a thin line."""
+    way = rr.GeoLineStrings(lat_lon=[degrees], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0))
+    canvas.fix(entity, way)
+
+
+def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
+    """Colours (n, 3) of fixes with covariances (n, d * d), by their mean standard deviation."""
+    size = round(covariance_m2.shape[1] ** 0.5)
+    sigma_m = np.full(len(covariance_m2), np.nan)
+    if size:  # fixes may come without
+        sigma_m = np.sqrt(covariance_m2[:, :: size + 1].mean(axis=1))
+    limits = [limit for limit, _ in QUALITIES]
+    colours = np.array([*(colour for _, colour in QUALITIES), POOR, unknown], np.uint8)
+    # what is not known comes after all numbers
+    return colours[np.searchsorted([*limits, np.inf], sigma_m)]
 
 
 def map_view(

@@ -34,6 +34,7 @@ from replay.timeline.canvas import (
     thin,
     thin_curve,
 )
+from replay.timeline.geodetic import by_deviation
 from replay.timeline.plots import LINE, SIGMAS, draw_curve, plot_view, shown_unit
 
 PLACE = ("x_m", "y_m", "z_m")
@@ -45,13 +46,6 @@ BIASES = (("gyro_bias_", "Gyro bias"), ("accelerometer_bias_", "Accelerometer bi
 FORWARD: tuple[Colour, ...] = ((230, 60, 40), (0, 158, 115), (0, 114, 178))
 # Ellipsoids along a path, which overlap to a tube.
 TUBE = 300
-# By the standard deviation of fixes: so good, and the colour.
-QUALITIES: tuple[tuple[float, Colour], ...] = (
-    (0.05, (0, 158, 115)),
-    (0.5, (240, 228, 66)),
-    (5.0, (230, 159, 0)),
-    (np.inf, (204, 121, 167)),
-)
 
 
 class Body(NamedTuple):
@@ -165,13 +159,8 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
     """Fixes as points, coloured by the standard deviation that they state."""
     rows = thin(stream.publish_time_ns)
     place = stream["position_m"][rows].astype(np.float32)
-    variance = stream["covariance_m2"][rows].reshape(len(rows), 3, 3)
-    sigma_m = np.sqrt(np.trace(variance, axis1=1, axis2=2) / 3.0)
-    limits = [limit for limit, _ in QUALITIES[:-1]]
-    colours = np.array([colour for _, colour in QUALITIES], np.uint8)
-    # an unknown deviation is sorted behind all that are known
-    shown = np.where(np.isnan(sigma_m)[:, None], MUTED, colours[np.searchsorted(limits, sigma_m)])
-    canvas.fix(entity, rr.Points3D(place, colors=shown, radii=rr.Radius.ui_points(3.0)))
+    colours = by_deviation(stream["covariance_m2"][rows], MUTED)
+    canvas.fix(entity, rr.Points3D(place, colors=colours, radii=rr.Radius.ui_points(3.0)))
 
 
 def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
@@ -187,7 +176,7 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
         strips = [strip for strip in inside if len(strip) > 1]
         if strips:
             marked = rr.LineStrips3D(strips, colors=[WRONG], radii=rr.Radius.ui_points(3.0))
-            canvas.fix(f"{entity}/without fixes", marked)
+            canvas.fix(f"{entity}/without_fixes", marked)
     if set(ORIENTATION) <= set(body.names):
         turned = rr.Transform3D.columns(
             translation=place, quaternion=np.roll(body.columns(ORIENTATION), -1, axis=1)
@@ -199,7 +188,7 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
-    """Ellipsoids of two standard deviations along the path."""
+    """Ellipsoids of two standard deviations along the path; as wires, for a viewer may be in one."""
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
     values, vectors = np.linalg.eigh(covariance[rows])
     vectors[np.linalg.det(vectors) < 0, :, 0] *= -1.0  # a rotation, no reflection
@@ -209,8 +198,9 @@ def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, c
             centers=place[rows],
             half_sizes=SIGMAS * np.sqrt(np.maximum(values, 0.0)),
             quaternions=Rotation.from_matrix(vectors).as_quat(),
-            colors=[(*colour, 40)],
-            fill_mode="solid",
+            colors=[colour],
+            line_radii=rr.Radius.ui_points(0.3),
+            fill_mode="majorwireframe",
         ),
     )
 
@@ -227,7 +217,7 @@ def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
         origin=escaped(root),
         name=f"Scene, tubes of {SIGMAS:g} sigma; red without fixes",
         eye_controls=rrb.EyeControls3D(
-            position=centre + extent * np.array([-0.3, -0.6, 0.5]), look_target=centre, eye_up=(0, 0, 1)
+            position=centre + extent * np.array([-0.4, -0.8, 0.6]), look_target=centre, eye_up=(0, 0, 1)
         ),
     )
 
@@ -264,11 +254,11 @@ def _draw_group(
             values, deviation = found
             label = component if len(bodies) == 1 else f"{component} {body.label}"
             if deviation is not None and "bias" in name:
-                _draw_band(canvas, f"{plot}/{label} band", body.time_ns, values, deviation, colour)
+                _draw_band(canvas, f"{plot}/{label}_band", body.time_ns, values, deviation, colour)
             draw_curve(canvas, plot, label, colour, body.time_ns, values, LINE)
             largest = max(largest, float(np.quantile(np.abs(values), 0.995)))
     extent = nice(1.2 * max(largest, np.finfo(float).tiny))
-    _draw_shades(canvas, f"{plot}/without fixes", outages, extent)
+    _draw_shades(canvas, f"{plot}/without_fixes", outages, extent)
     return plot_view(plot, title, (-extent, extent), legend=False)
 
 

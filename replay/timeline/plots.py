@@ -6,7 +6,7 @@ which draws one standard deviation: a band of k sigma is sent with k^2 times the
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import cycle
+from itertools import compress, cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -129,7 +129,7 @@ def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView
             rows, own = of_pattern.ravel() == number, int(degrees[number])
             is_named = len(stream.components) == patterns.shape[1]
             alike = np.count_nonzero(degrees == own) > 1
-            of = stream.components[int(patterns[number].argmax())] if is_named and alike else ""
+            of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
             squares = innovations.time_ns[rows], innovations.squared[rows]
             found.append(Squares(own, of, estimator, *squares))
     return _draw_squares(canvas, scene, case, "NIS", found, POINTS)
@@ -148,7 +148,7 @@ def _draw_squares(
     """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
     views = []
     for degrees, of in sorted({(each.degrees, each.of) for each in found}):
-        plot = entity_path("plots", case, f"{name.lower()}_{degrees}{of and f'_{of}'}")
+        plot = entity_path("plots", case, f"{name.lower()}_{degrees}{of and '_' + of.partition(',')[0]}")
         low, high = chi_square_interval(degrees, 1)
         alike = [each for each in found if (each.degrees, each.of) == (degrees, of)]
         ends = [min(each.time_ns[0] for each in alike), max(each.time_ns[-1] for each in alike)]
@@ -160,7 +160,7 @@ def _draw_squares(
         canvas.fix(f"{plot}/bounds", look)
         for _, _, estimator, time_ns, values in alike:
             draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
-        title = f"{name} of {degrees} component{'s' * (degrees != 1)}{of and f' from {of} on'}"
+        title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
         views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
     return views
 

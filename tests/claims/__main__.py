@@ -9,7 +9,7 @@ from pipeline.command_line import main as fuselog
 from pipeline.experiment import load_experiment, shipped
 from recorders.errors import choices
 from tests.claims import pages
-from tests.goldens.recipes import DATA, data_option, unpack
+from tests.goldens.recipes import DATA, data_option, importer_of, unpack
 
 
 @click.group()
@@ -29,8 +29,8 @@ def run(names: tuple[str, ...], data: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         places = unpack(data, DATA, Path(scratch))
         for name in names or known:
-            given = load_experiment(name, {}, {})[1].import_
-            source = ["--data", str(places[given.source])] if given else []
+            importer = importer_of(load_experiment(name, {}, {})[1])
+            source = ["--data", str(places[importer])] if importer else []
             folder = Path(scratch) / "results" / name
             if fuselog(["run", name, "--logs", "0", "--out", str(folder), *source]) != 0:
                 raise click.ClickException(f"{name}: its result stays as it was")

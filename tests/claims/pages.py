@@ -25,7 +25,8 @@ from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
-PAGES = [*sorted(FOLDER.parent.glob("*.md")), ROOT / "docs" / "tuning.md"]
+TOLD = ("diagnosing", "tuning")  # pages that are of no family, and hold results
+PAGES = [*sorted(FOLDER.parent.glob("*.md")), *(ROOT / "docs" / f"{name}.md" for name in TOLD)]
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 

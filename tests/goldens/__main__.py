@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 
+from pipeline.checking.golden import discrepancies, read, write
 from recorders.errors import choices
 from tests.goldens import store
 from tests.goldens.recipes import DATA, RECIPES, data_option, index, unpack
@@ -24,11 +25,11 @@ def main(names: tuple[str, ...], data: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         places = unpack(data, DATA, Path(scratch))
         for name in names or RECIPES:
-            golden, path = store.make(RECIPES[name], places), store.path_of(name)
+            done, path = store.replayed(name, places), store.path_of(name)
             if path.exists():
-                for sentence in store.differences(name, store.read(name), golden):
-                    click.echo(sentence)
-            store.write(name, golden)
+                for each in discrepancies(read(path), done):
+                    click.echo(each.sentence)
+            write(path, done.golden)
             click.echo(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
     (store.FOLDER.parent / "README.md").write_text(index(), encoding="utf-8")
 

@@ -18,14 +18,18 @@ from recorders.parameters import merge
 from recorders.recording import import_run, record_run
 from replay.engine.sources import MemorySource, memory_source
 
-# Of each importer: what to give it in the folder of real data, and the archive that this is in.
+# Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive
+# that this is in.
 DATA = {
     "ais": ("solent_ais.csv.xz", ""),
     "autoferry": ("autoferry", "autoferry.tar.xz"),
     "broad": ("broad", ""),
     "mrclam": ("mrclam6", "mrclam6.tar.xz"),
     "score-matrices": ("bssr1", "bssr1_set1.tar.xz"),
-    "table": ("navigation", "navigation.tar.xz"),
+    **dict.fromkeys(
+        ("walk", "quadrotor", "uwb-lias", "uwb-outdoor"), ("navigation", "navigation.tar.xz")
+    ),
+    "torus": ("torus", "torus.tar.xz"),
 }
 
 
@@ -72,13 +76,19 @@ class Recipe:
 
     @property
     def importer(self) -> str:
-        """Whose real data it needs; empty for one that is simulated."""
-        return self.loaded.import_.source if self.loaded.import_ else ""
+        """Whose real data it needs, an importer's or a mapping's; empty for one that is simulated."""
+        return importer_of(self.loaded)
 
     @property
     def has_log(self) -> bool:
         """Whether estimators are replayed."""
-        return bool(self.loaded.record or self.loaded.import_)
+        return bool(self.settings and (self.loaded.record or self.loaded.import_))
+
+
+def importer_of(experiment: Experiment) -> str:
+    """Whose real data an experiment needs, an importer's or a mapping's; empty where it needs none."""
+    given = experiment.import_
+    return given.parameters.get("mapping", given.source) if given else ""
 
 
 SHORT = {"duration_s": 40.0}
@@ -155,12 +165,24 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments")} | {
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=60.0),
+    "uwb-outdoor": Recipe("uwb-outdoor", part="uwb_outdoor/LOS/Trajectory_B/Case_3", span_s=20.0),
+    "uwb-pose": Recipe(
+        "uwb-pose",
+        estimators={"ekf": load_experiment("uwb-pose", {}, {})[1].estimators["ekf"]},
+        alone=True,
+        part="uwb_lias",
+        span_s=5.0,
+    ),
+    "warehouse-uwb": Recipe("warehouse-uwb", parameters={"duration_s": 5.0}),
     "tuning-mrclam": Recipe("tuning-mrclam", span_s=60.0),
     "torus-filter-noise-03": Recipe("torus-filter", parameters=TORUS["noise-03"]),
     "torus-filter-strong-coupling": Recipe("torus-filter", parameters=TORUS["strong-coupling"]),
     "torus-propagation": Recipe(
         "torus-propagation",
         over={"runs": 3, "options": {"correlations": [-0.9, 0.0, 0.5], "couplings_rad": [0.1, 1.0]}},
+    ),
+    "torus-real": Recipe(
+        "torus-real", over={"options": {"folds": 2, "most_components": 2, "grid_cells": 24}}
     ),
     "vehicles-cv": Recipe("vehicles-cv", parameters=SHORT),
     "vehicles-cv-losses-10": Recipe(
@@ -200,7 +222,7 @@ def first_log(recipe: Recipe, places: Mapping[str, Path]) -> MemorySource:
     experiment = recipe.loaded
     if experiment.import_:
         given = experiment.import_
-        place = places[given.source] / recipe.part
+        place = places[recipe.importer] / recipe.part
         recording, run = import_run(given.source, place, given.parameters)
     else:
         assert experiment.record
@@ -233,8 +255,9 @@ def index() -> str:
             "# Goldens",
             "",
             "What the estimators gave when these were made: `tests/replay/test_goldens.py` replays",
-            "and compares. `recipes.py` says what each is of, `store.py` what it holds and what may",
-            "differ. `python -m tests.goldens --data FOLDER [NAME ...]` makes them anew, and this page.",
+            "and compares, as `fuselog check` does. `recipes.py` says what each is of, `store.py`",
+            "what may differ. `python -m tests.goldens --data FOLDER [NAME ...]` makes them anew, and",
+            "this page.",
             "",
             "| estimator | goldens |",
             "|---|---|",

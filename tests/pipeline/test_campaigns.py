@@ -331,7 +331,10 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     assert main([*begin, "--workers", "0"]) == 2
     capsys.readouterr()
     assert main(["run", "ispace", "--workers", "2", *out]) == 2
-    assert "networks, does more than judge; leave out --workers" in capsys.readouterr().err
+    assert (
+        "networks, replays all runs together, in one process; leave out --workers"
+        in capsys.readouterr().err
+    )
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
     assert "give local:N with a number of workers" in capsys.readouterr().err
@@ -398,8 +401,13 @@ def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
 
 @pytest.mark.paper
 def test_dask_workers_give_the_same_bytes(tmp_path):
-    pytest.importorskip("distributed")
+    """Of a cluster of its own, and of one that is there, whose workers share no files with it."""
+    distributed = pytest.importorskip("distributed")
     place = tmp_path / "result"
     files = run(place)
     shutil.rmtree(place)
     assert run(place, crew_of(None, "local:2", RUNS)) == files
+    shutil.rmtree(place)
+    loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **loopback) as cluster:
+        assert run(place, crew_of(None, cluster.scheduler_address, RUNS)) == files

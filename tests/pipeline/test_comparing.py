@@ -1,7 +1,9 @@
 """Comparing: what two sides are made of, what is said of them, what is refused."""
 
-import json
+import re
+import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 import rerun.blueprint as rrb
 
 import fuselog as fl
+from pipeline.comparing.comparing import _unlike
 from replay.timeline.side_by_side import _alone
 
 Fuselog = Callable[..., Any]
@@ -106,6 +109,16 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     assert found.groups[0][1].sizes == {("nees", "robot1"): 3.0}
 
 
+def test_a_result_of_logs_is_replayed_from_them(
+    logs: list[Path], fuselog: Fuselog, tmp_path: Path
+) -> None:
+    assert fuselog("run", *logs[:2], "-e", "ekf", "-e", "ukf", "--out", tmp_path / "own").code == 0
+    found = fl.compare(tmp_path / "own")
+    assert "log_likelihood" in set(found.table["quantity"])
+    assert set(found.table["runs"]) == {2}
+    assert not [note for note in found.notes if "as the result has them" in note]
+
+
 def test_a_trajectory_is_compared_like_estimates(
     estimates: Path, fuselog: Fuselog, tmp_path: Path
 ) -> None:
@@ -118,7 +131,7 @@ def test_a_trajectory_is_compared_like_estimates(
     own = fl.compare(log, estimators=["ekf", "ukf"]).table.query("quantity == 'position_rmse_m'").iloc[0]
     assert row["difference"] == pytest.approx(own["difference"], rel=1e-6)
     assert row["verdict"] == "unclear"
-    assert "takes 5 runs or more, and there is 1 run" in found.sentences[0]
+    assert "takes 5 runs or more, and this is of 1 run" in found.sentences[0]
     assert "nees" not in set(found.table["quantity"])
     found.draw(tmp_path / "both.rrd")
     other = fl.compare(file, file, truth=file).table
@@ -134,7 +147,15 @@ def test_what_is_not_alike_is_said(logs: list[Path], estimates: Path, fuselog: F
     assert "only estimates has 2 runs, left out: landmarks, seed 2, run 6" in notes
     assert "estimator.sigma_range_m" in notes
     assert {row["runs"] for row in said.json["differences"]} == {6}
-    json.dumps(said.json)
+
+
+def test_different_truths_are_said(estimates: Path) -> None:
+    [[first, second]] = fl.compare(estimates, estimators=["ekf", "ukf"]).groups
+    run = next(iter(second.truths))
+    assert not [note for note in _unlike(first, second) if "truths" in note]
+    moved = replace(second, truths={**second.truths, run: "another"})
+    [note] = [note for note in _unlike(first, moved) if "truths" in note]
+    assert note == f"ekf and ukf have different truths in 1 run: {run}"
 
 
 @pytest.mark.parametrize(
@@ -182,3 +203,28 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
     shown = [str(each) for each in alone.contents]
     assert shown[:2] == ["map/robot1/**", "map/landmarks/**"]
     assert shown[2] == "- map/robot1/ukf\\:2/**"
+
+
+@pytest.mark.paper
+def test_the_page(fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its commands give its table, and a check of what has not changed."""
+    page = (Path(__file__).parents[2] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    told = [fuselog(*shlex.split(line)) for line in re.findall(r"^fuselog (.*)$", page, re.MULTILINE)]
+    assert [each.code for each in told] == [0] * 5
+    row = r"^ (\w+) +(low|high|[\d.]+)((?: +-?[\d.]+){5}) +(\w+)((?: +\d+){2}) *$"
+    shown, printed = (
+        {
+            name: [aim, numbers, *rest]
+            for name, aim, numbers, *rest in re.findall(row, text, re.MULTILINE)
+        }
+        for text in (page, told[2].out)
+    )
+    assert len(shown) == 4
+    for name, (aim, numbers, *rest) in shown.items():
+        assert [aim, *rest] == [printed[name][0], *printed[name][2:]]
+        values = [float(each) for each in printed[name][1].split()]
+        assert [float(each) for each in numbers.split()] == pytest.approx(values, rel=2e-3)
+    assert "all 430 fields" in told[4].out
+    assert (tmp_path / "check.xml").exists()
+    assert {path.suffix for path in Path("compared").rglob("*")} >= {".rrd", ".svg", ".csv", ".json"}

@@ -1,6 +1,8 @@
 """Diagnosing: the reference sheet's gains, faults that are named, what is unusual, what is refused."""
 
 import json
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.diagnosing import alterations as alter
+from pipeline.diagnosing import study
 from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
 from pipeline.diagnosing.hypotheses import hypotheses
@@ -198,7 +201,7 @@ def test_divergence_and_a_gate_that_locks_the_filter_out_have_their_time() -> No
     assert found.kind == "divergence"
     assert found.time_ns is not None
     assert 245e9 < found.time_ns < 260e9
-    assert "after the measurement of 7" in found.words
+    assert "after range_m of 7" in found.words
     locked = well & ~((np.arange(400) >= 100) & (np.arange(400) < 160))
     told = list(of_innovations(innovations(rng.chisquare(1, 400), locked), 0.999, 0, has_outliers=True))
     assert [each.kind for each in told] == ["gate"]
@@ -304,3 +307,42 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert any(note.startswith("no truth: errors and NEES are left out") for note in found.notes)
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
+
+
+def test_the_worked_example_of_the_page(
+    fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its commands give its sentences; what they say to try leaves nothing to be found."""
+    page = (Path(__file__).parents[2] / "docs" / "diagnosing.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^fuselog (record|diagnose) (.*)$", page, re.MULTILINE)
+    told = [fuselog(command, *shlex.split(options)) for command, options in commands]
+    assert [(each.code, each.err) for each in told] == [(0, "")] * 3
+    block = re.search(r"^1\. .*?(?=```)", page, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    assert " ".join(block[0].split()) in " ".join(told[1].out.split())
+    assert "nothing found" in told[2].out
+
+
+def test_the_study_counts_what_is_named_and_what_a_removal_gains(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two runs each: a bias that is named, one too small to be counted, and runs without a fault."""
+    landmarks = study.SCENARIOS["landmarks"]
+    small = study.Fault(
+        "bias or turned frame", SEEN, 0.002, record={"range_bearing": {"bias_range_m": 0.002}}
+    )
+    short = landmarks._replace(
+        parameters={"duration_s": 20.0}, faults={"bias": landmarks.faults["bias"], "small": small}
+    )
+    monkeypatch.setattr(study, "SCENARIOS", {"landmarks": short})
+    file = tmp_path / "few.toml"
+    file.write_text('title = "few"\nstudy = "diagnosis"\nruns = 2\nseed = 3\n')
+    told = fuselog("run", file, "--out", tmp_path / "out", "--json").json["metrics"]
+    assert told["diagnosis.worth.landmarks-bias"] > 50.0
+    assert told["diagnosis.first_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.covered_share.landmarks-bias"] == 1.0
+    assert told["diagnosis.counted.landmarks-small"] == 0.0
+    assert told["diagnosis.first_share.landmarks-small"] is None
+    assert told["diagnosis.nothing_share"] == 1.0
+    assert told["diagnosis.counted"] == 2.0

@@ -1,11 +1,8 @@
-"""Real angles: what is predicted is known beforehand, and the study says the same twice."""
-
-import json
+"""Real angles: what is predicted is known beforehand, and how sure a mean is."""
 
 import numpy as np
 import pytest
 
-from pipeline.command_line import main
 from pipeline.studies.torus_real import FILTERS, interval, persistence, predict
 
 
@@ -30,26 +27,3 @@ def test_interval_of_blocks():
     mean, low, high = interval(np.repeat([0.0, 1.0, 2.0, 3.0, 99.0], [5, 5, 5, 5, 3]), 5)
     half = 3.182446305284263 * np.std([0, 1, 2, 3], ddof=1) / 2
     assert (mean, low, high) == pytest.approx((1.5, 1.5 - half, 1.5 + half))
-
-
-@pytest.mark.paper
-def test_the_experiment(torus_angles, tmp_path):
-    options = ["--set", "options.folds=2", "--set", "options.most_components=2"]
-    options += ["--set", "options.grid_cells=24"]
-    command = [
-        "run",
-        "torus-real",
-        "--data",
-        str(torus_angles),
-        *options,
-        "--out",
-        str(tmp_path / "result"),
-    ]
-    assert main(command) == 0
-    result = json.loads((tmp_path / "result" / "result.json").read_text())
-    metrics = result["metrics"]
-    assert metrics["wrapped-mixture.log_density.dihedrals"] > metrics["wrapped.log_density.dihedrals"]
-    assert metrics["torus.log_density.wind"] == pytest.approx(metrics["grid.log_density.wind"], abs=0.05)
-    assert metrics["torus.log_density.wind"] == pytest.approx(-0.96949, abs=1e-3)  # by 48 cells too
-    assert len(result["claims"]) == 11
-    assert (tmp_path / "result" / "timeline.rrd").is_file()

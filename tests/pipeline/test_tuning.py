@@ -414,3 +414,30 @@ def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None
     covered = table.groupby("parameter")["is_covered"].mean()
     for name in FREE:
         assert told.json["metrics"][f"ekf.covered_share.{name}-20s"] == covered[name]
+
+
+def test_values_of_some_vehicles_are_judged_on_others(fuselog: Fuselog, tmp_path: Path) -> None:
+    """Those held out are no part of the search: as if there were two logs."""
+    own = tmp_path / "mine.toml"
+    experiment = """
+        title = "two robots tune, one judges"
+        study = "tuning-held-out"
+        record = { scenario = "landmarks", parameters = { robots = 3, duration_s = 10.0 } }
+        estimators.ekf = { sigma_range_m = 0.5, gate_probability = 1.0 }
+        options.free = ["sigma_range_m"]
+        options.tuned_by = ["robot1", "robot2"]
+        options.held_out = ["robot3"]
+    """
+    own.write_text(experiment)
+    metrics = fuselog("run", own, "--logs", "0", "--out", tmp_path / "r", "--json").json["metrics"]
+    assert metrics["start.sigma_range_m"] == 0.5
+    assert metrics["tuned.sigma_range_m"] == pytest.approx(0.1, rel=0.1)
+    for label in ("start", "tuned"):
+        alone = metrics[f"{label}-held-out.log_likelihood.robot3"]
+        assert metrics[f"{label}-held-out.open_gate_log_likelihood"] == pytest.approx(alone)
+        assert f"{label}.log_likelihood.robot3" not in metrics
+        assert f"{label}-held-out.log_likelihood.robot1" not in metrics
+    own.write_text(experiment.replace("robot3", "robot7"))
+    refused = fuselog("run", own, "--out", tmp_path / "other")
+    assert (refused.code, len(refused.err.splitlines())) == (2, 1)
+    assert "no topic begins with /robot7/" in refused.err

@@ -1,4 +1,4 @@
-"""Corrections that turn about up, then tilt: what is unknown about up stays unknown about it alone."""
+"""Corrections that turn about up and then tilt: what is unknown about up stays so about it alone."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorders.log import Stream
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.recording import import_run
 from replay.engine.sources import memory_source
 from replay.judging.track_errors import (
@@ -15,6 +16,7 @@ from replay.judging.track_errors import (
     instants_of,
     track_errors,
     track_figures,
+    tracks_at,
 )
 
 # By scenario: instants; of the radar GOSPA of all, G50, unreferenced; of the lidar the first two.
@@ -93,3 +95,23 @@ def test_switches_breaks_and_what_has_no_reference():
     assert (figures["target2_coverage"], figures["target2_rmse_m"]) == (1, 3)
     assert (figures["missed_targets"], figures["false_targets"]) == (0.4, 0.2)
     assert np.isfinite(as_trajectories(tracks)[:, :, 0]).sum(axis=1).tolist() == [3, 2, 1]
+
+
+def test_what_is_told_later_is_predicted_for_longer():
+    """A track at 2 m/s, told every second; at 3.5 s with a delay of 1 s the one of 2 s is known."""
+    seconds = np.arange(5)
+    sizes = make_stream("/set", schemas.ESTIMATE_SIZE, seconds * 10**9, elements=np.ones(5, np.int64))
+    tracks = make_stream(
+        "/track",
+        schemas.TRACK_ESTIMATE,
+        seconds * 10**9,
+        metadata=state_metadata(PLANE_MOTION),
+        track_id=np.ones(5, np.int64),
+        mean=np.stack([seconds**2, np.full(5, 2.0), 0.0 * seconds, np.zeros(5)], axis=1),
+        covariance=np.zeros((5, 16)),
+    )
+    at_ns = np.array([3_500_000_000])
+    for delay_s, x_m in ((0.0, 9.0 + 1.0), (1.0, 4.0 + 3.0)):
+        [told] = tracks_at(sizes, tracks, at_ns, round(delay_s * 1e9))
+        assert told.place.tolist() == [[x_m, 0.0]]
+    assert len(tracks_at(sizes, tracks, at_ns, 4 * 10**9)[0].number) == 0

@@ -1,0 +1,58 @@
+"""For tests of estimators: a replay against a golden, as `fuselog check` does it.
+
+>>> def test_my_estimator():
+...     assert_golden("drive.mcap", "tests/mine.golden.xz", {"mine": MINE})
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.checking.checking import Checked, check, compared, runs_of
+from pipeline.checking.golden import Golden, Replayed, make, read, write
+from pipeline.replays import Kind, settings_of
+from replay.engine.sources import LogSource, MemorySource
+
+__all__ = ["Golden", "Replayed", "assert_golden", "assert_same"]
+
+# Of the environment: where it is set, goldens are written in place of being compared.
+UPDATE = "FUSELOG_UPDATE_GOLDENS"
+
+
+def assert_golden(
+    logs: str | Path | Mapping[str, LogSource | MemorySource],
+    golden: str | Path,
+    estimators: str | Mapping[str, Kind] | list[str | Mapping[str, Kind]] | None = None,
+) -> None:
+    """Replay estimators over logs, and compare with a golden field by field.
+
+    The golden is written, in place of being compared, where the environment has FUSELOG_UPDATE_GOLDENS.
+
+    Args:
+        logs: a log, a folder of logs, or runs by name, such as `{"seed 7": fuselog.record(...)}`.
+        golden: the file, whose name ends in .golden.xz; it belongs beside the tests.
+        estimators: as for `fuselog.replay`; by default those that the golden names.
+
+    Raises AssertionError with the first difference: topic, run, stamp, component, both values, and the
+    innovation there. Raises BadInput where there is no golden, or it is of other runs.
+    """
+    runs = logs if isinstance(logs, Mapping) else runs_of(Path(logs))
+    place = Path(golden)
+    chosen: dict[str, dict[str, Any]] | None = None if estimators is None else settings_of(estimators)
+    if os.environ.get(UPDATE):
+        there = read(place) if place.exists() else None
+        write(place, make(runs, chosen or (there or {"settings": {}})["settings"]["estimators"]).golden)
+        return
+    _require(check(runs, read(place), chosen), place)
+
+
+def assert_same(replayed: Replayed, golden: str | Path) -> None:
+    """Compare what was made by other means with a golden; raises as `assert_golden`."""
+    _require(compared(read(Path(golden)), replayed), Path(golden))
+
+
+def _require(checked: Checked, golden: Path) -> None:
+    if checked.found:
+        more = [each.sentence for each in checked.found[1:10]]
+        raise AssertionError("\n".join([f"{golden}:", *checked.sentences, *more]))

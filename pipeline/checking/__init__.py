@@ -1,0 +1,1 @@
+"""Checking: estimators against stored replays, field by field."""

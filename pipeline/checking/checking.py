@@ -1,0 +1,137 @@
+"""Checking logs and results against a golden: what is replayed, and what is said of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.checking.golden import (
+    SUFFIX,
+    Discrepancy,
+    Golden,
+    Replayed,
+    Tolerances,
+    discrepancies,
+    first_of,
+    make,
+    read,
+    write,
+)
+from pipeline.ensemble import Settings
+from pipeline.outputs import Kind, check_files
+from pipeline.results import RESULT_FILE, read_result
+from recorders.errors import BadInput
+from recorders.log import open_log
+from replay.engine.sources import LogSource, MemorySource
+
+Runs = Mapping[str, LogSource | MemorySource]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A replay against its golden.
+
+    Attributes:
+        fields: how many fields of the golden's streams and metrics were compared, by run and topic.
+        found: what is not as in the golden.
+        sentences: on the first of these in time.
+    """
+
+    fields: Mapping[tuple[str, str], int]
+    found: Sequence[Discrepancy]
+    sentences: Sequence[str]
+
+
+def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Checked:
+    """Replay runs with a golden's settings, and compare field by field.
+
+    Args:
+        runs: by the names that the golden has them by.
+        golden: as `read` has it.
+        estimators: in place of those that the golden names, such as ones that have no name.
+
+    Raises BadInput where the runs are others than the golden's, or no estimator can follow them.
+    """
+    stored = golden["settings"]
+    replayed = make(
+        runs,
+        stored["estimators"] if estimators is None else estimators,
+        late=stored["late"],
+        arrival_order=stored["arrival_order"],
+        columns=stored["columns"],
+    )
+    return compared(golden, replayed)
+
+
+def compared(golden: Golden, replayed: Replayed) -> Checked:
+    """A replay, or what else was made again, against a golden."""
+    found = list(discrepancies(golden, replayed))
+    fields = {("", "metrics"): len(golden["metrics"])} if golden["metrics"] else {}
+    for name, run in golden["runs"].items():
+        fields |= {(name, topic): 4 + len(each["columns"]) for topic, each in run["streams"].items()}
+    return Checked(fields, found, first_of(found, replayed, golden) if found else [])
+
+
+def runs_of(path: Path) -> Runs:
+    """The runs of a log, of a folder of logs, or those whose logs a result kept.
+
+    Raises BadInput where there are none.
+    """
+    files = [path]
+    if (path / RESULT_FILE).is_file():
+        given = read_result(path).settings.get("logs", {})
+        stated = given.get("files", []) if isinstance(given, dict) else given
+        files = [Path(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
+    elif path.is_dir():
+        files = [each for each in sorted(path.glob("*.mcap")) if not each.match("*.estimates.mcap")]
+    if not files:
+        raise BadInput(f"{path}: holds no logs to replay; give a log, or a result that keeps some")
+    runs = {file.name: LogSource(open_log(file)) for file in files}
+    if len(runs) < len(files):
+        raise BadInput(f"{path}: two of its logs have one name; check them one by one")
+    return runs
+
+
+def update(
+    path: Path,
+    place: Path,
+    settings: Mapping[str, Any],
+    *,
+    estimators: Settings,
+    columns: Sequence[str] = (),
+    tolerances: Tolerances | None = None,
+) -> Golden:
+    """Write the golden of a path's runs to a place.
+
+    Settings that are not given are those of the golden that is there, else those of the result.
+    """
+    check_files([(place, GOLDEN)], {"log": [path]})
+    before = read(place) if place.exists() else None
+    stated: dict[str, Any] = {} if before is None else dict(before["settings"])
+    if not stated and (path / RESULT_FILE).is_file():
+        stated = read_result(path).settings
+    chosen = estimators or stated.get("estimators", {})
+    if not chosen:
+        raise BadInput(f"{path}: say what its golden is of, such as -e ekf")
+    kept = None if before is None else before["tolerances"]
+    golden = make(
+        runs_of(path),
+        chosen,
+        late=settings.get("late") or stated.get("late"),
+        arrival_order=bool(settings.get("arrival_order") or stated.get("arrival_order")),
+        columns=columns or stated.get("columns") or ("*",),
+        tolerances=tolerances or kept,
+    ).golden
+    write(place, golden)
+    return golden
+
+
+def _is_golden(path: Path) -> bool:
+    try:
+        read(path)
+    except BadInput as error:
+        return "wrote it (format" in str(error)  # of another version
+    return True
+
+
+GOLDEN = Kind(Path(SUFFIX).suffix or ".xz", "a golden of fuselog check", _is_golden)

@@ -1,0 +1,83 @@
+"""The command `fuselog check`: it replays, compares with a golden, and says what is first different."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.checking.checking import check, runs_of, update
+from pipeline.checking.golden import Tolerance, read
+from pipeline.checking.junit import JUNIT, write_junit
+from pipeline.commands import read_settings, settings_of_estimators
+from pipeline.outputs import check_files
+from pipeline.terminal import print_json, say
+from recorders.errors import BadInput
+from recorders.parameters import parse_settings
+
+
+def check_path(
+    path: Path,
+    golden: Path,
+    *,
+    is_update: bool,
+    labels: Sequence[str],
+    arrival_order: bool,
+    late: str | None,
+    columns: Sequence[str],
+    tolerances: Sequence[str],
+    junit: Path | None,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> bool:
+    """Check a path against a golden, or write that; whether all is as in the golden."""
+    if is_update:
+        chosen = settings_of_estimators(
+            labels, parse_settings(settings), read_settings(settings_file, labels)
+        )
+        made = update(
+            path,
+            golden,
+            {"late": late, "arrival_order": arrival_order},
+            estimators=chosen,
+            columns=columns,
+            tolerances=dict(map(_tolerance, tolerances)),
+        )
+        streams = sum(len(run["streams"]) for run in made["runs"].values())
+        size_kb = golden.stat().st_size / 1e3
+        say(f"{golden}: {len(made['runs'])} runs, {streams} streams, {size_kb:.0f} kB")
+        return True
+    if labels or settings or settings_file or late or arrival_order or columns or tolerances:
+        raise BadInput(f"{golden}: says what is replayed and allowed; give other settings with --update")
+    if junit is not None:
+        check_files([(junit, JUNIT)], {"golden": [golden]})
+    done = check(runs_of(path), read(golden))
+    if junit is not None:
+        write_junit(junit, golden.name, done)
+    if as_json:
+        print_json(
+            {
+                "equal": not done.found,
+                "fields": sum(done.fields.values()),
+                "first": list(done.sentences),
+                "differences": [each.sentence for each in done.found],
+            }
+        )
+        return not done.found
+    for sentence in done.sentences:
+        say(sentence)
+    if done.found:
+        say(f"{len(done.found)} of {sum(done.fields.values())} fields are not as in {golden}")
+    else:
+        say(f"all {sum(done.fields.values())} fields are as in {golden}")
+    return not done.found
+
+
+def _tolerance(text: str) -> tuple[str, Tolerance]:
+    """A pattern and how far apart what matches it may be, from PATTERN=RELATIVE."""
+    pattern, _, value = text.rpartition("=")
+    try:
+        relative = float(value)
+    except ValueError:
+        relative = -1.0
+    if not (pattern and relative >= 0):
+        raise BadInput(f"--tolerance {text}: expected PATTERN=RELATIVE, as '/estimates/ekf/* mean=1e-9'")
+    return pattern, Tolerance(relative)

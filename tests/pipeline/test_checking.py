@@ -1,0 +1,194 @@
+"""`fuselog check`: what is found, what is told of it, what passes, what is refused."""
+
+import lzma
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from fuselog.testing import assert_golden
+from pipeline.checking.golden import Replayed, checksums, discrepancies, read, write
+from recorders.log import LogWriter
+
+Fuselog = Callable[..., Any]
+POSE = "/estimates/ekf/robot1/pose"
+INNOVATION = "/estimates/ekf/robot1/innovation"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "run.mcap"
+    fl.write(path, fl.record("landmarks", seed=4, duration_s=10.0))
+    return path
+
+
+@pytest.fixture
+def golden(log: Path, fuselog: Fuselog, tmp_path: Path) -> Path:
+    path = tmp_path / "ekf.golden.xz"
+    assert fuselog("check", log, "--against", path, "--update", "-e", "ekf").code == 0
+    return path
+
+
+def with_settings(golden: Path, **settings: Any) -> Path:
+    """The golden of another estimator, as it was before a change of the code."""
+    changed = read(golden)
+    changed["settings"]["estimators"]["ekf"] |= settings
+    write(golden, changed)
+    return golden
+
+
+def test_the_same_passes_and_gives_the_same_bytes(golden: Path, log: Path, fuselog: Fuselog) -> None:
+    before = golden.read_bytes()
+    said = fuselog("check", log, "--against", golden)
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith("all ")
+    assert fuselog("check", log, "--against", golden, "--update").code == 0
+    assert golden.read_bytes() == before
+    assert len(before) < 20_000
+
+
+def test_a_change_in_the_seventh_digit_is_found_at_its_first_stamp(
+    golden: Path, log: Path, fuselog: Fuselog
+) -> None:
+    """With what is different there, and the innovation that it comes from."""
+    sigma_range_m = 0.1 * (1 + 1e-7)
+    said = fuselog("check", log, "--against", with_settings(golden, sigma_range_m=sigma_range_m))
+    assert said.code == 1
+    done = [fl.replay(log, [{"ekf": settings}]) for settings in ({}, {"sigma_range_m": sigma_range_m})]
+    before, after = (each.estimates[0][POSE] for each in done)
+    apart = (before["mean"] != after["mean"]).any(axis=1)
+    apart |= (before["covariance"] != after["covariance"]).any(axis=1)
+    first_ns = before.publish_time_ns[np.argmax(apart)]
+    assert apart.any()
+    first, bits, innovation = said.out.splitlines()[:3]
+    assert re.match(
+        rf"run\.mcap {INNOVATION} covariance: range_m is \S+ at {first_ns} ns, the golden has \S+; "
+        "2e-07 of its size apart, 1e-12 is allowed",
+        first,
+    )
+    assert bits.startswith(f"bits of {INNOVATION} differ from {first_ns} ns on")
+    assert "NIS" in innovation
+    assert str(first_ns) in innovation
+    page = (Path(__file__).parents[2] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    [told] = re.findall(r"^run\.mcap /estimates.*?(?=\n```)", page, re.MULTILINE | re.DOTALL)
+    number = r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?"
+    assert re.sub(number, "#", told) == re.sub(number, "#", "\n".join([first, bits, innovation]))
+    shown, printed = ([float(each) for each in re.findall(number, text)] for text in (told, said.out))
+    assert shown == pytest.approx(printed[: len(shown)], rel=1e-5)
+
+
+def test_tolerances_and_columns_are_kept_in_the_golden(
+    golden: Path, log: Path, fuselog: Fuselog
+) -> None:
+    update = ("check", log, "--against", golden, "--update", "-e", "ekf")
+    assert fuselog(*update, "--keep", "*/pose mean", "--tolerance", f"{POSE} mean=1e-3").code == 0
+    streams = read(golden)["runs"]["run.mcap"]["streams"]
+    assert {name for each in streams.values() for name in each["columns"]} == {"mean"}
+    assert fuselog("check", log, "--against", with_settings(golden, sigma_range_m=0.1 + 1e-8)).code == 0
+    said = fuselog("check", log, "--against", with_settings(golden, sigma_range_m=0.3))
+    assert said.code == 1
+    assert "0.001 is allowed" in said.out
+
+
+def test_a_golden_of_another_cpu_passes_within_its_tolerance(golden: Path) -> None:
+    stored, found = read(golden), read(golden)
+    found["arithmetic"] = "another"
+    kept = found["runs"]["run.mcap"]["streams"][POSE]["columns"]["mean"]["kept"]
+    kept[5][0] *= 1 + 1e-9
+    assert not list(discrepancies(stored, Replayed(found, {})))
+    kept[5][0] *= 1 + 1e-3
+    [different] = discrepancies(stored, Replayed(found, {}))
+    assert (different.component, different.part) == ("x_m", "mean")
+
+
+def test_a_result_and_its_logs(tmp_path: Path, fuselog: Fuselog) -> None:
+    """Its first logs, with its own estimators."""
+    result, golden = tmp_path / "landmarks", tmp_path / "landmarks.golden.xz"
+    fl.run("landmarks", runs=3, out=result, logs=2, set={"duration_s": 3.0})
+    assert fuselog("check", result, "--against", golden, "--update").code == 0
+    stored = read(golden)
+    assert list(stored["runs"]) == ["run-0000.mcap", "run-0001.mcap"]
+    assert list(stored["settings"]["estimators"]) == ["dead-reckoning", "ekf", "ukf"]
+    assert fuselog("check", result / "logs", "--against", golden).code == 0
+    said = fuselog("check", result / "logs" / "run-0000.mcap", "--against", golden)
+    assert said.code == 2
+    assert "the golden is of run-0000.mcap, run-0001.mcap" in said.err
+
+
+def test_junit(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    """A test case for each topic; a failure tells; times are no part of it."""
+    path = tmp_path / "check.xml"
+    for settings, failures in (({}, 0), ({"sigma_range_m": 0.2}, 2)):
+        said = fuselog("check", log, "--against", with_settings(golden, **settings), "--junit", path)
+        assert said.code == (failures > 0)
+        root = ElementTree.parse(path).getroot()
+        assert (root.tag, root.attrib) == ("testsuites", {"name": "fuselog check"})
+        [suite] = root
+        assert (suite.tag, suite.get("name"), suite.get("errors")) == ("testsuite", golden.name, "0")
+        assert int(suite.get("tests", "")) == len(suite) > 1
+        assert int(suite.get("failures", "")) == len(suite.findall("testcase/failure")) >= failures
+        for case in suite:
+            assert (case.tag, set(case.attrib)) == ("testcase", {"classname", "name"})
+            assert all(set(each.attrib) == {"message", "type"} and each.text for each in case)
+    assert "the golden has" in path.read_text(encoding="utf-8")
+
+
+def test_a_third_party_tests_its_own_estimator(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written once where the environment asks for it, then compared."""
+    golden = tmp_path / "mine.golden.xz"
+    runs = {"seed 4": fl.record("landmarks", seed=4, duration_s=3.0)}
+    mine = {"mine": {"kind": "ekf", "sigma_range_m": 0.1}}
+    with pytest.raises(fl.BadInput, match="there is no such golden"):
+        assert_golden(runs, golden, mine)
+    monkeypatch.setenv("FUSELOG_UPDATE_GOLDENS", "1")
+    assert_golden(runs, golden, mine)
+    monkeypatch.delenv("FUSELOG_UPDATE_GOLDENS")
+    assert_golden(runs, golden, mine)
+    assert_golden(runs, golden)
+    with pytest.raises(AssertionError, match=r"seed 4 /estimates/mine/.* the golden has"):
+        assert_golden(runs, golden, {"mine": {"kind": "ekf", "sigma_range_m": 0.2}})
+
+
+def test_bad_input(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    note = tmp_path / "note.golden.xz"
+    note.write_text("mine", encoding="utf-8")
+    other = tmp_path / "run.mcap"
+    with LogWriter(other) as writer:
+        writer.write(fl.record("landmarks", seed=5, duration_s=1.0).streams.values())
+    newer = tmp_path / "newer.golden.xz"
+    newer.write_bytes(
+        lzma.compress(lzma.decompress(golden.read_bytes()).replace(b'"format":1', b'"format":2'))
+    )
+    for arguments, sentence in (
+        ((log, "--against", newer), "a newer fuselog wrote it (format 2, this one reads 1)"),
+        ((log, "--against", note), "is no golden, or damaged"),
+        ((log, "--against", note, "--update", "-e", "ekf"), "exists and is not a golden"),
+        ((log, "--against", tmp_path / "none.golden.xz"), "there is no such golden; --update writes it"),
+        ((log, "--against", tmp_path / "none.golden.xz", "--update"), "say what its golden is of"),
+        ((other, "--against", golden), "what is recorded or imported has changed"),
+        ((tmp_path / "empty", "--against", golden), "holds no logs to replay"),
+        ((log, "--against", golden, "-e", "ukf"), "give other settings with --update"),
+        ((log, "--against", golden, "--update", "--tolerance", "mean"), "expected PATTERN=RELATIVE"),
+        ((log, "--against", golden, "--junit", note), "give a name that ends in .xml"),
+    ):
+        said = fuselog("check", *arguments)
+        assert (said.code, "Traceback" in said.err) == (2, False)
+        assert sentence in said.err
+    assert note.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_checksum_tells_bits_apart() -> None:
+    values = np.random.default_rng(0).normal(size=(1000, 3))
+    changed = values.copy()
+    changed[500:, 1] = np.nextafter(changed[500:, 1], np.inf)
+    before, after = checksums({"mean": values}), checksums({"mean": changed})
+    assert np.array_equal(before[:500], after[:500])
+    assert np.mean(before[500:] != after[500:]) > 0.99

@@ -1,0 +1,68 @@
+"""Clocks that differ, found from recordings alone: the likelihood of the innovations knows them."""
+
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from recorders.recording import import_run
+from replay.engine.sources import memory_source
+from tests.replay.estimators import quadrotor
+
+pytestmark = pytest.mark.paper
+
+
+@pytest.fixture(scope="module")
+def recordings(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    archive, place = real_data / "navigation.tar.xz", tmp_path_factory.mktemp("navigation")
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    with tarfile.open(archive) as packed:
+        wanted = [each for each in packed if "gnss_imu_rtk" in each.name or "quad_mimu" in each.name]
+        packed.extractall(place, wanted, filter="data")
+    return place / "navigation"
+
+
+def test_the_delay_of_the_walks_velocity_is_found(recordings: Path):
+    """The sheet's is .125 s, the likelihood flat from there to .15; the mapping has taken it already."""
+    log = memory_source(
+        *import_run("table", recordings / "gnss_imu_rtk" / "walk_0827", {"mapping": "walk"})
+    )
+    given = {
+        "force_noise_density": 0.05,
+        "gyro_noise_density": 0.001,
+        "force_bias_density": 3e-4,
+        "gyro_bias_density": 2e-6,
+        "tilt_sigma_rad": np.radians(3.0),
+        "gyro_bias_sigma_radps": np.radians(0.2),
+        "velocity_delay_s": -0.075,
+    }
+    bounds = {"velocity_delay_s": (-0.125, 0.175)}
+    found = fl.tune(log, "ekf", "velocity_delay_s", set=given, bounds=bounds, grid=7)
+    assert 0.115 < found.parameters["value"][0] + 0.125 < 0.16
+
+
+@pytest.mark.parametrize(
+    ("path", "least_s", "most_s"),
+    [
+        (3, 0.1, 0.3),  # of fixes once a second that err by .5 m; .10 of those of the truth at 10 Hz
+        (9, 0.375, 0.525),
+    ],
+)
+def test_the_offset_of_the_quadrotors_unit_is_found(
+    recordings: Path, path: int, least_s: float, most_s: float
+):
+    folder = recordings / "quad_mimu" / f"path_{path}"
+    log = quadrotor.log_of(folder, quadrotor.read_flight(folder), path, 0.0)
+    given = {name: value for name, value in quadrotor.SETTINGS.items() if name != "every_s"}
+    found = fl.tune(
+        log,
+        "ekf",
+        "inertial_delay_s",
+        set={**given, "inertial_delay_s": 0.01},
+        bounds={"inertial_delay_s": (-0.2, 1.2)},
+        grid=15,
+    )
+    assert least_s < found.parameters["value"][0] < most_s
