@@ -218,7 +218,7 @@ def test_the_solent_with_identities_hidden(real_data: Path):
         solent.streams["/identity"]["thing_id"].astype(np.int64), stream["track_id"].astype(np.int64)
     )
     found = kept(table)
-    assert found.things == 37
+    assert found.targets == 37
     assert found.kept_share >= 0.70
     assert found.mean_share >= 0.88
     values = measure([Output("t", "", "track", outputs[TOPIC], [solent])], find_metrics(["tracks"]))
