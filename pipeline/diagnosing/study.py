@@ -31,6 +31,8 @@ DEGREE = np.pi / 180.0
 QUANTITIES = (
     "worth",
     "counted",
+    "first",
+    "first_two",
     "first_share",
     "first_two_share",
     "covered_share",
@@ -333,6 +335,8 @@ def _summary(rows: pd.DataFrame) -> pd.Series:
         {
             "worth": rows["worth"].median(),
             "counted": float(len(counted)),
+            "first": float(counted["is_first"].sum()),
+            "first_two": float(counted["is_in_first_two"].sum()),
             "first_share": counted["is_first"].mean(),
             "first_two_share": counted["is_in_first_two"].mean(),
             "covered_share": counted["covers"].mean(),

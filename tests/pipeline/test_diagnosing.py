@@ -344,5 +344,6 @@ def test_the_study_counts_what_is_named_and_what_a_removal_gains(
     assert told["diagnosis.covered_share.landmarks-bias"] == 1.0
     assert told["diagnosis.counted.landmarks-small"] == 0.0
     assert told["diagnosis.first_share.landmarks-small"] is None
+    assert told["diagnosis.first.landmarks-bias"] == told["diagnosis.first_two.landmarks-bias"] == 2.0
     assert told["diagnosis.nothing_share"] == 1.0
     assert told["diagnosis.counted"] == 2.0
