@@ -12,7 +12,7 @@ from pipeline.results import Outcome, result_folder, write_outcome
 from tests.claims import pages
 
 README = (pages.ROOT / "README.md").read_text(encoding="utf-8")
-ONES = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
+ONES = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven"]
 # Numbers of results that the README's sentences hold.
 STATED = [
     "{broad[bingham.movement_rmse_deg]:.2f} deg on BROAD",
