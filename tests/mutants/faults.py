@@ -492,8 +492,8 @@ FAULTS = [
     ),
     Fault(
         "pipeline/experiment.py",
-        "experiment = build(Experiment, {**merge(values, own), **over}, where)",
-        "experiment = build(Experiment, {**over, **merge(values, own)}, where)",
+        "experiment = build(Experiment, {**merge(self.values, own), **over}, where)",
+        "experiment = build(Experiment, {**over, **merge(self.values, own)}, where)",
         "tests/pipeline/test_experiments.py",
     ),
     Fault(

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.experiment import load_experiment
 from recorders.recording import import_run
 from replay.engine.sources import memory_source
-from tests.replay.estimators import quadrotor
 
 pytestmark = pytest.mark.paper
 
@@ -55,13 +55,15 @@ def test_the_offset_of_the_quadrotors_unit_is_found(
     recordings: Path, path: int, least_s: float, most_s: float
 ):
     folder = recordings / "quad_mimu" / f"path_{path}"
-    log = quadrotor.log_of(folder, quadrotor.read_flight(folder), path, 0.0)
-    given = {name: value for name, value in quadrotor.SETTINGS.items() if name != "every_s"}
+    log = memory_source(*import_run("table", folder, {"mapping": "quadrotor", "seed": path}))
+    given = dict(load_experiment("quad-inertial", {}, {})[1].estimators["ekf"])
+    given |= {"topics": {"inertial": "/imu1/inertial"}, "inertial_delay_s": 0.01}
+    del given["every_s"]
     found = fl.tune(
         log,
         "ekf",
         "inertial_delay_s",
-        set={**given, "inertial_delay_s": 0.01},
+        set=given,
         bounds={"inertial_delay_s": (-0.2, 1.2)},
         grid=15,
     )

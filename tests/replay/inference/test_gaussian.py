@@ -90,7 +90,8 @@ def correct(
 
     note = empty_note(len(v))
     update = kalman_update(stage, 0, innovate)
-    return update(mean, covariance, v, (), gate, 0, workspace(stage), note), note
+    plain = Noise(np.empty(0), np.empty(0))  # no robust update
+    return update(mean, covariance, v, plain, gate, 0, workspace(stage), note), note
 
 
 @given(st.integers(1, 5), st.integers(1, 4), seeds)
@@ -152,6 +153,9 @@ class Noise(NamedTuple):
 
     density: Floats
     variance: Floats
+    inflate_nis: float = np.nan
+    student_freedom: float = np.nan
+    switch_nis: float = np.nan
 
 
 def times(matrix: Floats, vector: Any) -> tuple[Any, ...]:
