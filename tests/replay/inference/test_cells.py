@@ -17,17 +17,25 @@ from replay.inference.estimators import registered_models
 from tests.replay.inference.wheel import make_wheel
 
 RUNS = 30
+FEW_RANGES = {
+    "duration_s": 3.0,
+    "rate_hz": 5.0,
+    "anchors_m": [(-10.0, -6.0, 3.0), (10.0, -6.0, 3.0), (10.0, 6.0, 2.5), (-10.0, 6.0, 2.5)],
+}
 # What simulates logs of a model, near linear where that can be: scenario, parameters.
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     # the prior is wrong by a standard deviation, along what the sum of the pressures does not tell
     "batch-reactor": ("batch-reactor", {"prior_mean": [2.9, 1.1], "prior_variance": 0.01}),
     "extended-target": ("extended-target", {}),
     "inertial": ("navigation", {"duration_s": 12.0}),
+    "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
+    "ranging-position": ("ranging", {**FEW_RANGES, "tags_m": [(0.0, 0.0, 0.0)]}),
     "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
     "vehicle": ("vehicles", {"duration_s": 30.0, "stochastic": True}),
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
+CONSISTENT = (*NEAR_LINEAR, "inertial", "ranging-pose", "ranging-position")
 # So many particles that a sharp measurement does not leave a few; and these vehicles go on as they
 # are: an interacting multiple model that expects manoeuvres is too careful.
 SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
@@ -71,7 +79,7 @@ def nees(model: str, method: str, **settings: Any) -> tuple[float, float]:
 def test_every_cell_is_consistent(model: str, method: str) -> None:
     """The mean NEES per component is 1 within 4 standard errors where the model is near linear."""
     mean, error = nees(model, method, **SETTINGS.get((model, method), {}))
-    if model in (*NEAR_LINEAR, "inertial"):
+    if model in CONSISTENT:
         assert abs(mean - 1) < 4 * error
 
 
