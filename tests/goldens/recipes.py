@@ -116,6 +116,7 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
     "extended-target-failing": Recipe("extended-target", run=117),
+    "imu-grades": Recipe("imu-grades", span_s=12.0),
     "gnss-ins": Recipe("gnss-ins", part="gnss_imu_rtk/walk_0827", span_s=30.0),
     "quad-inertial": Recipe(
         "quad-inertial",

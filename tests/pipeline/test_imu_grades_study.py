@@ -1,0 +1,58 @@
+"""Units of several grades while a receiver is silent: which errors count, what so many drives show."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.studies.imu_grades import Limit, Span, _claim, horizontal
+from replay.judging.evaluation import Errors
+
+
+def test_errors_count_in_the_outage_alone():
+    """In the plane, from the last fix on and before the next one."""
+    elapsed_s = np.array([49.8, 50.0, 50.5, 79.5, 80.0])
+    error = np.array(
+        [[1.0, 9.0, 0.0], [3.0, 9.0, 4.0], [6.0, 9.0, 8.0], [0.3, 9.0, 0.4], [1.0, 9.0, 0.0]]
+    )
+    none = np.zeros(5, np.int64)
+    errors = Errors(
+        "ekf",
+        "body",
+        ("x_m", "z_m", "y_m"),
+        ("linear",) * 3,
+        none,
+        none,
+        none,
+        elapsed_s,
+        error,
+        np.empty((5, 3, 3)),
+        np.empty(5),
+        0,
+        (),
+    )
+    found = horizontal(errors, Span(50.0, 80.0))
+    assert found["after_s"].tolist() == [0.0, 0.5, 29.5]
+    assert found["error_m"].tolist() == pytest.approx([5.0, 10.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("errors_m", "runs", "verdict"),
+    [
+        ([1.9] * 59, 59, "confirmed"),
+        ([1.9] * 58 + [2.1], 59, "refuted"),  # one beyond it, and it is not shown
+        ([1.9] * 58, 58, "refuted"),  # too few to show anything
+    ],
+)
+def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(errors_m, runs, verdict):
+    table = pd.DataFrame({"grade": "g", "estimator": "ekf", "after_s": 30.0, "error_m": errors_m})
+    assert _claim(Limit(grade="g", after_s=30.0, most_m=2.0), "ekf", table, runs).verdict == verdict
+
+
+def test_a_grade_that_is_not_there_and_a_drive_without_outage_are_named(fuselog, tmp_path):
+    limit = 'limits=[{grade="golden",after_s=1.0,most_m=1.0}]'
+    command = ["run", "imu-grades", "--out", str(tmp_path / "out"), "--set"]
+    assert "no grade 'golden'; there are consumer" in fuselog(*command, f"options.{limit}").err
+    assert (
+        "0 outages; give one"
+        in fuselog(*command, "gnss.outages_s=[]", "--set", "duration_s=12.0", "--set", "runs=1").err
+    )
