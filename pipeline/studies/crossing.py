@@ -14,7 +14,8 @@ from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summary_table
-from pipeline.studies.tracking import Interval, difference, lower, mean_interval, means_of, table_of
+from pipeline.studies.repetitions import Interval, mean_interval
+from pipeline.studies.tracking import difference, lower, means_of, table_of
 from recorders.parameters import Parameters
 from replay.judging.track_errors import instants_of
 

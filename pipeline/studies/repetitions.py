@@ -6,10 +6,12 @@ for its 100 runs can be tried as often.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from pipeline.charts import Axis, Series, curve
 from pipeline.ensemble import Replayed
@@ -38,6 +40,26 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
     repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
     repeated[errors.step, errors.run] = values
     return repeated
+
+
+class Interval(NamedTuple):
+    """The mean of independent values, and where it lies with 95 %."""
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f}, 95 % {self.low:+.2f} to {self.high:+.2f}"
+
+
+def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
+    """The mean of independent values, and its interval by Student's distribution; NaN for one value."""
+    count, mean = len(values), float(np.mean(values))
+    if count < 2:
+        return Interval(mean, np.nan, np.nan)
+    half = student.ppf(0.5 + probability / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count)
+    return Interval(mean, mean - float(half), mean + float(half))
 
 
 def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:

@@ -14,7 +14,6 @@ import pandas as pd
 from pydantic import PositiveInt
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
-from scipy.stats import t as student
 from threadpoolctl import threadpool_limits
 
 from pipeline.charts import Axis, Chart, Panel, curve
@@ -23,6 +22,7 @@ from pipeline.ensemble import hash_streams
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Outcome
 from pipeline.runner import Runner
+from pipeline.studies.repetitions import Interval, mean_interval
 from recorders.errors import BadInput
 from recorders.models.headings import turn_on
 from recorders.models.planar import wrap_angle
@@ -170,7 +170,7 @@ def _judge_predictions(
         outcome.metrics |= {f"{name}.{key}.wind": value for key, value in parameters.items()}
     outcome.figures["wind"] = _chart(outcome.tables["wind"], half)
 
-    def gain(name: str, other: str) -> tuple[float, float, float]:
+    def gain(name: str, other: str) -> Interval:
         return interval(later[name].log_density - later[other].log_density, options.block_hours)
 
     outcome.claims += [
@@ -187,7 +187,7 @@ def _judge_predictions(
             "wind: five samples are enough, within .02 an hour of Bayes' rule on a grid",
             "(not in the paper)",
             f"log density {_said(lost)} an hour",
-            lost[1] > -0.02,
+            lost.low > -0.02,
         )
     )
     nearer = interval(later["persistence"].error_rad - later["torus"].error_rad, options.block_hours)
@@ -196,26 +196,24 @@ def _judge_predictions(
             "wind: five samples are nearer to the next direction than persistence",
             "(not in the paper)",
             f"circular distance {_said(nearer)} rad less",
-            nearer[1] > 0.0,
+            nearer.low > 0.0,
         )
     )
 
 
-def interval(values: Floats | pd.Series, block: int) -> tuple[float, float, float]:
+def interval(values: Floats | pd.Series, block: int) -> Interval:
     """The mean, and where it lies with 95 % by Student's distribution of the means of whole blocks."""
     whole = np.asarray(values)[: len(values) // block * block]
-    means = whole.reshape(-1, block).mean(axis=1)
-    half = student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
-    return float(means.mean()), float(means.mean() - half), float(means.mean() + half)
+    return mean_interval(whole.reshape(-1, block).mean(axis=1).tolist())
 
 
-def _said(gain: tuple[float, float, float]) -> str:
-    return f"{gain[0]:+.3f} ({gain[1]:+.3f} to {gain[2]:+.3f})"
+def _said(gain: Interval) -> str:
+    return f"{gain.mean:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})"
 
 
-def _gains(claim: str, gain: tuple[float, float, float], unit: str) -> Claim:
+def _gains(claim: str, gain: Interval, unit: str) -> Claim:
     """A claim that holds where the whole interval is above zero."""
-    return judged(claim, "(not in the paper)", f"log density {_said(gain)} {unit}", gain[1] > 0.0)
+    return judged(claim, "(not in the paper)", f"log density {_said(gain)} {unit}", gain.low > 0.0)
 
 
 FILTERS: dict[str, Filter] = {

@@ -6,13 +6,13 @@ and holds where all of its 95 % interval does.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
 
 from pipeline.claims import Claim, judged
+from pipeline.studies.repetitions import Interval, mean_interval
 from recorders.errors import BadInput
 from recorders.log import Stream
 from replay.engine.arrays import Floats
@@ -95,26 +95,6 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
         for each in innovations
         if each.degrees.sum()
     }
-
-
-class Interval(NamedTuple):
-    """The mean of independent values, and where it lies with 95 %."""
-
-    mean: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.mean:+.2f}, 95 % {self.low:+.2f} to {self.high:+.2f}"
-
-
-def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
-    """The mean of independent values, and its interval by Student's distribution; NaN for one value."""
-    count, mean = len(values), float(np.mean(values))
-    if count < 2:
-        return Interval(mean, np.nan, np.nan)
-    half = student.ppf(0.5 + probability / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count)
-    return Interval(mean, mean - float(half), mean + float(half))
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:

@@ -29,8 +29,9 @@ from replay.inference.methods import (
     Method,
     RegressionParameters,
     UnscentedParameters,
-    check_filter,
     filter_with,
+    named_filter,
+    no_steps,
 )
 from replay.inference.model import Model
 from replay.inference.steps import Gaussian, Note, Stage, Steps, slots_of
@@ -291,19 +292,14 @@ def _banked(name: str, variant: str, members: int) -> Method:
 
 
 def _made_for(parameters: BankParameters) -> Method:
-    name, _, variant = parameters.filter.partition(":")
-    check_filter(name, variant, "bank", "for the members of a bank")
+    name, variant = named_filter(parameters.filter, "bank", "for the members of a bank")
     return _banked(name, variant, parameters.members)
-
-
-def _no_steps(stage: Stage) -> Steps:
-    raise AssertionError("a bank has the steps of the filter that its parameters name")
 
 
 BANK = Method(
     "bank of filters from a prior cut across its widest angle; the filter follows the name: bank:ekf",
     BankParameters,
-    _no_steps,
+    no_steps,
     lacks=partial(_lacks, inner=FILTERS["ekf"]),
     variant="filter",
     made_for=_made_for,

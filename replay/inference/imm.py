@@ -13,6 +13,7 @@ mode that fits badly lie below the smallest number.
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
@@ -43,8 +44,9 @@ from replay.inference.methods import (
     Method,
     RegressionParameters,
     UnscentedParameters,
-    check_filter,
     filter_with,
+    named_filter,
+    no_steps,
 )
 from replay.inference.model import Model, switching_of
 from replay.inference.recursion import Estimates, Happenings, Innovations
@@ -506,13 +508,13 @@ def smoothing(modes: int) -> Function:
 # As an estimator
 
 
-class Mixing(Filter):
+class Mixing(Filter, ABC):
     """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
 
     @property
+    @abstractmethod
     def names(self) -> Sequence[str]:
         """What the Gaussians are of."""
-        raise NotImplementedError
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
         """Estimates and innovations to be filled in."""
@@ -616,19 +618,13 @@ def _interacting(name: str, variant: str) -> Method:
 
 
 def _made_for(parameters: InteractingParameters) -> Method:
-    name, _, variant = parameters.filter.partition(":")
-    check_filter(name, variant, "imm", "for the modes of an imm")
-    return _interacting(name, variant)
-
-
-def _no_steps(stage: Stage) -> Steps:
-    raise AssertionError("an imm has the steps of the filter that its parameters name")
+    return _interacting(*named_filter(parameters.filter, "imm", "for the modes of an imm"))
 
 
 INTERACTING = Method(
     "interacting multiple models; the filter of every mode follows the name, as in imm:ukf",
     InteractingParameters,
-    _no_steps,
+    no_steps,
     lacks=partial(_lacks, inner=FILTERS["ekf"]),
     variant="filter",
     made_for=_made_for,

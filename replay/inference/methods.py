@@ -353,12 +353,22 @@ FILTERS: Mapping[str, Method] = {
 }
 
 
-def check_filter(name: str, variant: str, method: str, use: str) -> None:
-    """Raise BadInput where there is no such filter for a method to rest on; `use` says what for."""
+def no_steps(stage: Stage) -> Steps:
+    """For a method whose steps are those of one that `Method.made_for` makes for its parameters."""
+    raise AssertionError("the method was not made for its parameters")
+
+
+def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
+    """The name and the variant of a filter for a method to rest on, such as "lrkf:s2kf-50".
+
+    Raises BadInput where there is no such filter; `use` says what for.
+    """
+    name, _, variant = text.partition(":")
     if name not in FILTERS:
         raise BadInput(f"'{name}' is no filter {use}; {choices(name, FILTERS)}")
     if variant and FILTERS[name].variant is None:
         raise BadInput(f"filter {name} has no variants; give '{method}:{name}' without ':{variant}'")
+    return name, variant
 
 
 @lru_cache(maxsize=64)

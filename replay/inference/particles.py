@@ -47,7 +47,7 @@ from replay.inference.generate import (
     weighted_mean_of,
 )
 from replay.inference.happenings import joined, of_rows
-from replay.inference.methods import Method, MethodParameters
+from replay.inference.methods import Method, MethodParameters, no_steps
 from replay.inference.model import Model, Sensor, trial_state
 from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.regression import settling
@@ -782,10 +782,6 @@ def _made_for(parameters: ParticleParameters) -> Method:
     return _of_so_many(parameters.particles, parameters.resample_below)
 
 
-def _no_steps(stage: Stage) -> Steps:
-    raise AssertionError("a particle filter has steps for a number of particles")
-
-
 def _lacks_likelihood(model: Model) -> str:
     """A sensor whose noise enters other than linearly, and which states no likelihood."""
     parameters = trial_parameters(model)
@@ -812,7 +808,7 @@ def _lacks_likelihood(model: Model) -> str:
 BOOTSTRAP = Method(
     "bootstrap particle filter; the number of particles follows the name, as in particles:2000",
     ParticleParameters,
-    _no_steps,
+    no_steps,
     lacks=_lacks_likelihood,
     variant="particles",
     made_for=_made_for,

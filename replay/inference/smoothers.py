@@ -26,8 +26,9 @@ from replay.inference.methods import (
     Method,
     RegressionParameters,
     UnscentedParameters,
-    check_filter,
     filter_with,
+    named_filter,
+    no_steps,
 )
 from replay.inference.model import Model
 from replay.inference.recursion import Estimates, Happenings, Innovations
@@ -66,8 +67,8 @@ class Forward(NamedTuple):
 def parse_forward(text: str) -> Forward:
     """What `SmootherParameters.forward` says; raises BadInput where it says nothing."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
-    name, _, variant = before.removesuffix(":").partition(":")
-    check_filter(name, variant, "smoother", "that a smoother goes back over")
+    rest_on = before.removesuffix(":")
+    name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
     if not has_lag:
         return Forward(name, variant, FOREVER_NS)
     found = re.fullmatch(rf"(\d+)({'|'.join(UNITS_NS)})", lag)
@@ -272,15 +273,11 @@ def _made_for(parameters: SmootherParameters) -> Method:
     return _smoother_of(forward.name, forward.variant)
 
 
-def _no_steps(stage: Stage) -> Steps:
-    raise AssertionError("a smoother has the steps of the filter that its parameters name")
-
-
 SMOOTHING = Method(
     "Rauch-Tung-Striebel smoother; the filter follows the name, as in smoother:ukf, and after it, if "
     "wanted, a lag, as in smoother:ekf:lag=500ms",
     SmootherParameters,
-    _no_steps,
+    no_steps,
     lacks=FILTERS["ekf"].lacks,
     variant="forward",
     made_for=_made_for,

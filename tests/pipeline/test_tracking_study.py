@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.tracking import Interval, difference, figures_of, lower, mean_interval
+from pipeline.studies.repetitions import Interval, mean_interval
+from pipeline.studies.tracking import difference, figures_of, lower
 from replay.judging.track_errors import TracksAt
 
 
