@@ -22,10 +22,11 @@ from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import Outcome
 from pipeline.runner import Runner
 from pipeline.studies.localization import summary_table
+from pipeline.studies.repetitions import rms_length
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import read_mapping, recordings_in
 from recorders.log import Stream, make_stream, schemas
-from recorders.models.orientation import compose
+from recorders.models.orientation import compose, heading
 from recorders.models.planar import wrap_angle
 from recorders.models.states import NAVIGATION, state_metadata
 from recorders.parameters import Parameters
@@ -336,21 +337,13 @@ def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -
     late = flight.time_ns[true] >= late_ns
     estimate, truth = pose[own[late]], flight.state[true[late]]
     moved = estimate[:, :6] - truth[:, :6]
-    heading = wrap_angle(np.subtract(*(_yaw(each[:, 6:]) for each in (estimate, truth))))
+    turned = wrap_angle(heading(estimate[:, 6:]) - heading(truth[:, 6:]))
     return {
-        "position_rmse_m": _rms(moved[:, :3]),
-        "horizontal_rmse_m": _rms(moved[:, :2]),
-        "velocity_rmse_mps": _rms(moved[:, 3:]),
-        "heading_rmse_deg": float(np.degrees(_rms(heading[:, None]))),
+        "position_rmse_m": rms_length(moved[:, :3]),
+        "horizontal_rmse_m": rms_length(moved[:, :2]),
+        "velocity_rmse_mps": rms_length(moved[:, 3:]),
+        "heading_rmse_deg": float(np.degrees(rms_length(turned[:, None]))),
     }
-
-
-def _yaw(quaternion: Floats) -> Floats:
-    return Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX")[:, 0]
-
-
-def _rms(error: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:

@@ -90,11 +90,6 @@ class Reference(NamedTuple):
         return np.stack([np.interp(wanted, since, column) for column in self.state.T], axis=1)
 
 
-def root_mean_square(error: Floats) -> float:
-    """Of the lengths of errors (n, d); NaN of none."""
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) if len(error) else np.nan
-
-
 def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
     """The mean NIS of single ranges within a span."""
     stamps = innovations.publish_time_ns

@@ -67,6 +67,11 @@ def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
     return np.sqrt(np.nanmean(values**2, axis=axis))
 
 
+def rms_length(errors: Floats) -> float:
+    """The root mean square of the lengths of errors (n, d); NaN of none."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else np.nan
+
+
 def rmse_of_runs(errors: Errors, runs: int) -> Floats:
     """The root mean square length of every run's errors (runs,); NaN for a run without any."""
     squared = np.sum(errors.error**2, axis=1)

@@ -24,8 +24,8 @@ from pipeline.studies.ranging import (
     outcome_of,
     recordings,
     replayed,
-    root_mean_square,
 )
+from pipeline.studies.repetitions import rms_length
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.arrays import Booleans, Floats
@@ -103,7 +103,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             estimate = Reference(states.publish_time_ns, states["mean"][:, :2]).at(stamps)
             error = estimate - truth.state[inside, :2]
             nis = mean_nis(outputs["innovation"], begin_ns, end_ns)
-            own[label] = {"position_rmse_m": root_mean_square(error), "nis": nis}
+            own[label] = {"position_rmse_m": rms_length(error), "nis": nis}
             if each is found[0]:
                 drawn[label] = stamps, np.hypot(*error.T)
         name = each.recording.name
@@ -146,7 +146,7 @@ def published_rmse(
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
-    return root_mean_square(error[:, :2]), root_mean_square(error)
+    return rms_length(error[:, :2]), rms_length(error)
 
 
 def printed(folder: Path) -> dict[str, float]:

@@ -23,8 +23,8 @@ from pipeline.studies.ranging import (
     outcome_of,
     recordings,
     replayed,
-    root_mean_square,
 )
+from pipeline.studies.repetitions import rms_length
 from recorders.errors import BadInput
 from recorders.models.orientation import heading
 from recorders.models.planar import wrap_angle
@@ -91,10 +91,10 @@ def figures_of(
         float(np.mean(np.einsum("ki,kij,kj->k", each, information, each))) for each in (error, around)
     )
     figures = {
-        "position_rmse_m": root_mean_square(error[:, :2]),
-        "heading_rmse_deg": float(np.degrees(root_mean_square(error[:, 2:]))),
-        "position_spread_m": root_mean_square(around[:, :2]),
-        "heading_spread_deg": float(np.degrees(root_mean_square(around[:, 2:]))),
+        "position_rmse_m": rms_length(error[:, :2]),
+        "heading_rmse_deg": float(np.degrees(rms_length(error[:, 2:]))),
+        "position_spread_m": rms_length(around[:, :2]),
+        "heading_spread_deg": float(np.degrees(rms_length(around[:, 2:]))),
         "nis": mean_nis(of.outputs[label]["innovation"], begin_ns, int(truth.time_ns[-1])),
         "nees": nees,
         "nees_around_mean": nees_around,

@@ -13,6 +13,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
+from recorders.models.constant_velocity import noise_moments
 from recorders.models.states import state_metadata
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
@@ -149,7 +150,8 @@ def simulate(parameters: RangingParameters, rng: np.random.Generator) -> Recordi
 def _path(parameters: RangingParameters, steps: int, start: Floats, rng: np.random.Generator) -> Floats:
     """The states (steps, 6) under white accelerations, exactly at every step."""
     step_s = 1.0 / parameters.rate_hz
-    root = np.linalg.cholesky([[step_s**3 / 3.0, step_s**2 / 2.0], [step_s**2 / 2.0, step_s]])
+    place, mixed, speed = noise_moments(1.0, step_s)
+    root = np.linalg.cholesky([[place, mixed], [mixed, speed]])
     density = np.array([*[parameters.acceleration_density] * 2, parameters.turn_acceleration_density])
     noise = rng.normal(size=(steps, 3, 2)) @ root.T * density[:, None]
     states = np.empty((steps, 6))

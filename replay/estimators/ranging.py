@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
+from recorders.models.constant_velocity import noise_moments
 from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.measurements import SPACE
@@ -56,12 +57,6 @@ class PoseRangingParameters(RangingParameters):
     start_sigma_radps: PositiveFloat = 0.5
 
 
-def walk(duration_s: Any, density: Any) -> Components:
-    """Variance of a position, covariance with its velocity, variance of that, of white acceleration."""
-    power = density**2
-    return power * duration_s**3 / 3.0, power * duration_s**2 / 2.0, power * duration_s
-
-
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
     """Position and velocity after a while."""
     x, y, vx, vy = state
@@ -70,7 +65,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """The rows of the lower triangle of the noise's covariance."""
-    place, mixed, speed = walk(duration_s, parameters.acceleration_density)
+    place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return place, 0.0, place, mixed, 0.0, speed, 0.0, mixed, 0.0, speed
 
 
@@ -82,8 +77,8 @@ def move_pose(state: Components, control: Components, duration_s: Any, parameter
 
 def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """The rows of the lower triangle of the noise's covariance."""
-    place, mixed, speed = walk(duration_s, parameters.acceleration_density)
-    angle, turning, turn = walk(duration_s, parameters.turn_acceleration_density)
+    place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
+    angle, turning, turn = noise_moments(parameters.turn_acceleration_density**2, duration_s)
     # fmt: off
     return (
         place,
