@@ -19,7 +19,7 @@ from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
 from replay.engine.components import components_of
 from replay.engine.tangent import Kind
-from replay.estimators.alignment import AlignmentParameters, align, specific_force, turn_rate
+from replay.estimators.alignment import AlignmentParameters, align, specific_force, suspect, turn_rate
 from replay.estimators.navigation_sensors import carried_sensors
 from replay.inference.model import Control, Correction, Model, Motion, Sensor, Start
 
@@ -264,7 +264,7 @@ INERTIAL = Model(
     ),
     Motion(move, move_noise, lost=lost),
     control=UNIT,
-    start=Start({}, HANDHELD, find=align),
+    start=Start({}, HANDHELD, find=align, suspect=suspect),
     correction=Correction(correct, correction_between, len(STATE)),
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

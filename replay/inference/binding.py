@@ -184,6 +184,31 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
     return f"model {name} comes nearest and lacks {missing}"
 
 
+def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
+    """Which model the log's prior is of, where only its control has another name; empty where none is.
+
+    As with several inertial units, of which one has to be chosen.
+    """
+    for name, model in models.items():
+        control = model.control
+        if control is None or control.topic in names:
+            continue
+        others = [
+            each for each, topic in topics.items() if topic.schema_name == control.schema.full_name
+        ]
+        end = f"/{names.get(model.prior, model.prior)}"
+        priors = [each for each in topics if each.endswith(end)]
+        for prior in priors:
+            place = resolved(control.topic, prior.rpartition("/")[0])
+            if others and place not in topics and names_state(topics[prior], model, exactly=True):
+                return (
+                    f"{prior} is of model {name}, which needs {place} ({control.schema.full_name}); the "
+                    f"log has {', '.join(others)} of that type: choose one, as with "
+                    f"--set topics.{control.topic}={others[0]}"
+                )
+    return ""
+
+
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
     """What a model needs, under the prefix of a log that has most of it."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])

@@ -283,12 +283,15 @@ class Start:
         find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
             the model's names for their topics, and the maps; for a state that is found from several
             messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
+        suspect: (streams, parameters) -> sentences: what looks wrong in these messages where the log has
+            a prior. It is only said.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
     align: Callable[..., tuple[Floats, Floats] | None] | None = None
     find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
+    suspect: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
 
 
 class Started(NamedTuple):
