@@ -13,15 +13,15 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, into_plane, strapdown
+from recorders.models.inertial import cross, into_body, into_plane, product, strapdown
 from recorders.models.planar import Components
 from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
 from replay.engine.components import components_of
 from replay.engine.tangent import Kind
-from replay.estimators.alignment import AlignmentParameters, align, specific_force, turn_rate
+from replay.estimators.alignment import AlignmentParameters, align, specific_force, suspect, turn_rate
 from replay.estimators.navigation_sensors import carried_sensors
-from replay.inference.model import Control, Model, Motion, Sensor, Start
+from replay.inference.model import Control, Correction, Model, Motion, Sensor, Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
@@ -118,6 +118,73 @@ def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
     return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
 
 
+def correct(state: Components, step: Components) -> Components:
+    """The state after a correction: turned about the vertical, its velocity with it, then tilted.
+
+    An inertial unit does not feel where north is, so that a body that is headed elsewhere, with its
+    velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true.
+    Barrau and Bonnabel, The Invariant Extended Kalman Filter as a Stable Observer, IEEE TAC 62(4), 2017,
+    on errors that a symmetry of the motion carries along.
+    """
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
+    turn = ux * step[6] + uy * step[7] + uz * step[8]
+    # the step holds what the turn makes of the velocity, to first order
+    east, north = vx + step[3] + turn * vy, vy + step[4] - turn * vx
+    cosine, sine = np.cos(turn), np.sin(turn)
+    half = np.cos(0.5 * turn), ux * np.sin(0.5 * turn), uy * np.sin(0.5 * turn), uz * np.sin(0.5 * turn)
+    tilt = 1.0, 0.5 * (step[6] - turn * ux), 0.5 * (step[7] - turn * uy), 0.5 * (step[8] - turn * uz)
+    w, x, y, z = product(product((qw, qx, qy, qz), half), tilt)
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return (
+        px + step[0],
+        py + step[1],
+        pz + step[2],
+        cosine * east - sine * north,
+        sine * east + cosine * north,
+        vz + step[5],
+        w / length,
+        x / length,
+        y / length,
+        z / length,
+        gx + step[9],
+        gy + step[10],
+        gz + step[11],
+        bx + step[12],
+        by + step[13],
+        bz + step[14],
+    )
+
+
+def correction_between(state: Components, moved: Components) -> Components:
+    """The step by which `correct` leads from a state to another."""
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
+    w, x, y, z = product((qw, -qx, -qy, -qz), moved[6:10])
+    about = ux * x + uy * y + uz * z
+    turn = np.arctan2(2.0 * w * about, w * w - about * about)  # of the quaternion and its negative
+    cosine, sine = np.cos(turn), np.sin(turn)
+    half = about * ux, about * uy, about * uz
+    w, x, y, z = product((w, -half[0], -half[1], -half[2]), (w, x, y, z))
+    return (
+        moved[0] - px,
+        moved[1] - py,
+        moved[2] - pz,
+        cosine * moved[3] + sine * moved[4] - vx - turn * vy,
+        cosine * moved[4] - sine * moved[3] - vy + turn * vx,
+        moved[5] - vz,
+        2.0 * x / w + turn * ux,
+        2.0 * y / w + turn * uy,
+        2.0 * z / w + turn * uz,
+        moved[10] - gx,
+        moved[11] - gy,
+        moved[12] - gz,
+        moved[13] - bx,
+        moved[14] - by,
+        moved[15] - bz,
+    )
+
+
 def position(state: Components, about: Any, parameters: Any) -> Components:
     """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
@@ -197,6 +264,7 @@ INERTIAL = Model(
     ),
     Motion(move, move_noise, lost=lost),
     control=UNIT,
-    start=Start({}, HANDHELD, find=align),
+    start=Start({}, HANDHELD, find=align, suspect=suspect),
+    correction=Correction(correct, correction_between, len(STATE)),
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

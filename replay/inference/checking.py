@@ -28,9 +28,11 @@ from replay.inference.generate import (
     things,
 )
 from replay.inference.model import (
+    Correction,
     Model,
     Motion,
     Sensor,
+    check_correction,
     check_motion,
     check_sensor,
     check_state,
@@ -97,6 +99,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
+        check_correction("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
         if model.modes and model.switching:
@@ -119,6 +122,9 @@ def check_model(
             _check_linear(call, part.linear, by_state)
             _check_jumps(call, tried, rng)
             _check_twins(call, tried, rng)
+        if model.correction is not None:
+            for state in tried:
+                _check_correction(model.correction, state[: model.correction.components], model, rng)
         for index, name in enumerate(model.state):
             _check_period(name, index, model, calls, tried)
         for motion in motions.values():
@@ -202,6 +208,29 @@ def _check_derivatives(
             _compare(call, getattr(work, name), slopes, (name, column), 1e-6, "by central differences")
     _check_by_hand(call, part, state, others, work)
     return np.array(work.state)
+
+
+def _check_correction(
+    correction: Correction, state: Floats, model: Model, rng: np.random.Generator
+) -> None:
+    """A small step moves every component by itself, and `between` finds a large one again."""
+    kinds = model.kinds[: correction.components]
+    t, what = tangent_size(kinds), _place(correction.move)
+    names = _tangent(dict(zip(model.state, kinds, strict=False)))
+    for column in range(t):
+        small = STEP * np.eye(t)[column]
+        end, start = (np.array(correction.move(tuple(state), tuple(each))) for each in (small, -small))
+        slopes = _difference(end, start, kinds) / (2.0 * STEP)
+        if not np.allclose(slopes, np.eye(t)[column], atol=1e-6):
+            raise AssertionError(f"{what}: a small step of {names[column]} moves other components too")
+    step = rng.normal(size=t)
+    found = correction.between(tuple(state), correction.move(tuple(state), tuple(step)))
+    wrong = np.flatnonzero(~(np.abs(np.array(found) - step) <= 1e-8))
+    if len(wrong):
+        raise AssertionError(
+            f"{_place(correction.between)}: {names[wrong[0]]} of a step is {step[wrong[0]]:.9g}, and "
+            f"comes back as {found[wrong[0]]:.9g}"
+        )
 
 
 def _check_by_hand(

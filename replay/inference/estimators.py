@@ -35,6 +35,7 @@ from replay.inference.binding import (
     Found,
     assumed_of,
     complaint_of,
+    elsewhere,
     names_state,
     nearest,
     needs_of,
@@ -183,6 +184,9 @@ def _bind_fitting(
         for name, model in models.items()
     }
     fitting = [name for name in models if found[name]]
+    chooses = elsewhere(models, topics, renamed)
+    if chooses:
+        raise BadInput(f"estimator {label}: {chooses}")
     for exactly in (False, True):  # the prior's components tell
         if len(fitting) > 1:
             named_alike = [
