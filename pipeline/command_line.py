@@ -159,7 +159,7 @@ def _command(
 @_command(
     "Simulate a scenario and write its log.",
     "fuselog record landmarks --seed 7 -o run.mcap",
-    "fuselog record landmarks --set duration_s=120 --set fix.rate_hz=1 -o long.mcap",
+    "fuselog record landmarks --set duration_s=120 -o long.mcap",
     "fuselog record --again run.mcap -o again.mcap",
 )
 @click.argument("scenario", required=False)
