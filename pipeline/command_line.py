@@ -1,5 +1,6 @@
 """The command `fuselog`. Commands import what they need when they run: `--help` answers at once."""
 
+import inspect
 import io
 import logging
 import math
@@ -9,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -124,13 +125,43 @@ foxglove_option = click.option(
 )
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def _with_examples(text: str, *examples: str) -> str:
+    """A help text that ends with commands to try, which click does not wrap."""
+    return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=_with_examples(
+        "Record, replay, judge and look at estimators for sensor fusion.",
+        "fuselog record landmarks --seed 7 -o run.mcap",
+        "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
+        "fuselog view est.mcap",
+    ),
+)
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
-    """Record, replay, judge and look at estimators for sensor fusion."""
+    """All commands."""
 
 
-@fuselog.command(short_help="Simulate a scenario and write its log.")
+def _command(
+    short_help: str, *examples: str, name: str | None = None
+) -> Callable[[Callable[..., None]], click.Command]:
+    """Add a command, whose help is its docstring, or the short one, and examples of it."""
+
+    def added(function: Callable[..., None]) -> click.Command:
+        text = _with_examples(function.__doc__ or short_help, *examples)
+        return fuselog.command(name=name, short_help=short_help, help=text)(function)
+
+    return added
+
+
+@_command(
+    "Simulate a scenario and write its log.",
+    "fuselog record landmarks --seed 7 -o run.mcap",
+    "fuselog record landmarks --set duration_s=120 -o long.mcap",
+    "fuselog record --again run.mcap -o again.mcap",
+)
 @click.argument("scenario", required=False)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
@@ -183,7 +214,13 @@ def record(
     _say_written(path, sum(map(len, recording.streams)))
 
 
-@fuselog.command(name="import", short_help="Import real data and write their log.")
+@_command(
+    "Import real data and write their log.",
+    "fuselog import ros drive.bag -o drive.mcap",
+    "fuselog import table drive.csv --guess -o mapping.toml",
+    "fuselog import table drive.csv --mapping mapping.toml -o drive.mcap",
+    name="import",
+)
 @click.argument("source")
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
@@ -249,7 +286,12 @@ def _say_written(path: Path, messages: int) -> None:
     click.echo(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
 
 
-@fuselog.command(short_help="Replay estimators over logs and write their estimates.")
+@_command(
+    "Replay estimators over logs and write their estimates.",
+    "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
+    "fuselog replay run.mcap -e ekf --set sigma_range_m=0.3",
+    "fuselog replay run.mcap -e ekf --arrival-order --late rewind:0.5",
+)
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option(
     "-e", "--estimator", "names", multiple=True, required=True, help="An estimator (repeatable)."
@@ -306,7 +348,10 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     replay_logs(list(logs), list(names), **options)
 
 
-@fuselog.command(short_help="Search the parameters of an estimator that explain logs best.")
+@_command(
+    "Search the parameters of an estimator that explain logs best.",
+    "fuselog tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad",
+)
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "label", required=True, help="The estimator.")
 @click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
@@ -366,7 +411,10 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     tune_logs(list(logs), **options)
 
 
-@fuselog.command(short_help="Say why an estimator is inconsistent.")
+@_command(
+    "Say why an estimator is inconsistent.",
+    "fuselog diagnose run.mcap -e ekf",
+)
 @click.argument("log", type=ANY_PATH)
 @click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
 @click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
@@ -388,7 +436,10 @@ def diagnose(log: Path, **options: Any) -> None:
     diagnose_log(log, **options)
 
 
-@fuselog.command(short_help="Say what the measurements of logs tell of a model's state.")
+@_command(
+    "Say what the measurements of logs tell of a model's state.",
+    "fuselog observability run.mcap --window 10",
+)
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--model", help="The model, where several fit the logs.")
 @click.option(
@@ -419,7 +470,11 @@ def observability(logs: tuple[Path, ...], **options: Any) -> None:
     show_observability(list(logs), **options)
 
 
-@fuselog.command(short_help="Judge estimates against the truth.")
+@_command(
+    "Judge estimates against the truth.",
+    "fuselog evaluate est.mcap",
+    "fuselog evaluate est.txt --truth gt.txt --align se3",
+)
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where ESTIMATES is one as a file.")
@@ -502,7 +557,11 @@ def evaluate(
     evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
 
 
-@fuselog.command(short_help="Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.")
+@_command(
+    "Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.",
+    "fuselog export est.mcap --to tum",
+    "fuselog export run.mcap --to csv --topic /robot1/odometry -o odometry.csv",
+)
 @click.argument("path", type=ANY_PATH)
 @click.option(
     "--to",
@@ -534,7 +593,11 @@ def export(path: Path, to: Any, **options: Any) -> None:
         click.echo(printable(f"{file}: {topic}"))
 
 
-@fuselog.command(short_help="Write a span, some topics or fewer messages of a log.")
+@_command(
+    "Write a span, some topics or fewer messages of a log.",
+    "fuselog cut run.mcap --start 10 --end 20 -o part.mcap",
+    "fuselog cut run.mcap --decimate '/robot1/odometry=5Hz' -o slow.mcap",
+)
 @click.argument("path", type=ANY_PATH)
 @out_log_option
 @click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
@@ -562,7 +625,10 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
     _say_changed(cut_log(path, decimate=_pairs("--decimate", decimate), **options))
 
 
-@fuselog.command(short_help="Write one log of several, whose clocks may differ.")
+@_command(
+    "Write one log of several, whose clocks may differ.",
+    "fuselog merge a.mcap b.mcap --offset b.mcap=-0.5 -o both.mcap",
+)
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @out_log_option
 @click.option(
@@ -586,7 +652,10 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
     _say_changed(merge_logs(list(logs), offsets_s=offsets_s, **options))
 
 
-@fuselog.command(short_help="Write a log with other names of topics and components.")
+@_command(
+    "Write a log with other names of topics and components.",
+    "fuselog relabel run.mcap --topic /robot1/=/left/ -o left.mcap",
+)
 @click.argument("path", type=ANY_PATH)
 @out_log_option
 @click.option(
@@ -631,7 +700,12 @@ def _say_changed(done: "Changed") -> None:
     _say_written(done.path, sum(done.messages.values()))
 
 
-@fuselog.command(short_help="Open a log, estimates or a result in the Rerun viewer.")
+@_command(
+    "Open a log, estimates or a result in the Rerun viewer.",
+    "fuselog view est.mcap",
+    "fuselog view run.mcap --start 10 --end 20",
+    "fuselog view out/landmarks --screenshot picture.png --at 30",
+)
 @click.argument("path", type=ANY_PATH)
 @click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
 @click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
@@ -649,7 +723,12 @@ def view(path: Path, **options: Any) -> None:
     view_path(path, **options)
 
 
-@fuselog.command(short_help="Run an experiment: record, replay, evaluate, draw.")
+@_command(
+    "Run an experiment: record, replay, evaluate, draw.",
+    "fuselog run landmarks --runs 1000 --workers 4",
+    "fuselog run landmarks --set ekf.gate_probability=0.999 --set duration_s=30",
+    "fuselog run a.mcap b.mcap -e ekf -e ukf --out out/mine",
+)
 @click.argument("experiment", nargs=-1, required=True)
 @click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
 @click.option("--runs", type=int, help="Number of Monte Carlo runs.")
@@ -679,7 +758,7 @@ def run(
 ) -> None:
     """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
 
-    Or replay logs as an experiment: fuselog run LOG.mcap ... -e ekf -e ukf --out DIR
+    Or replay logs of your own as an experiment, LOG.mcap ... with -e for each estimator.
 
     --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
     --set gap_limit_s=1 an entry of the experiment.
@@ -691,7 +770,11 @@ def run(
     run_named(experiment, labels, over, **options)
 
 
-@fuselog.command(short_help="Run an experiment at many points of its parameters.")
+@_command(
+    "Run an experiment at many points of its parameters.",
+    "fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --runs 50",
+    "fuselog sweep landmarks --over robots=1,2 --over duration_s=10:60:6",
+)
 @click.argument("experiment", nargs=-1, required=True)
 @click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
 @click.option(
@@ -723,8 +806,6 @@ def sweep(
 ) -> None:
     """Run EXPERIMENT, or replay logs, at all points of a grid of parameters, or at samples of it.
 
-    fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --over robots=1,2
-
     A table has every metric at every point, and within what nine in ten runs lie; figures show them as
     curves, or as heat maps over two parameters. A key is as --set has it.
     """
@@ -734,7 +815,11 @@ def sweep(
     sweep_named(experiment, labels, over, **options)
 
 
-@fuselog.command(short_help="Compare estimators over the same runs, with a verdict on every metric.")
+@_command(
+    "Compare estimators over the same runs, with a verdict on every metric.",
+    "fuselog compare out/before out/after",
+    "fuselog compare a.mcap b.mcap -e ekf -e ukf",
+)
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
@@ -756,17 +841,20 @@ def sweep(
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
-    Or estimators over logs: fuselog compare LOG.mcap ... -e ekf -e ukf
-
-    All others are compared with the first, metric by metric over the runs that both have, with
-    intervals of 95 % by the bootstrap over runs.
+    Or estimators over logs, LOG.mcap ... with -e for each estimator. All others are compared with the
+    first, metric by metric over the runs that both have, with intervals of 95 % by the bootstrap over
+    runs.
     """
     from pipeline.comparing.command import compare_sides
 
     compare_sides(list(sides), list(labels), **options)
 
 
-@fuselog.command(short_help="Check that estimators still give what a golden has.")
+@_command(
+    "Check that estimators still give what a golden has.",
+    "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
+    "fuselog check run.mcap --against ekf.golden.xz",
+)
 @click.argument("path", type=ANY_PATH)
 @click.option("--against", "golden", type=FILE, required=True, help="The golden, a .golden.xz file.")
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
@@ -804,7 +892,10 @@ def check(path: Path, golden: Path, **options: Any) -> None:
         click.get_current_context().exit(1)
 
 
-@fuselog.command(short_help="Render results as one self-contained HTML page.")
+@_command(
+    "Render results as one self-contained HTML page.",
+    "fuselog report out/landmarks -o report.html",
+)
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
 @click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
@@ -818,7 +909,10 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 
-@fuselog.command(short_help="Say what a log holds.")
+@_command(
+    "Say what a log holds.",
+    "fuselog info run.mcap",
+)
 @click.argument("log", type=ANY_PATH)
 @recover_option
 @json_option
@@ -829,8 +923,8 @@ def info(log: Path, recover: bool, as_json: bool) -> None:
     show_log(log, recover=recover, as_json=as_json)
 
 
-def _list_command(kind: str, text: str) -> None:
-    @fuselog.command(name=f"{kind}s", help=text)
+def _list_command(kind: str, text: str, example: str) -> None:
+    @_command(text, f"fuselog {kind}s", f"fuselog {kind}s {example}", name=f"{kind}s")
     @click.argument("name", required=False)
     @json_option
     def listing(name: str | None, as_json: bool) -> None:
@@ -839,13 +933,17 @@ def _list_command(kind: str, text: str) -> None:
         catalog.show(getattr(catalog, f"{kind}s")(), kind, name, as_json=as_json)
 
 
-_list_command("scenario", "List what can be recorded and imported, or all about NAME.")
-_list_command("estimator", "List the estimators, or all about NAME.")
-_list_command("metric", "List the metrics, or all about NAME.")
-_list_command("experiment", "List the shipped experiments, or all about NAME.")
+_list_command("scenario", "List what can be recorded and imported, or all about NAME.", "landmarks")
+_list_command("estimator", "List the estimators, or all about NAME.", "ekf")
+_list_command("metric", "List the metrics, or all about NAME.", "consistency")
+_list_command("experiment", "List the shipped experiments, or all about NAME.", "landmarks")
 
 
-@fuselog.command(short_help="List the models, and the methods that estimate each, or all about NAME.")
+@_command(
+    "List the models, and the methods that estimate each, or all about NAME.",
+    "fuselog models",
+    "fuselog models robot",
+)
 @click.argument("name", required=False)
 @json_option
 def models(name: str | None, as_json: bool) -> None:
@@ -855,7 +953,10 @@ def models(name: str | None, as_json: bool) -> None:
     show_models(name, as_json=as_json)
 
 
-@fuselog.command(short_help="Say what the cache of kernels and samples holds, or clear it.")
+@_command(
+    "Say what the cache of kernels and samples holds, or clear it.",
+    "fuselog cache --clear",
+)
 @click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
 @json_option
 def cache(clear: bool, as_json: bool) -> None:

@@ -1,0 +1,49 @@
+"""The gallery: a card for every shipped experiment, with its picture, its command and its page."""
+
+import re
+from pathlib import Path
+
+from pipeline.catalog import Entry, experiments
+
+DOCS = Path(__file__).parents[2] / "docs"
+HEAD = """---
+hide: [navigation, toc]
+---
+
+# Gallery
+
+Every experiment that ships: its first run as the timeline draws it, or else its figure. A picture leads
+to the page that says what it shows.
+
+<div class="grid cards gallery" markdown>
+
+"""
+
+
+def gallery() -> str:
+    """The text of the page."""
+    return HEAD + "\n".join(map(_card, experiments())) + "\n</div>\n"
+
+
+def page_of(experiment: str) -> Path:
+    """The page that has an experiment's results, or its command: those of families first."""
+    told = re.compile(rf"\{{{experiment}[.\[]|fuselog run ([\w. -]* )?{experiment}(?![\w-])")
+    pages = [*sorted((DOCS / "families").glob("*.md")), *sorted(DOCS.glob("*.md"))]
+    return next(page for page in pages if told.search(page.read_text(encoding="utf-8")))
+
+
+def picture_of(experiment: str) -> Path:
+    """What stands for an experiment: its first run, which `tests.docs.pictures` draws, or its figure."""
+    of_run = DOCS / "gallery" / f"{experiment}.png"
+    return of_run if of_run.exists() else DOCS / "figures" / f"{experiment}.svg"
+
+
+def _card(entry: Entry) -> str:
+    picture, page = (
+        path.relative_to(DOCS).as_posix() for path in (picture_of(entry.name), page_of(entry.name))
+    )
+    command = f"fuselog run {entry.name}" + (" --data FOLDER" if "imports" in entry.facts else "")
+    return (
+        f"-   [![{entry.name}: {entry.what}]({picture}){{ loading=lazy }}]({page})\n\n"
+        f"    **[{entry.name}]({page})**\n\n    {entry.what}\n\n    `{command}`\n"
+    )

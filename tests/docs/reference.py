@@ -1,0 +1,140 @@
+"""The pages of the reference: commands, Python, messages, and all that is registered by a name."""
+
+import ast
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+
+from pipeline import catalog
+from pipeline.catalog import Entry
+from recorders.log.schemas import SCHEMAS, Field, Schema
+from recorders.parameters import describe
+from replay.inference.all_methods import METHODS
+from replay.inference.estimators import registered_models
+
+STUB = Path(__file__).parents[2] / "fuselog" / "__init__.pyi"
+COMMANDS = """# Commands
+
+::: mkdocs-click
+    :module: pipeline.command_line
+    :command: fuselog
+    :depth: 1
+"""
+ROOMS = {
+    "pipeline": "Logs, replays, experiments",
+    "recorders": "Streams and recorders",
+    "replay": "Models, estimators, metrics, timelines",
+}
+KINDS: dict[str, tuple[Callable[[], list[Entry]], str]] = {
+    "scenarios": (
+        catalog.scenarios,
+        "What can be recorded or imported. `--set NAME=VALUE` changes a parameter.",
+    ),
+    "models": (
+        catalog.models,
+        "What a state is made of, how it moves and what sensors measure of it. The "
+        "[methods](estimators.md) that estimate it are those with a check mark.",
+    ),
+    "estimators": (
+        catalog.estimators,
+        "All that `-e NAME` takes. The methods among them estimate any [model](models.md), whose "
+        "parameters they take besides their own; the others have mathematics of their own.",
+    ),
+    "metrics": (catalog.metrics, "What estimates are judged by."),
+}
+TYPES = {
+    "time_ns": "`optional sfixed64`, ns",
+    "identifier": "`optional fixed32`",
+    "real": "`optional double`",
+    "vector": "`repeated double`, packed, of one length per stream",
+}
+
+
+def reference() -> dict[str, str]:
+    """The text of each page, by its place in the site."""
+    pages = {"commands": COMMANDS, "python": _python(), "messages": _messages()}
+    for kind, (entries, what) in KINDS.items():
+        matrix = _methods_of_models() if kind == "models" else []
+        sections = [line for entry in entries() for line in _section(entry)]
+        pages[kind] = "\n".join([f"# {kind.title()}", "", what, "", *matrix, *sections])
+    return {f"reference/{name}.md": text for name, text in pages.items()}
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table, and an empty one."""
+    cells = [[each.replace("|", "\\|") for each in row] for row in [head, ["---"] * len(head), *rows]]
+    return [*(f"| {' | '.join(row)} |" for row in cells), ""]
+
+
+def _python() -> str:
+    """All public names, as the stub of the package lists them; messages have a page of their own."""
+    imports = [
+        node for node in ast.parse(STUB.read_text("utf-8")).body if isinstance(node, ast.ImportFrom)
+    ]
+    lines = [
+        "# Python",
+        "",
+        "`import fuselog` has these names; [Python](../python.md) shows how to use them. "
+        "`fuselog.schemas` has the [messages](messages.md).",
+    ]
+    for room, nodes in groupby(imports, lambda node: (node.module or "").partition(".")[0]):
+        names = [alias.name for node in nodes for alias in node.names if alias.name != "schemas"]
+        names.sort(key=lambda name: (name[0].isupper(), name))  # functions first
+        lines += ["", f"## {ROOMS[room]}", "", *(f"::: fuselog.{name}\n" for name in names)]
+    return "\n".join([*lines, "## Tests", "", "::: fuselog.testing.assert_golden", ""])
+
+
+def _messages() -> str:
+    lines = [
+        "# Messages",
+        "",
+        "Every message of a log: a protobuf message of syntax proto3, whose fields are always written, "
+        "numbered in this order. Each opens with `sensor_time_ns`, the sensor's own clock reading.",
+        "",
+    ]
+    for schema in SCHEMAS.values():
+        lines += _schema(schema)
+    return "\n".join(lines)
+
+
+def _schema(schema: Schema) -> Iterator[str]:
+    yield from [f"## {schema.name}", "", schema.purpose, ""]
+    rows = [
+        [str(number), f"`{field.name}`", TYPES[field.kind], _missing(field)]
+        for number, field in enumerate(schema.fields, start=1)
+    ]
+    yield from table(["number", "field", "type", "where it is missing"], rows)
+
+
+def _missing(field: Field) -> str:
+    says = {
+        "NaN": field.may_be_nan,
+        "left out by logs of before there was the field": field.may_be_absent,
+    }
+    return "; ".join(text for text, holds in says.items() if holds)
+
+
+def _methods_of_models() -> list[str]:
+    rows = [
+        [f"[{name}](#{name})", *("" if method.lacks(model) else "✓" for method in METHODS.values())]
+        for name, model in registered_models().items()
+    ]
+    return table(["model", *METHODS], rows)
+
+
+def _section(entry: Entry) -> Iterator[str]:
+    """What `fuselog KINDs NAME` prints of an entry, its parameters folded."""
+    yield from [f"## {entry.name}", "", f"{entry.what}.", ""]
+    facts = {key: fact for key, fact in entry.facts.items() if fact != "yes"}
+    for key, fact in facts.items():
+        yield f"- {key}: {f'`{fact}`' if fact.startswith('fuselog ') else fact}"
+    parameters = describe(entry.parameters, entry.values) if entry.parameters else []
+    if parameters:
+        rows = [[f"`{each.name}`", _value(each.default), each.accepts] for each in parameters]
+        lines = table(["parameter", "default", "accepts"], rows)
+        yield from ["", f'??? note "{len(rows)} parameters"', "", *(f"    {line}" for line in lines)]
+    yield ""
+
+
+def _value(default: object) -> str:
+    return "" if default is None else f"`{default}`"
