@@ -300,6 +300,7 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
+        by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -348,6 +349,7 @@ class Model:
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
     takes_fixes: bool = True
+    by_name: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
