@@ -183,7 +183,7 @@ def _bind_fitting(
         name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
         for name, model in models.items()
     }
-    fitting = [name for name in models if found[name]]
+    fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]
     chooses = elsewhere(models, topics, renamed)
     if chooses:
         raise BadInput(f"estimator {label}: {chooses}")

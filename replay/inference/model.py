@@ -324,6 +324,7 @@ class Model:
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
         correction: how a correction moves the state; every component by itself unless given.
+        by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -373,6 +374,7 @@ class Model:
     start: Start | None = None
     correction: Correction | None = None
     takes_fixes: bool = True
+    by_name: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
