@@ -26,6 +26,7 @@ from replay.engine.blocks import Ragged
 from replay.estimators.networks import message_bytes
 
 CALM, CI, NAIVE = "calm", "ci", "naive"
+INTERVAL, NEWS = "at most once in an interval", "when it has news"
 OWN = "(own claim)"
 BEYOND = 1.1  # times the number of states: NEES of what is not consistent
 
@@ -78,6 +79,14 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         "sending": summarised(sending, ["estimator", "policy", "limit"]),
         "lying": summarised(lying, ["estimator", "lie_m"]),
     }
+    for row in outcome.tables["sending"].to_dict("records"):
+        case = ("every" if row["policy"] == INTERVAL else "news") + f"-{row['limit']:g}"
+        for quantity in ("position_rmse_m", "nees", "bytes_per_s"):
+            outcome.metrics[f"{row['estimator']}.{quantity}.{case.replace('.', '_')}"] = row[quantity]
+    for row in outcome.tables["lying"].to_dict("records"):
+        case = f"lie-{row['lie_m']:g}m".replace(".", "_")
+        for quantity in ("position_rmse_m", "nees", "liar_refused", "honest_refused"):
+            outcome.metrics[f"{row['estimator']}.{quantity}.{case}"] = row[quantity]
     outcome.claims = [
         *(_consistent(name, stressed) for name in options.cases),
         _naive(stressed),
@@ -108,7 +117,7 @@ def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> 
 def summarised(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Means over the runs."""
     found = rows.groupby(by, sort=False).mean(numeric_only=True).drop(columns="run").reset_index()
-    return found.assign(rmse_m=np.sqrt(found["squared_m2"]))
+    return found.assign(position_rmse_m=np.sqrt(found["squared_m2"]))
 
 
 def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
@@ -222,7 +231,7 @@ def _naive(table: pd.DataFrame) -> Claim:
 def _economy(table: pd.DataFrame) -> list[Claim]:
     """Whether sending news beats sending in intervals, and whether CI stays consistent."""
     own = table[table["estimator"] == CI]
-    by_interval, by_news = (rows for _, rows in own.groupby("policy", sort=False))
+    by_interval, by_news = (own[own["policy"] == policy] for policy in (INTERVAL, NEWS))
     grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
     gains = []
     for _, rows in by_news.groupby("limit", sort=False):
@@ -300,7 +309,10 @@ def _lie_claims(table: pd.DataFrame, options: StressOptions) -> list[Claim]:
 def _bandwidth_chart(table: pd.DataFrame) -> Chart:
     """Error and NEES over what a node sends a second."""
     panels = []
-    for quantity, label in (("rmse_m", "RMSE of the position (m)"), ("nees", "mean NEES (4 states)")):
+    for quantity, label in (
+        ("position_rmse_m", "RMSE of the position (m)"),
+        ("nees", "mean NEES (4 states)"),
+    ):
         panel = Panel(x=Axis(label="sent by a node (B/s)", log=True), y=Axis(label=label, log=True))
         for (estimator, policy), rows in table.groupby(["estimator", "policy"], sort=False):
             rows = rows.sort_values("bytes_per_s")
@@ -315,7 +327,7 @@ def _bandwidth_chart(table: pd.DataFrame) -> Chart:
 def _lie_chart(table: pd.DataFrame) -> Chart:
     """Error and NEES of the honest nodes, and what is refused, over the size of the lie."""
     labels = {
-        "rmse_m": "RMSE of honest nodes (m)",
+        "position_rmse_m": "RMSE of honest nodes (m)",
         "nees": "mean NEES of honest nodes",
         "liar_refused": "share of the liar's messages refused",
     }
