@@ -184,8 +184,9 @@ def follow(
                 steps.append(step)
             continue
         step = _advance(anchor, frame, cut, seen, pose, bounds)
-        is_new = step.finding in (CONTRADICTS_PAST, UNDECIDED)
-        if is_new or step.time_ns - anchor.time_ns >= parameters.anchor_s * 1e9:
+        is_old = step.time_ns - anchor.time_ns >= parameters.anchor_s * 1e9
+        is_cut = step.finding != CONTRADICTS_ITSELF
+        if step.finding in (CONTRADICTS_PAST, UNDECIDED) or (is_old and is_cut):
             parts = [_simpler(part, parameters.most_edges) for part in step.parts]
             step = step._replace(parts=parts, growth=_area(parts) / _area(step.parts))
             anchor = Anchor(frame.time_ns, pose, parts, step.headings)
@@ -212,31 +213,42 @@ def _advance(
         blamed = to_blame(frame.pairs, frame.arena)
         first = int(blamed[0]) if len(blamed) else None
         return step._replace(finding=CONTRADICTS_ITSELF, blamed=first)
-    common = shapely.union_all(past).intersection(cut)
-    heading = narrowed(headings, common, seen, bounds.bearing_rad) if common.area > 0.0 else None
-    before = common_headings(anchor.headings, turned(heading, motion, -1)) if heading else None
-    if heading and before:
-        origin = moved(cut, before, motion, -1)
-        held = [part.intersection(origin) for part in anchor.parts]
-        parts = [moved(part, before, motion).intersection(cut) for part in held]
-        alive = [index for index, part in enumerate(parts) if part.area > 0.0]
-        if alive:
-            finding = None
-            if len(alive) < len(parts):
-                finding = FRAME_WRONG if alive == [0] else PAST_WRONG
-            anchor.parts, anchor.headings = [held[index] for index in alive], before
-            return step._replace(
-                parts=[parts[index] for index in alive], headings=heading, finding=finding
-            )
-    finding = CONTRADICTS_PAST if len(past) == 1 else UNDECIDED
-    whole = shapely.union_all(past)
-    own = _first(frame, cut, seen, bounds)
+    agreed = _cut(anchor, step, cut, seen, motion, bounds)
+    if agreed is not None:
+        return agreed
+    whole, own = shapely.union_all(past), _first(frame, cut, seen, bounds)
     return step._replace(
         parts=[whole, cut],
         headings=all_headings_of(headings, own.headings),
-        finding=finding,
+        finding=CONTRADICTS_PAST if len(past) == 1 else UNDECIDED,
         blamed=_contradicting(frame, whole),
     )
+
+
+def _cut(
+    anchor: Anchor, step: Step, cut: BaseGeometry, seen: Bearings, motion: Motion, bounds: Bounds
+) -> Step | None:
+    """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
+    common = shapely.union_all(step.parts).intersection(cut)
+    if common.area == 0.0:
+        return None
+    headings = narrowed(step.headings, common, seen, bounds.bearing_rad)
+    if headings is None:
+        return None
+    before = common_headings(anchor.headings, turned(headings, motion, -1))
+    if before is None:
+        return None
+    origin = moved(cut, before, motion, -1)
+    held = [part.intersection(origin) for part in anchor.parts]
+    parts = [moved(part, before, motion).intersection(cut) for part in held]
+    alive = [index for index, part in enumerate(parts) if part.area > 0.0]
+    if not alive:
+        return None
+    finding = None
+    if len(alive) < len(parts):
+        finding = FRAME_WRONG if alive == [0] else PAST_WRONG
+    anchor.parts, anchor.headings = [held[index] for index in alive], before
+    return step._replace(parts=[parts[index] for index in alive], headings=headings, finding=finding)
 
 
 def _contradicting(frame: Frame, places: BaseGeometry) -> int | None:

@@ -184,9 +184,9 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
     ),
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
-    "mrclam-set-filter": Recipe("mrclam-set-filter", estimators=SET_FILTERS, alone=True, span_s=100.0),
+    "mrclam-set-filter": Recipe("mrclam-set-filter", estimators=SET_FILTERS, alone=True, span_s=60.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=60.0),
-    "mrclam-stress": Recipe("mrclam-stress", span_s=300.0),
+    "mrclam-stress": Recipe("mrclam-stress", span_s=60.0),
     "set-filter": Recipe("set-filter", parameters=SHORT, estimators=SET_FILTERS, alone=True),
     "uwb-outdoor": Recipe("uwb-outdoor", part="uwb_outdoor/LOS/Trajectory_B/Case_3", span_s=20.0),
     "uwb-pose": Recipe(
