@@ -24,9 +24,10 @@ def swung() -> MemorySource:
         "/hand/inertial",
         schemas.INERTIAL_SAMPLE,
         SIMULATION_EPOCH_NS + STEP_NS * np.arange(COUNT),
-        specific_force_mps2=np.sin(9.0 * time_s + [0.0, 1.0, 2.0]) + [1.0, -2.0, 9.0],
+        specific_force_mps2=np.sin(9.0 * time_s + np.arange(3)) + np.array([1.0, -2.0, 9.0]),
         turn_rate_radps=np.cos(7.0 * time_s + [0.0, 1.0, 2.0]),
-        magnetic_field_ut=3.0 * np.cos(5.0 * time_s + [2.0, 1.0, 0.0]) + [5.0, 20.0, -40.0],
+        magnetic_field_ut=3.0 * np.cos(5.0 * time_s + np.arange(2, -1, -1))
+        + np.array([5.0, 20.0, -40.0]),
     )
     return memory_source(Recording([samples]), RunMetadata("hand"))
 
