@@ -29,7 +29,7 @@ def test_heading_and_inclination_are_the_parts_of_an_error():
 
 @pytest.mark.paper
 def test_a_trial_by_a_filter_and_by_madgwick(real_data, tmp_path):
-    """Errors as measured when this was written; a magnet is told of, and costs only the common method."""
+    """Errors as first measured; a magnet is told of, and costs only the common method."""
     name, experiment = load_experiment("broad-peers", {}, {})
     few = {label: experiment.estimators[label] for label in ("ekf", "madgwick")}
     experiment = experiment.model_copy(update={"estimators": few})
