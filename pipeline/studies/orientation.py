@@ -74,9 +74,11 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     runner = Runner(experiment, setting)
     for number, (name, source) in enumerate(trials(experiment, setting)):
         recorded = runner.replay([source])
-        if not number:  # what is told of the others can be imported again
+        near = with_magnet(source, name, options)
+        disturbed = runner.replay([near])
+        if not number:  # the others can be imported again
             runner.keep([source], recorded.outputs)
-        disturbed = runner.replay([with_magnet(source, name, options)])
+            runner.draw([near], disturbed.outputs, WITH_MAGNET)
         for case, replayed in ((AS_RECORDED, recorded), (WITH_MAGNET, disturbed)):
             rows += errors_of(replayed, name, case)
             found += disturbed_spans(replayed, name, case, options)
