@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.studies.orientation import error_angles
 from recorders.errors import BadInput
+from tests.replay.timeline.test_timeline import read
 
 TRIAL = "07_undisturbed_fast_rotation_B"
 
@@ -44,6 +45,10 @@ def test_a_trial_by_a_filter_and_by_madgwick(real_data, tmp_path):
     verdicts = {claim.claim: claim.verdict for claim in result.claims}
     assert verdicts["an added magnet is noticed, from and to within 2 s"] == "confirmed"
     assert verdicts["ekf errs less than madgwick"] == "not reproducible", "one trial has no interval"
+    events = read(tmp_path / "out" / "magnet-added" / "timeline.rrd")[f"/events/{TRIAL}/ekf"]
+    texts = [text for (text,) in events["TextLog:text"] if "field disturbed" in text]
+    assert texts[0].startswith("ekf: magnetic field disturbed for 20 s, by up to ")
+    assert len(texts) == 2
     spans = (tmp_path / "out" / "tables" / "disturbances.csv").read_text()
     assert spans.count("magnet-added") == 2
     assert spans.count(f"{TRIAL},all") == 0
