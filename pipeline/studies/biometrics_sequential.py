@@ -52,7 +52,7 @@ FAULTS = {
 }
 BOUNDS = ["value", "low", "high"]
 FIXED_PROBES = 50  # more than any matcher needs
-IMPOSTORS = 100_000  # so that their tail is that of all
+IMPOSTORS = 100_000  # so many that their tail is that of all
 DRIFT_SIGMA = 1.0
 
 
@@ -210,13 +210,13 @@ def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
     }
 
 
-def fixed_number(ratios: Floats, rates: Rates, count: int, rng: np.random.Generator) -> float:
+def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> float:
     """The least number of independent probes whose summed ratios hold both rates; NaN for none."""
     drawn = Drawn(ratios, np.arange(len(ratios)))
-    same, other = np.zeros(count), np.zeros(count)
+    same, other = np.zeros(IMPOSTORS), np.zeros(IMPOSTORS)
     for number in range(1, FIXED_PROBES + 1):
-        same += rng.choice(np.diag(ratios), count)
-        other += ratios[drawn.impostors(count, rng)]
+        same += rng.choice(np.diag(ratios), IMPOSTORS)
+        other += ratios[drawn.impostors(IMPOSTORS, rng)]
         if np.mean(same <= np.quantile(other, 1.0 - rates.false_accept)) <= rates.false_reject:
             return float(number)
     return float("nan")
@@ -240,12 +240,17 @@ def watched(
             labelled(Drawn(each.ratios, half), label, options.label_ratio, size, rng) for half in halves
         )
         steady = [np.sort(reference.ratio[reference.is_genuine == kind]) for kind in (False, True)]
+        if min(map(len, steady)) == 0 or len(seen.ratio) < options.watched_probes:
+            raise BadInput(
+                f"study biometrics-sequential: the other matchers are sure of {len(seen.ratio)} probes "
+                f"of {size} to watch {matcher} by; lower options.label_ratio, or give other matchers"
+            )
         for fault in ("none", *FAULTS):
             probes = options.watched_probes if fault == "none" else options.fault_probes
-            some = Labelled(*(part[: options.watched * probes] for part in seen))
+            whole = min(len(seen.ratio), options.watched * probes) // probes * probes
+            some = Labelled(seen.ratio[:whole], seen.is_genuine[:whole])
             now = some._replace(ratio=faulty(fault, some, steady, rng))
-            whole = len(now.ratio) // probes * probes
-            changes = watching(now, steady)[:, :whole].reshape(4, -1, probes)
+            changes = watching(now, steady).reshape(4, -1, probes)
             alarm = first_alarm(page_sums(changes).max(axis=0), options.run_length, together=2)
             yield {
                 "fault": fault,
@@ -343,10 +348,12 @@ def _tell_tests(
     rng: np.random.Generator,
 ) -> None:
     """Metrics, claims and the figure of Wald's tests."""
-    for row in table.itertuples():
-        of_rate = row.quantity in ("false_accept", "false_reject", "undecided")
-        name, scale = (f"{row.quantity}_percent", 100.0) if of_rate else (row.quantity, 1.0)
-        outcome.metrics[f"{row.way}.{name}.{row.matcher}-{_case(row.rates)}"] = scale * row.value
+    for row in records(table):
+        quantity, case = row["quantity"], f"{row['matcher']}-{_case(row['rates'])}"
+        if quantity in ("false_accept", "false_reject", "undecided"):
+            outcome.metrics[f"{row['way']}.{quantity}_percent.{case}"] = 100.0 * row["value"]
+        else:
+            outcome.metrics[f"{row['way']}.{quantity}.{case}"] = row["value"]
     outcome.tables["tests"] = table.assign(rates=table["rates"].map(_percents))
     for stated, way, error in product(options.rates, WAYS, Rates._fields):
         if way == "one-identity" and error == "false_reject":
@@ -356,22 +363,23 @@ def _tell_tests(
         what = {"false_accept": "false accepts", "false_reject": "false rejects"}[error]
         claim = f"{_percents(stated)} stated, {WAYS[way]}: {what} are held"
         outcome.claims.append(_held(claim, bound, chosen))
-    fewer, near = [], []
+    fewer: list[tuple[str, float, float]] = []
+    near: list[tuple[str, float, dict[str, Any]]] = []
     for stated in options.rates:
         rates = Rates(*stated)
         rows = _chosen(table, way="independent", rates=stated)
         for matcher, matrix in ratios.items():
             own = rows[rows["matcher"] == matcher].set_index("quantity")
-            fixed = fixed_number(matrix, rates, options.sequences, rng)
+            fixed = fixed_number(matrix, rates, rng)
             case = f"{matcher}-{_case(stated)}"
             outcome.metrics[f"fixed.probes.{case}"] = fixed
-            probes = own.loc[["genuine_probes", "impostor_probes"]]
-            fewer.append((case, fixed, probes["high"].max()))
+            probes = [records(own.loc[[f"{kind}_probes"]])[0] for kind in ("genuine", "impostor")]
+            fewer.append((case, fixed, max(each["high"] for each in probes)))
             means = np.diag(matrix).mean(), matrix[~np.eye(len(matrix), dtype=bool)].mean()
-            for (kind, row), mean in zip(probes.iterrows(), means, strict=True):
-                wald = wald_probes(rates, float(mean), genuine=kind == "genuine_probes")
-                outcome.metrics[f"wald.{kind}.{case}"] = wald
-                near.append((f"{case} {str(kind).split('_')[0]}", wald, row))
+            for kind, found, mean in zip(("genuine", "impostor"), probes, means, strict=True):
+                wald = wald_probes(rates, float(mean), genuine=kind == "genuine")
+                outcome.metrics[f"wald.{kind}_probes.{case}"] = wald
+                near.append((f"{case} {kind}", wald, found))
     outcome.claims.append(
         judged(
             "independent probes: fewer on average than the fixed number that holds these rates",
@@ -394,16 +402,17 @@ def _tell_tests(
 def _tell_watches(table: pd.DataFrame, options: Options, outcome: Outcome) -> None:
     """Metrics and claims of the watch over matchers."""
     outcome.tables["watch"] = table
-    for row in table.itertuples():
-        name, scale = ("silent_percent", 100.0) if row.quantity == "silent" else ("probes", 1.0)
-        outcome.metrics[f"watch.{name}.{row.fault}-{row.matcher}"] = scale * row.value
+    for row in records(table):
+        name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)
+        outcome.metrics[f"watch.{name}.{row['fault']}-{row['matcher']}"] = scale * row["value"]
     steady = _chosen(table, fault="none", quantity="probes")
     outcome.claims.append(
-        judged(
+        _decided(
             f"a matcher without a fault: {options.run_length:g} probes or more until a false alarm",
             f"{options.run_length:g} (stated)",
             _of_matchers(steady, "{:.0f}"),
-            bool((steady["low"] >= options.run_length).all()),
+            holds=bool((steady["low"] >= options.run_length).all()),
+            fails=bool((steady["high"] < options.run_length).any()),
         )
     )
     for fault, words in FAULTS.items():
@@ -419,6 +428,12 @@ def _tell_watches(table: pd.DataFrame, options: Options, outcome: Outcome) -> No
         )
 
 
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table by the names of its columns."""
+    rows: list[Any] = table.to_dict("records")
+    return rows
+
+
 def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
     """The rows in which columns have these values."""
     for name, value in of.items():
@@ -427,19 +442,29 @@ def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
 
 
 def _held(claim: str, bound: float, rows: pd.DataFrame) -> Claim:
-    """A stated rate is held where no interval goes beyond it, and is not where one lies beyond it."""
-    ours = _of_matchers(rows.assign(**{name: 100.0 * rows[name] for name in BOUNDS}), "{:.2f}") + " %"
-    paper = f"at most {100.0 * bound:.3g} % (Wald's inequality)"
-    if (rows["high"] <= bound).all() or (rows["low"] > bound).any():
-        return judged(claim, paper, ours, bool((rows["high"] <= bound).all()))
+    """Whether a stated rate is held."""
+    return _decided(
+        claim,
+        f"at most {100.0 * bound:.3g} % (Wald's inequality)",
+        _of_matchers(rows.assign(**{name: 100.0 * rows[name] for name in BOUNDS}), "{:.2f}") + " %",
+        holds=bool((rows["high"] <= bound).all()),
+        fails=bool((rows["low"] > bound).any()),
+    )
+
+
+def _decided(claim: str, paper: str, ours: str, *, holds: bool, fails: bool) -> Claim:
+    """A claim that holds where all intervals lie within what is stated; it fails by one beyond."""
+    if holds or fails:
+        return judged(claim, paper, ours, holds)
     return Claim(claim, paper, ours, "not reproducible", "too few users to tell")
 
 
 def _of_matchers(rows: pd.DataFrame, form: str) -> str:
     """Values with their intervals, matcher by matcher."""
     return ", ".join(
-        f"{row.matcher} {form.format(row.value)} ({form.format(row.low)} to {form.format(row.high)})"
-        for row in rows.itertuples()
+        f"{row['matcher']} {form.format(row['value'])} "
+        f"({form.format(row['low'])} to {form.format(row['high'])})"
+        for row in records(rows)
     )
 
 

@@ -124,7 +124,12 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
         "biometrics-bssr1",
         estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
     ),
+    "biometrics-sequential": Recipe("biometrics-sequential", estimators={"ratio": {"pairs": "trimmed"}}),
+    "biometrics-sequential-simulated": Recipe(
+        "biometrics-sequential-simulated", parameters={"users": 120}
+    ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
+    "broad-peers": Recipe("broad-peers", part="07_undisturbed_fast_rotation_B.hdf5", span_s=30.0),
     # scans that come late, and vessels that go side by side
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
