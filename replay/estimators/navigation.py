@@ -66,6 +66,7 @@ class NavigationParameters(AlignmentParameters):
     field_north_ut: float | None = None
     field_up_ut: float | None = None
     range_delay_s: float = 0.0
+    standing_delay_s: float = 0.0
     sigma_velocity_mps: PositiveFloat | None = None
     sigma_heading_rad: PositiveFloat | None = None
     sigma_height_m: PositiveFloat | None = None
