@@ -157,6 +157,8 @@ def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
         parameters: `AlignmentParameters`.
     """
     topic, found = streams["inertial"].topic, []
+    if not len(streams["inertial"]):
+        return []
     try:
         samples = _samples(streams["inertial"], parameters)
         _tilt(samples, topic, parameters)

@@ -21,7 +21,7 @@ from replay.engine.components import components_of
 from replay.engine.tangent import Kind
 from replay.estimators.alignment import AlignmentParameters, align, specific_force, suspect, turn_rate
 from replay.estimators.navigation_sensors import carried_sensors
-from replay.inference.model import Control, Correction, Model, Motion, Sensor, Start
+from replay.inference.model import Control, Model, Motion, Sensor, Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
@@ -66,6 +66,7 @@ class NavigationParameters(AlignmentParameters):
     field_north_ut: float | None = None
     field_up_ut: float | None = None
     range_delay_s: float = 0.0
+    standing_delay_s: float = 0.0
     sigma_velocity_mps: PositiveFloat | None = None
     sigma_heading_rad: PositiveFloat | None = None
     sigma_height_m: PositiveFloat | None = None
@@ -156,35 +157,6 @@ def correct(state: Components, step: Components) -> Components:
     )
 
 
-def correction_between(state: Components, moved: Components) -> Components:
-    """The step by which `correct` leads from a state to another."""
-    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
-    ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
-    w, x, y, z = product((qw, -qx, -qy, -qz), moved[6:10])
-    about = ux * x + uy * y + uz * z
-    turn = np.arctan2(2.0 * w * about, w * w - about * about)  # of the quaternion and its negative
-    cosine, sine = np.cos(turn), np.sin(turn)
-    half = about * ux, about * uy, about * uz
-    w, x, y, z = product((w, -half[0], -half[1], -half[2]), (w, x, y, z))
-    return (
-        moved[0] - px,
-        moved[1] - py,
-        moved[2] - pz,
-        cosine * moved[3] + sine * moved[4] - vx - turn * vy,
-        cosine * moved[4] - sine * moved[3] - vy + turn * vx,
-        moved[5] - vz,
-        2.0 * x / w + turn * ux,
-        2.0 * y / w + turn * uy,
-        2.0 * z / w + turn * uz,
-        moved[10] - gx,
-        moved[11] - gy,
-        moved[12] - gz,
-        moved[13] - bx,
-        moved[14] - by,
-        moved[15] - bz,
-    )
-
-
 def position(state: Components, about: Any, parameters: Any) -> Components:
     """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
@@ -265,6 +237,6 @@ INERTIAL = Model(
     Motion(move, move_noise, lost=lost),
     control=UNIT,
     start=Start({}, HANDHELD, find=align, suspect=suspect),
-    correction=Correction(correct, correction_between, len(STATE)),
+    correct=correct,
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

@@ -244,26 +244,6 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Correction:
-    """How a correction moves the state, where its components do not each move by themselves.
-
-    What is believed is a Gaussian of steps from the mean. Where it is wide, it matters along which
-    curves they lead: a heading that is off by 20 deg has turned the velocity with it.
-
-    Attributes:
-        move: (state, step) -> state; the step is one of the tangent space (t,). Small ones move every
-            component by itself, so that the derivative at zero is the unit matrix.
-        between: (state, moved) -> step, the inverse.
-        components: of how many components this is, the state's first ones; others, which are linear or
-            angles, move by themselves.
-    """
-
-    move: Function
-    between: Function
-    components: int
-
-
-@dataclass(frozen=True, eq=False)
 class Start:
     """What is assumed of a log that has no prior: it was not made for the model.
 
@@ -323,7 +303,9 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
-        correction: how a correction moves the state; every component by itself unless given.
+        correct: (state, step) -> state, how an update moves the state by a step of its tangent space,
+            where not every component moves by itself, as small steps must: the derivative at zero is the
+            unit matrix. It says along which curves a belief is Gaussian, which matters where it is wide.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
@@ -372,7 +354,7 @@ class Model:
     needs_sensor: bool = True
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
-    correction: Correction | None = None
+    correct: Function | None = None
     takes_fixes: bool = True
     by_name: bool = False
 
@@ -446,17 +428,11 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
-def check_correction(where: str, model: Model) -> None:
-    """Call the functions of a model's correction once, uncompiled; see `check_motion`."""
-    if model.correction is None:
-        return
-    components = model.correction.components
-    if components > model.size:
-        raise BadInput(f"{where}: a correction of {components} components; the state has {model.size}")
-    kinds = model.kinds[:components]
-    state, tangent = trial_state(kinds), tangent_size(kinds)
-    _check(where, model.correction.move, (state, (0.0,) * tangent), (components,))
-    _check(where, model.correction.between, (state, state), (tangent,))
+def check_correct(where: str, model: Model) -> None:
+    """Call how a model corrects its state once, uncompiled; see `check_motion`."""
+    if model.correct is not None:
+        arguments = trial_state(model.kinds), (0.0,) * model.tangent
+        _check(where, model.correct, arguments, (model.size,))
 
 
 def check_switching(where: str, model: Model, parameters: Any) -> None:

@@ -217,7 +217,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            going_back(model.kinds, model.correction)(runs, *arguments, scratch=memory)
+            going_back(model.kinds)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 

@@ -20,9 +20,8 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
-from replay.inference.corrections import moving, reaching_back
 from replay.inference.gaussian import copy_gaussian, moved_covariance, multiply, semidefinite_cholesky
-from replay.inference.model import Correction
+from replay.inference.generate import differencing, is_flat, resetting, retraction
 from replay.inference.recursion import Estimates
 from replay.inference.steps import Note, Stage, Steps
 
@@ -211,10 +210,7 @@ class Later(NamedTuple):
 
 
 class BackMemory(NamedTuple):
-    """What the way back of one core works in: a Gaussian, what carries it, and a step's matrices.
-
-    `state` and `transition` are those of a correction, see `corrections.stepping`.
-    """
+    """What the way back of one core works in: a Gaussian, what carries it, and a step's matrices."""
 
     mean: Floats
     covariance: Floats
@@ -222,36 +218,41 @@ class BackMemory(NamedTuple):
     change: Floats
     step: Floats
     rest: Floats
-    state: Floats
-    transition: Floats
 
 
 @lru_cache(maxsize=64)
-def going_back(kinds: tuple[str, ...], correction: Correction | None = None) -> Function:
+def going_back(kinds: tuple[str, ...]) -> Function:
     """The same over all runs, compiled; see `way_back`."""
-    return compile_over_runs(way_back(kinds, correction), allocates=False)
+    return compile_over_runs(way_back(kinds), allocates=False)
 
 
-def way_back(kinds: tuple[str, ...], correction: Correction | None = None) -> Function:
+def way_back(kinds: tuple[str, ...]) -> Function:
     """The loop over the nodes of one run, from its last to its first."""
-    reach, move = reaching_back(kinds, correction), moving(kinds, correction)
+    add, subtract, flat = retraction(kinds), differencing(kinds), is_flat(kinds)
+    reset, reset_back = resetting(kinds), resetting(kinds, back=True)
 
     def go_back(mean: Floats, predicted: Floats, gain: Floats, rest: Floats, work: BackMemory) -> None:
         """Move the Gaussian of `work` to the node before, whose filtered mean is `mean`."""
         change, step, covariance = work.change[0], work.step, work.covariance
-        reach(predicted, work)
+        subtract(work.mean, predicted, work.change, 0)
         for row in range(len(step)):
             entry = 0.0
             for k in range(len(step)):
                 entry += gain[row, k] * change[k]
             step[row] = entry
+        if not flat:
+            reset_back(change, covariance)
+            reset_back(change, covariance.T)
         moved_covariance(covariance, gain, work.product)
         for row in range(len(step)):
             for column in range(len(step)):
                 covariance[row, column] += rest[row, column]
         for row in range(len(mean)):
             work.mean[row] = mean[row]
-        move(work.mean, covariance, work)
+        add(work.mean, step)
+        if not flat:
+            reset(step, covariance)
+            reset(step, covariance.T)
 
     def smooth(
         run: int,
@@ -303,5 +304,5 @@ def no_later(runs: int, n: int, t: int) -> Later:
 
 def back_memory(n: int, t: int) -> BackMemory:
     """Memory for the way back of states with n components, and t in the tangent space."""
-    shapes = ((n,), (t, t), (t, t), (1, t), (t,), (t, t), (n,), (t, t))
+    shapes = ((n,), (t, t), (t, t), (1, t), (t,), (t, t))
     return BackMemory(*(np.empty(shape) for shape in shapes))

@@ -173,3 +173,23 @@ def test_several_units_are_told_apart_before_another_model_is_taken():
         r"/body/imu1/inertial, /body/imu2/inertial of that type: .*topics.inertial=/body/imu1/inertial",
     ):
         estimator.bind("ekf", topics, build(estimator.parameters, {}, "test"))
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize(("method", "goes_on"), [("bank", True), ("particles", False)])
+def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, goes_on: bool):
+    """A bank goes on after it as its filters do; a cloud of particles has no such step, and says so."""
+    slow = {"unit": {"rate_hz": 10.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
+    count = {} if goes_on else {"particles": 20}
+    source = drive(silent, duration_s=26.0, **slow)
+    found = outputs(INERTIAL, method, [source], **count)
+    times_s = since_s(found["state"].stream)
+    last_s = times_s[-1]
+    failures = sentences_of(found["failure"].stream)
+    if goes_on:
+        assert failures == []
+        assert last_s == pytest.approx(26.0)
+        assert not ((times_s > 20.01) & (times_s < 22.99)).any()
+    else:
+        assert failures == ["what drives the motion is silent for too long"]
+        assert last_s == pytest.approx(20.0)

@@ -10,7 +10,7 @@ import pytest
 from recorders.errors import BadInput
 from replay.inference.checking import check_model
 from replay.inference.estimators import registered_models
-from replay.inference.model import Correction, Model, Motion
+from replay.inference.model import Model, Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -118,14 +118,6 @@ def moved_by(state: Any, step: Any) -> Any:
     return x + step[0], y + step[1], heading + step[2], speed + step[3] + step[2] * turn, turn + step[4]
 
 
-def moved_apart(state: Any, step: Any) -> Any:
-    return tuple(np.add(state, step))
-
-
-def twice(state: Any, moved: Any) -> Any:
-    return tuple(2.0 * np.subtract(moved, state))
-
-
 WRONG: dict[str, tuple[Model, str]] = {
     "a Jacobian of a sensor": (with_speed(jacobian=rows_by_hand), "read_speed .* as written by hand"),
     "a measured angle declared linear": (
@@ -172,16 +164,8 @@ WRONG: dict[str, tuple[Model, str]] = {
         "known are linear",
     ),
     "a correction that is none for small steps": (
-        replace(VEHICLE_A, correction=Correction(moved_by, twice, 5)),
+        replace(VEHICLE_A, correct=moved_by),
         "moved_by .* a small step of heading_rad moves other components too",
-    ),
-    "a correction with another inverse": (
-        replace(VEHICLE_A, correction=Correction(moved_apart, twice, 5)),
-        "twice .*: x_m of a step is .*, and comes back as",
-    ),
-    "a correction of too many components": (
-        replace(VEHICLE_A, correction=Correction(moved_apart, twice, 6)),
-        "a correction of 6 components; the state has 5",
     ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),
