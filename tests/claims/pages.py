@@ -9,7 +9,8 @@ In a page stands a comment, a template, and below it what it gives, up to `<!-- 
     -->
 
 `{NAME[KEY]:FORMAT}` is a metric of the experiment NAME, `{NAME[KEY][0]}` an entry of one that is a list,
-`{NAME.claims}` its table of claims, `{NAME.verdicts}` how many there are of each verdict.
+`{NAME.claims}` its table of claims, `{NAME.counted}` how many there are of each verdict, and
+`{NAME.verdicts}` the same in numbers alone.
 """
 
 import json
@@ -25,8 +26,7 @@ from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
-TOLD = ("diagnose", "tune")  # pages that are of no family, and hold results
-PAGES = [*sorted(FOLDER.parent.glob("*.md")), *(ROOT / "docs" / f"{name}.md" for name in TOLD)]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
@@ -49,12 +49,16 @@ class Stored:
         return ", ".join(map(str, self._counts().values()))
 
     @property
+    def counted(self) -> str:
+        """How many claims there are of each verdict, in words."""
+        return ", ".join(f"{count} {verdict}" for verdict, count in self._counts().items())
+
+    @property
     def claims(self) -> str:
         """What command gave the claims, and their table."""
-        how_many = ", ".join(f"{count} {verdict}" for verdict, count in self._counts().items())
         simulated = "import" not in self.settings
         runs = " (seed {seed}, {runs} runs)".format_map(self.settings) if simulated else ""
-        head = [f"`fuselog run {self._name}`{runs}: {how_many}.", ""]
+        head = [f"`fuselog run {self._name}`{runs}: {self.counted}.", ""]
         return "\n".join(
             [*head, "| claim | paper | ours | verdict |", "|---|---|---|---|", *self._rows()]
         )
