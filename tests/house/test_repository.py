@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +60,14 @@ def test_no_file_cites_what_is_outside_the_repository() -> None:
                     path.read_text(encoding="utf-8"),
                 )
                 assert not found, f"{path}: {found}"
+
+
+def test_one_version_everywhere() -> None:
+    """That of pyproject.toml, which the installed package has, is cited and tops the changelog."""
+    stated = PYPROJECT["project"]["version"]
+    assert version("fuselog") == stated
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == stated
+    assert cited["license"] == PYPROJECT["project"]["license"]
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (\S+)", changelog, re.MULTILINE)[0].rstrip(",") == stated
