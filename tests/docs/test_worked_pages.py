@@ -35,9 +35,11 @@ WORKED = [
     "coming-from",
     "tracking",
     "your-log",
+    "your-model",
     "timeline",
     pytest.param("navigation", marks=pytest.mark.paper),
 ]
+UNCOMPILED = ["your-model"]  # a model of the page's own: quicker in Python than its kernels are compiled
 PEERS = (
     "evo",
     "filterpy",
@@ -91,9 +93,11 @@ def flat(text: str) -> str:
 
 @pytest.mark.parametrize("name", WORKED)
 def test_a_page_can_be_worked_through(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    if name in UNCOMPILED:
+        request.getfixturevalue("uncompiled")
     names: dict[str, Any] = {}
     printed, shown, left_out = "", 0, list[str]()
     for language, file, text in blocks_of(name):
