@@ -44,7 +44,7 @@ def test_the_gallery_has_every_experiment() -> None:
     page = gallery.gallery()
     for name in shipped("experiments"):
         assert page.count(f"`fuselog run {name}") == 1, name
-        assert gallery.picture_of(name).exists(), f"python -m tests.docs.pictures {name}"
+        assert gallery.picture_of(name).is_relative_to(gallery.DOCS), name
 
 
 def test_the_reference_has_every_name() -> None:
