@@ -238,7 +238,7 @@ class Tuning:
                 )
         if found.is_at_edge:
             yield (
-                "there are no intervals: beside these values a run fails, or uses fewer measurements, so "
+                "there are no intervals: beside these values a run fails or uses fewer measurements, so "
                 "that likelihoods cannot be compared; give every log a prior, a narrower --bound, or "
                 "other values to start from"
             )
