@@ -44,7 +44,7 @@ PEERS = (
     "evo",
     "filterpy",
     "stonesoup",
-)  # of the extra `bench`, and evo; without one its code is not run
+)  # of the extra `bench`; without one its code is not run
 _BLOCK = re.compile(r"^```(\w*)(?: title=\"(.*?)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
