@@ -1,6 +1,6 @@
 """`make bench`: every benchmark beside this file, as ratios measured in one run.
 
-What it prints is kept in docs/speed.json, each table with its machine; the site's page of speed is made of it.
+What it prints is kept in docs/speed.json, each table with its machine; the page of speed is made of it.
 """
 
 import importlib
@@ -12,9 +12,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pipeline.terminal import format_value, print_table
+from tests.claims.pages import SPEED
 
 COLUMNS = ("what", "ours", "theirs", "ratio")
-KEPT = Path(__file__).parents[2] / "docs" / "speed.json"
 
 
 def main() -> None:
@@ -31,9 +31,9 @@ def main() -> None:
 
 def keep(name: str, rows: list[list[str]]) -> None:
     """Put a benchmark's table into the file of all, in place of the one that was there."""
-    there = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+    there = json.loads(SPEED.read_text(encoding="utf-8")) if SPEED.exists() else {}
     there[name] = {"day": datetime.now(UTC).date().isoformat(), "machine": machine(), "rows": rows}
-    KEPT.write_text(json.dumps(dict(sorted(there.items())), indent=1) + "\n", encoding="utf-8")
+    SPEED.write_text(json.dumps(dict(sorted(there.items())), indent=1) + "\n", encoding="utf-8")
 
 
 def machine() -> str:
