@@ -93,13 +93,14 @@ def hypotheses(
     command = f"fuselog tune LOG -e {label}"
     source, parameters = base.source, bound[0].parameters
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
-    priors = list(dict.fromkeys(topic for each in bound for topic in each.priors))
+    stated = (topic for each in bound for topic in each.priors if topic in source.streams)
+    priors = list(dict.fromkeys(stated))
     found = [*_noises(command, bound, source), *_outliers(parameters)]
     stamps = [source.streams[topic].publish_time_ns for topic in streamed if len(source.streams[topic])]
     first_ns = min(int(each[0]) for each in stamps)
     last_ns = max(int(each[-1]) for each in stamps)
     begins_ns = [source.streams[topic].publish_time_ns[:1] for topic in priors]
-    first_ns = min(first_ns, *(int(each[0]) for each in begins_ns if len(each)))
+    first_ns = min([first_ns, *(int(each[0]) for each in begins_ns if len(each))])
     timing = alter.delayed(first_ns, last_ns), alter.drifted(first_ns, last_ns)
     for topic in streamed:
         stream = source.streams[topic]

@@ -58,7 +58,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
         for table in track_tables(reports_of(each))
     ]
     if not tables:
-        raise BadInput("no tracks to judge: the log has no identities, or no estimator tells tracks")
+        raise BadInput("no tracks to judge: the log has no identities, or no estimator gives tracks")
     return pd.concat(tables).rename(columns={"target": "mmsi"})
 
 

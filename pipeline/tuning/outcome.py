@@ -45,6 +45,7 @@ class Found(NamedTuple):
             stopped, or ended at bounds alone.
         evaluations: how many values were tried.
         has_converged, was_stopped: how it ended.
+        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
     """
 
     coordinates: Coordinates
@@ -53,6 +54,7 @@ class Found(NamedTuple):
     told: Confidence | None = None
     has_converged: bool = True
     was_stopped: bool = False
+    is_at_edge: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,6 +236,12 @@ class Tuning:
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
                 )
+        if found.is_at_edge:
+            yield (
+                "there are no intervals: beside these values a run fails or uses fewer measurements, so "
+                "that likelihoods cannot be compared; give every log a prior, a narrower --bound, or "
+                "other values to start from"
+            )
         if found.told is not None:
             yield from doubts(found.told, free)
 

@@ -230,7 +230,10 @@ def _minimum(
 
 
 def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
-    """The second derivatives (m, m) of the cost at a point (k,), by m of its coordinates."""
+    """The second derivatives (m, m) of the cost at a point (k,), by m of its coordinates.
+
+    They are not finite where the cost beside the point is not.
+    """
     m, h = len(places), CURVATURE_STEP
     along = h * np.eye(len(point))[list(places)]
     pairs = list(combinations(range(m), 2))
@@ -241,7 +244,10 @@ def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Seque
     ]
     costs = cost(coordinates.values(np.array([point, *(point + along), *(point - along), *corners])))
     ahead, behind, crossed = np.split(costs[1:], [m, 2 * m])
-    found = np.diag((ahead - 2.0 * costs[0] + behind) / h**2)
-    for (i, j), (both, plus, minus, neither) in zip(pairs, crossed.reshape(-1, 4), strict=True):
-        found[i, j] = found[j, i] = (both - plus - minus + neither) / (4.0 * h**2)
+    both, plus, minus, neither = crossed.reshape(-1, 4).T
+    with np.errstate(invalid="ignore"):
+        found = np.diag((ahead - 2.0 * costs[0] + behind) / h**2)
+        mixed = (both - plus - minus + neither) / (4.0 * h**2)
+    for (i, j), value in zip(pairs, mixed, strict=True):
+        found[i, j] = found[j, i] = value
     return found

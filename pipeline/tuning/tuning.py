@@ -226,11 +226,15 @@ def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
         inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
-        told = None
+        told, is_at_edge = None, False
         if objective.by == "likelihood" and inner:
-            told = confidence(inner, curvature(objective, coordinates, point, inner))
+            bent = curvature(objective, coordinates, point, inner)
+            is_at_edge = not np.isfinite(bent).all()
+            told = None if is_at_edge else confidence(inner, bent)
         optimum, evaluations = coordinates.values(point), objective.best.evaluations
-        return Found(coordinates, optimum, evaluations, told, has_converged=has_converged)
+        return Found(
+            coordinates, optimum, evaluations, told, has_converged=has_converged, is_at_edge=is_at_edge
+        )
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
             raise

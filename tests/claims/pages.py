@@ -10,7 +10,8 @@ In a page stands a comment, a template, and below it what it gives, up to `<!-- 
 
 `{NAME[KEY]:FORMAT}` is a metric of the experiment NAME, `{NAME[KEY][0]}` an entry of one that is a list,
 `{NAME.claims}` its table of claims, `{NAME.counted}` how many there are of each verdict, and
-`{NAME.verdicts}` the same in numbers alone.
+`{NAME.verdicts}` the same in numbers alone. `{speed[WHAT]:.0f}` is how many times faster than a peer
+`make bench` found fuselog to be at WHAT, and `{speed.machine}` where.
 """
 
 import json
@@ -26,7 +27,8 @@ from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
+SPEED = ROOT / "docs" / "speed.json"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
@@ -74,6 +76,19 @@ class Stored:
             yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
+class Speed:
+    """What `make bench` kept."""
+
+    def __init__(self, kept: Mapping[str, Any]) -> None:
+        rows = [row for table in kept.values() for row in table["rows"]]
+        self._ratios = {what: ratio for what, *_, ratio in rows}
+        self.machine = " and ".join(sorted({table["machine"] for table in kept.values()}))
+
+    def __getitem__(self, what: str) -> float:
+        """The ratio of a row."""
+        return float(self._ratios[what].partition(" ")[0])
+
+
 def store(folder: Path) -> Path:
     """Keep what a result folder holds of claims, metrics and settings; not where its data lay."""
     result: Result = read_result(folder)
@@ -93,6 +108,13 @@ def stored() -> dict[str, Stored]:
     }
 
 
+@cache
+def speed() -> Speed:
+    """How fast fuselog is beside its peers, as last measured."""
+    return Speed(json.loads(SPEED.read_text(encoding="utf-8")))
+
+
 def rendered(page: str) -> str:
     """The text of a page with everything that is made from results made anew."""
-    return _BLOCK.sub(lambda block: f"{block[1]}{block[2].format_map(stored())}\n{block[4]}", page)
+    known = {**stored(), "speed": speed()}
+    return _BLOCK.sub(lambda block: f"{block[1]}{block[2].format_map(known)}\n{block[4]}", page)

@@ -33,9 +33,12 @@ def page_of(experiment: str) -> Path:
 
 
 def picture_of(experiment: str) -> Path:
-    """What stands for an experiment: its first run, which `tests.docs.pictures` draws, or its figure."""
-    of_run = DOCS / "gallery" / f"{experiment}.png"
-    return of_run if of_run.exists() else DOCS / "figures" / f"{experiment}.svg"
+    """Its first run, which `tests.docs.pictures` draws, else its figure, else the first of its page."""
+    page = page_of(experiment)
+    shown = re.findall(r"!\[.*?\]\((.*?)\)", page.read_text(encoding="utf-8"))
+    of_run, figure = DOCS / "gallery" / f"{experiment}.png", DOCS / "figures" / f"{experiment}.svg"
+    of_page = [(page.parent / each).resolve() for each in shown]
+    return next(path for path in (of_run, figure, *of_page) if path.exists())
 
 
 def _card(entry: Entry) -> str:

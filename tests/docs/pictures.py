@@ -4,11 +4,14 @@ A Vulkan driver is needed, as for `fuselog view --screenshot`.
 """
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
 from PIL import Image
 
+from pipeline.diagnosing.diagnosis import diagnose
+from pipeline.door import record
 from pipeline.experiment import shipped
 from pipeline.replays import replay
 from recorders.errors import choices
@@ -20,31 +23,35 @@ WINDOW = (960, 600)
 VIEWS = (0, 36, 960, 570)  # without the viewer's own bars
 
 
+def draw(name: str, places: Mapping[str, Path], rrd: Path) -> None:
+    """Write the timeline of an experiment's first log; of diagnoses, that of docs/diagnose.md."""
+    if name == "diagnosis":
+        fault = {"bias_bearing_rad": 0.035}
+        diagnose(record("landmarks", seed=7, range_bearing=fault), "ekf").view(save=rrd)
+    else:
+        replay(first_log(RECIPES[name], places), RECIPES[name].settings).view(save=rrd)
+
+
 @click.command()
 @click.argument("names", nargs=-1)
 @data_option
 def main(names: tuple[str, ...], data: Path) -> None:
     """Draw the first logs of the experiments NAMES, or of all that have some."""
-    known = [name for name in shipped("experiments") if name in RECIPES and RECIPES[name].has_log]
+    known = [name for name in shipped("experiments") if name == "diagnosis" or RECIPES[name].has_log]
     for name in names:
         if name not in known:
             raise click.BadParameter(f"no experiment '{name}' that has logs; {choices(name, known)}")
     with tempfile.TemporaryDirectory() as scratch:
         places = unpack(data, DATA, Path(scratch))
+        rrd, picture = Path(scratch) / "timeline.rrd", Path(scratch) / "view.png"
         for name in names or known:
-            recipe, rrd, picture = (
-                RECIPES[name],
-                Path(scratch) / "timeline.rrd",
-                Path(scratch) / "view.png",
-            )
-            replay(first_log(recipe, places), recipe.settings).view(save=rrd)
+            draw(name, places, rrd)
             for complaint in screenshot(rrd, picture, size=WINDOW):
                 click.echo(f"{name}: {complaint}")
+            card = DOCS / "gallery" / f"{name}.png"
             with Image.open(picture) as image:
-                image.crop(VIEWS).convert("RGB").quantize(128).save(
-                    DOCS / "gallery" / f"{name}.png", optimize=True
-                )
-            click.echo(DOCS / "gallery" / f"{name}.png")
+                image.crop(VIEWS).convert("RGB").quantize(128).save(card, optimize=True)
+            click.echo(card)
 
 
 if __name__ == "__main__":

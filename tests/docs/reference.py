@@ -1,6 +1,7 @@
 """The pages of the reference: commands, Python, messages, and all that is registered by a name."""
 
 import ast
+import json
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -11,6 +12,8 @@ from recorders.log.schemas import SCHEMAS, Field, Schema
 from recorders.parameters import describe
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
+from tests.bench.__main__ import COLUMNS
+from tests.claims.pages import SPEED
 
 STUB = Path(__file__).parents[2] / "fuselog" / "__init__.pyi"
 COMMANDS = """# Commands
@@ -52,7 +55,7 @@ TYPES = {
 
 def reference() -> dict[str, str]:
     """The text of each page, by its place in the site."""
-    pages = {"commands": COMMANDS, "python": _python(), "messages": _messages()}
+    pages = {"commands": COMMANDS, "python": _python(), "messages": _messages(), "speed": _speed()}
     for kind, (entries, what) in KINDS.items():
         matrix = _methods_of_models() if kind == "models" else []
         sections = [line for entry in entries() for line in _section(entry)]
@@ -120,6 +123,25 @@ def _methods_of_models() -> list[str]:
         for name, model in registered_models().items()
     ]
     return table(["model", *METHODS], rows)
+
+
+def _speed() -> str:
+    lines = [
+        "# Speed",
+        "",
+        "fuselog beside other software, in one run and with the same estimates, as `make bench` last "
+        "measured it. `python -m tests.bench NAME` measures one table.",
+        "",
+    ]
+    for name, kept in json.loads(SPEED.read_text(encoding="utf-8")).items():
+        lines += [
+            f"## {name}",
+            "",
+            f"{kept['day']}, {kept['machine']}",
+            "",
+            *table(COLUMNS, kept["rows"]),
+        ]
+    return "\n".join(lines)
 
 
 def _section(entry: Entry) -> Iterator[str]:

@@ -16,20 +16,35 @@ from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 import fuselog as fl
+from replay.timeline import show
 from tests.pipeline.conftest import run_here
 
 DOCS = Path(__file__).parents[2] / "docs"
-WORKED = ["start", "judge", "smooth", "contract", "coming-from"]
+WORKED = [
+    "start",
+    "judge",
+    "smooth",
+    "contract",
+    "coming-from",
+    "tracking",
+    "your-log",
+    "your-model",
+    "timeline",
+    pytest.param("navigation", marks=pytest.mark.paper),
+]
+UNCOMPILED = ["your-model"]  # a model of the page's own: quicker in Python than its kernels are compiled
 PEERS = (
     "evo",
     "filterpy",
     "stonesoup",
-)  # of the extra `bench`, and evo; without one its code is not run
+)  # of the extra `bench`; without one its code is not run
 _BLOCK = re.compile(r"^```(\w*)(?: title=\"(.*?)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -78,9 +93,11 @@ def flat(text: str) -> str:
 
 @pytest.mark.parametrize("name", WORKED)
 def test_a_page_can_be_worked_through(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    if name in UNCOMPILED:
+        request.getfixturevalue("uncompiled")
     names: dict[str, Any] = {}
     printed, shown, left_out = "", 0, list[str]()
     for language, file, text in blocks_of(name):
@@ -103,6 +120,18 @@ def test_a_page_can_be_worked_through(
     assert shown, "a worked page shows what its commands print"
     if left_out:
         pytest.skip(f"all but the code for {', '.join(left_out)}, which are not installed here")
+
+
+def test_a_drawing_of_ones_own_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's function puts the distances of a replay on the timeline of its scenario."""
+    names: dict[str, Any] = {}
+    (code,) = (block.text for block in blocks_of("timeline") if "fl.Timeline" in block.text)
+    exec(code, names)
+    monkeypatch.setattr(show, "load", Mock(return_value=names["TIMELINE"]))
+    log = fl.record("landmarks", seed=3, duration_s=2.0)
+    fl.replay(log, "ekf").view(save=tmp_path / "own.rrd")
+    drawn = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "own.rrd")).stream()}
+    assert "/distance/robot1/ekf" in drawn
 
 
 def test_readers_in_other_languages_read_what_fuselog_reads(

@@ -53,5 +53,5 @@ def test_as_shipped(autoferry: Path, tmp_path: Path):
 def test_other_estimators_are_refused(autoferry: Path, tmp_path: Path):
     over = {"estimators": {"gm-phd": {"sensor": "radar", "variance_m2": 25.0}}}
     name, experiment = load_experiment("autoferry", {}, over)
-    with pytest.raises(BadInput, match="gm-phd tells no tracks"):
+    with pytest.raises(BadInput, match="gm-phd gives no tracks"):
         run_experiment(name, experiment, tmp_path / "out", data=autoferry / "scenario2")

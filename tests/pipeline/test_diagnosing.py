@@ -313,6 +313,15 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
 
 
+def test_a_log_without_a_prior_is_diagnosed() -> None:
+    """The filter began at the first fixes; there is no prior whose sigma could be wrong."""
+    run = fl.record("landmarks", seed=3, duration_s=30.0, fix={"rate_hz": 2.0})
+    streams = {topic: each for topic, each in run.streams.items() if not topic.endswith("/prior")}
+    found = fl.diagnose(replace(run, streams=streams), "ekf")
+    assert not any("prior" in sentence for sentence in found.sentences)
+    assert set(found.components["component"]) >= {"x_m", "y_m", "range_m", "bearing_rad"}
+
+
 def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -199,11 +199,13 @@ def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
     assert "\n ekf " in listed
 
 
-def test_the_readme_brings_a_log_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The README's snippet writes a log and its command replays it; a renamed field would break both."""
-    page = (Path(__file__).parents[2] / "README.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (command,) = re.findall(r"```\n(fuselog replay own\.mcap .*?)```", page, re.DOTALL)
+def test_the_page_brings_a_log_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's snippet writes a log and its command replays it; a renamed field would break both."""
+    page = (Path(__file__).parents[2] / "docs" / "your-log.md").read_text()
+    (code,) = (
+        each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "own.mcap" in each
+    )
+    (command,) = re.findall(r"```sh\n(fuselog replay own\.mcap .*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     exec(code, {})
     assert main(shlex.split(command.replace("\\\n", ""))[1:]) == 0

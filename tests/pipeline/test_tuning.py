@@ -19,6 +19,7 @@ import fuselog as fl
 from pipeline.executors import Here
 from pipeline.results import read_result
 from pipeline.tuning.objective import Best
+from pipeline.tuning.search import Cost, curvature
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
@@ -157,6 +158,24 @@ def test_a_parameter_that_no_message_depends_on_is_refused(short: fl.MemorySourc
         fl.tune(replace(short, streams=blind), "ekf", "sigma_range_m", set=given)
     with pytest.raises(fl.BadInput, match="every_s: nothing in the logs depends on it"):
         fl.tune(short, "ekf", ["sigma_range_m", "every_s"], set={**given, "every_s": 1e6})
+
+
+def test_at_an_edge_there_are_no_intervals(
+    short: fl.MemorySource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the best values a run fails: that is said, and numpy warns of nothing."""
+
+    def beside_an_edge(cost: Cost, *where: Any) -> Any:
+        def edged(points: Any) -> Any:
+            return np.where(points[:, 0] > points[0, 0], np.inf, cost(points))
+
+        return curvature(edged, *where)
+
+    monkeypatch.setattr("pipeline.tuning.tuning.curvature", beside_an_edge)
+    given = of_sigmas(0.1, 0.05, 0.2, 0.03)
+    found = fl.tune(short, "ekf", ["sigma_range_m", "sigma_bearing_rad"], set=given)
+    assert found.parameters[["low", "high"]].isna().all(axis=None)
+    assert any(note.startswith("there are no intervals: beside these values") for note in found.notes)
 
 
 def test_ctrl_c_ends_with_the_best_so_far(short: fl.MemorySource) -> None:

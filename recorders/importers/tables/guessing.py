@@ -48,7 +48,7 @@ def guess(paths: Sequence[Path]) -> str:
     files = []
     for path in paths:
         if not path.exists():
-            raise BadInput(f"{path}: no such file or folder; give the tables to look at")
+            raise BadInput(f"{path}: no such file or folder; give the tables to guess from")
         inside = sorted(path.rglob("*")) if path.is_dir() else [path]
         files += [
             (file, file.relative_to(path) if path.is_dir() else Path(file.name)) for file in inside

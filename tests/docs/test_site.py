@@ -1,0 +1,66 @@
+"""The site is built as `make docs` builds it, and its notebooks run."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from pipeline.experiment import shipped
+from tests.docs import gallery, hooks, notebooks, reference
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.paper
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """Links, anchors and pictures are there; no page fetches anything from elsewhere."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    pages = {path.relative_to(tmp_path).with_suffix("").as_posix() for path in tmp_path.rglob("*.html")}
+    sources = {*(ROOT / "docs").rglob("*.md"), *notebooks.NOTEBOOKS}
+    assert pages >= {path.relative_to(ROOT / "docs").with_suffix("").as_posix() for path in sources}
+    commands = (tmp_path / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "fuselog replay run.mcap -e ekf" in re.sub(r"<[^>]+>", "", commands)
+
+
+def test_what_a_page_must_not_have() -> None:
+    for bad in (
+        '<script src="https://cdn.org/a.js">',
+        "<link href=//fonts.org/a.css>",
+        '<img src="a.png">',
+    ):
+        with pytest.raises(Exception, match="page: <"):
+            hooks.on_post_page(bad, page="page", config={})
+    hooks.on_post_page(
+        '<a href="https://rerun.io">, <img alt="a robot" src="a.png">', page="", config={}
+    )
+
+
+def test_the_gallery_has_every_experiment() -> None:
+    page = gallery.gallery()
+    for name in shipped("experiments"):
+        assert len(re.findall(rf"`fuselog run {name}(?: --data FOLDER)?`", page)) == 1, name
+        assert gallery.picture_of(name).is_relative_to(gallery.DOCS), name
+
+
+def test_the_reference_has_every_name() -> None:
+    pages = reference.reference()
+    for kind, (entries, _) in reference.KINDS.items():
+        for entry in entries():
+            assert f"\n## {entry.name}\n" in pages[f"reference/{kind}.md"]
+    robot = pages["reference/models.md"].partition("## robot\n")[2].partition("\n## ")[0]
+    assert "    | `gate_probability` | `0.999` | number > 0 <= 1 |" in robot
+    odometry = pages["reference/messages.md"].partition("## Odometry\n")[2]
+    assert "| 2 | `forward_mps` | `optional double` |" in odometry
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("path", notebooks.NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_prints_what_is_kept(path: Path) -> None:
+    kept = notebooks.printed(nbformat.read(path, as_version=4))
+    assert kept
+    assert notebooks.printed(notebooks.executed(path)) == kept, "python -m tests.docs.notebooks"
