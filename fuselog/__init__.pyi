@@ -32,6 +32,7 @@ from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome
 from pipeline.runner import Runner as Runner
+from pipeline.surgery import constrain as constrain
 from pipeline.surgery import cut as cut
 from pipeline.surgery import merge as merge
 from pipeline.surgery import relabel as relabel

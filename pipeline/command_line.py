@@ -653,6 +653,27 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 
 
 @_command(
+    "Write a log with what its inertial unit says of standing and rolling.",
+    "fuselog constrain run.mcap -o constrained.mcap --set rolling_hz=10",
+)
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only unit].")
+@set_option
+@recover_option
+def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
+    """Write PATH with topics that say when its body stands and, with --set rolling_hz=10, that it rolls.
+
+    The model inertial takes them as it takes sensors: a body that stands has no velocity, and one that
+    rolls on wheels moves neither to the side nor up.
+    """
+    from pipeline.surgery import constrain as constrain_log
+    from recorders.parameters import parse_settings
+
+    _say_changed(constrain_log(path, settings=parse_settings(settings), **options))
+
+
+@_command(
     "Write a log with other names of topics and components.",
     "fuselog relabel run.mcap --topic /robot1/=/left/ -o left.mcap",
 )

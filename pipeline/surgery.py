@@ -1,4 +1,4 @@
-"""Log surgery: a log cut, several merged into one, topics and components renamed.
+"""Log surgery: a log cut, constrained, several merged into one, topics and components renamed.
 
 Logs go through block by block, so that memory does not grow with them, into a new log that says in its
 metadata what was done. No log is changed.
@@ -10,17 +10,20 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.constraints import ConstraintParameters, constraints_of
 from pipeline.outputs import CHANGED, CHANGES, check_files
 from pipeline.starting import span_of
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Log, LogWriter, RunMetadata, Stream, open_log, read_blocks, read_empty, schemas
 from recorders.log.schemas import SCHEMAS, message_class
 from recorders.log.sealed import OWN_NAMES
+from recorders.parameters import build
 from replay.engine.sources import LogSource
 
 Blocks = Iterator[list[Stream]]
@@ -214,6 +217,62 @@ def relabel(
     pairs = [f"{old}={new}" for old, new in {**(topics or {}), **(components or {})}.items()]
     run = _told(_moved(log, target), f"relabelled {log.path.name} {' '.join(pairs)}")
     return _write(target, run, [renamed(read_empty(log, topic)) for topic in chosen], blocks, notes)
+
+
+def constrain(
+    path: str | Path,
+    out: str | Path,
+    *,
+    unit: str | None = None,
+    settings: Mapping[str, object] | None = None,
+    recover: bool = False,
+) -> Changed:
+    """Write a log with what its inertial unit says of the body: that it stands, that it rolls on wheels.
+
+    The topics `standing` and `rolling` come beside the unit's own, see `pipeline.constraints`.
+
+    Args:
+        path: the log.
+        out: the log to write.
+        unit: the topic of the inertial samples; the only one unless given.
+        settings: of `ConstraintParameters`, such as {"rolling_hz": 10}.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where it is not clear which unit is meant, the log has such a topic, nothing is asked
+    for, or something else is in the place of the output.
+    """
+    log, target = open_log(path, recover=recover), Path(out)
+    check_files([(target, CHANGED)], {"log": [log.path]})
+    parameters = build(ConstraintParameters, settings or {}, "constrain")
+    chosen_unit = _unit_of(log, unit)
+    added = constraints_of(LogSource(log).read([chosen_unit])[chosen_unit], parameters)
+    for stream in added:
+        if stream.topic in log.topics:
+            raise BadInput(f"{log.path}: has a topic {stream.topic}; rename it first: fuselog relabel")
+    notes = _losses(log)
+    for stream in added:
+        told, total = int(stream["value"].sum()), len(stream)
+        notes.append(f"{stream.topic}: holds at {told} of {total} stamps")
+    chosen = _readable(log, _ranked(log), notes)
+    empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
+    names = " ".join(stream.topic for stream in added)
+    run = _told(_moved(log, target), f"constrained {log.path.name} by {chosen_unit}: {names}")
+    return _write(target, run, empty, chain(_blocks(log, chosen), [added]), notes)
+
+
+def _unit_of(log: Log, unit: str | None) -> str:
+    """The topic of inertial samples that is meant; raises BadInput where it is not clear."""
+    kind = schemas.INERTIAL_SAMPLE.full_name
+    units = [name for name, topic in log.topics.items() if topic.schema_name == kind]
+    if not units:
+        raise BadInput(f"{log.path}: has no inertial unit, no topic of {kind}")
+    if unit is None and len(units) > 1:
+        raise BadInput(
+            f"{log.path}: has several inertial units; choose one with --unit: {', '.join(units)}"
+        )
+    if unit is not None and unit not in units:
+        raise UnknownName(f"{log.path}: no inertial unit {unit}; {choices(unit, units)}")
+    return unit or units[0]
 
 
 def _blocks(

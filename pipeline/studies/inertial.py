@@ -57,7 +57,7 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
     for errors in found:
         moving = np.concatenate(
             [
-                _is_moving(source, errors.case, errors.time_ns[errors.run == run])
+                is_moving(source, errors.case, errors.time_ns[errors.run == run])
                 for run, source in enumerate(sources)
             ]
         )
@@ -68,7 +68,7 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
     return pd.DataFrame(rows, columns=["trial", "estimator", "movement_rmse_deg", "samples"])
 
 
-def _is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """What the last message before each stamp says; the topic speaks at every change."""
     stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
     row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1

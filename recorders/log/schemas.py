@@ -353,6 +353,15 @@ SET_ESTIMATE = _declare(
     _identifier("ring_id"),
     _vector("vertex"),
 )
+SET_STEP = _declare(
+    "SetStep",
+    "How the set of this time came about: from which earlier one it was moved, in which interval the "
+    "heading lies, and how many times larger a simpler form made it.",
+    Field("anchor_time_ns", "time_ns"),
+    _real("heading_rad"),
+    _real("heading_half_width_rad"),
+    _real("area_growth"),
+)
 DENSITY_ESTIMATE = _declare(
     "DensityEstimate",
     "One component of a mixture, or one weighted sample where the covariance is zero.",

@@ -7,7 +7,10 @@ model is a new file, a known one loads in a fraction of a second. Kernels stay p
 which also run uncompiled.
 """
 
+import __future__
+
 import ast
+import collections
 import gc
 import inspect
 import logging
@@ -54,6 +57,10 @@ _LOG = logging.getLogger("fuselog")
 _PATIENCE_S = 1.0
 
 
+# In place of a definition's name, which has the hash of the definition.
+_NAME = "_defined_here"
+
+
 class DoesNotCompile(BadInput):
     """What numba says of a function that it cannot compile, and of which line."""
 
@@ -73,7 +80,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
         name = bundle.add(function.__name__, function)
         names = ", ".join(inspect.signature(function).parameters)
         text = f"def kernel({names}):\n    return {name}({names})"
-        return _compile(bundle, text, function)
+        return _compile(bundle, name, text, function)
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
@@ -108,6 +115,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
     loop = _compile(
         bundle,
+        kernel,
         f"def kernel(first, end, {names}):\n"
         "    for run in range(first, end):\n"
         f"        {kernel}(run, {names})",
@@ -170,6 +178,11 @@ class Inlined(Compiler):
         return managers
 
 
+# Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
+_PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
+vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inlined)
+
+
 def _is_uncompiled() -> bool:
     return os.environ.get("FUSELOG_UNCOMPILED") == "1"
 
@@ -207,7 +220,7 @@ def _over_runs(
     own: Sequence[Any] | None = None,
     name: str,
     loop: Callable[..., None],
-    places: Mapping[int, str],
+    places: Mapping[tuple[str, int], str],
     hint: str,
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
@@ -239,18 +252,19 @@ def _over_runs(
         for helper in begun:
             helper.result()
     except NumbaError as error:
-        said = str(error)
+        said = re.sub(r"\x1b\[\d*m", "", str(error))  # bold where colorama is installed
         reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
-        reason = re.sub(r",? ?(defined )?at kernel_\w+ \(\d+\)", "", reason)
-        line = re.search(r'File "kernel_\w+", line (\d+)', said)
-        place = places.get(int(line[1]), "") if line else ""
+        reason = re.sub(r",? ?(defined )?at \w+_[0-9a-f]{16} \(\d+\)", "", reason)
+        line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', said)
+        place = places.get((line[1], int(line[2])), "") if line else ""
         raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{place}{hint}") from error
 
 
 class _Bundle:
-    """Sources in the order they are needed, and the imports above them.
+    """Sources in the order they are needed, each under a name that says what it is.
 
-    Everything gets a name of its own: two closures of one function, over different models, are two.
+    The name has the hash of the source, in which the names of all that it needs stand: two closures of
+    one function, over different models, are two, and what two kernels need is one and compiled once.
     """
 
     def __init__(self, allocates: bool = True) -> None:
@@ -258,16 +272,13 @@ class _Bundle:
         inner = "error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True"
         bounds = ", boundscheck=True" if os.environ.get("FUSELOG_BOUNDSCHECK") == "1" else ""
         self.options = f"_nrt={allocates}{bounds}"
-        self.imports = {"import numba", "import numpy"}
         inner += ", pipeline_class=Inlined"
-        self.imports.add("from replay.engine.compile import Inlined")
         if not allocates:  # one piece is faster where no counting of references stands in the way
             inner += ", forceinline=True"
         self._decorator = f"@numba.njit({inner}, {self.options})"
-        self.definitions: list[str] = []
-        # where the lines of the module come from, in words
-        self.places: dict[int, str] = {}
-        self._origins: dict[int, dict[int, str]] = {}
+        self.definitions: dict[str, str] = {}
+        # where a definition's lines come from, in words
+        self.places: dict[tuple[str, int], str] = {}
         self._names: dict[Any, str] = {}
 
     def add(self, name: str, value: Any) -> str:
@@ -281,39 +292,36 @@ class _Bundle:
                 "nor tuple, nor can be imported by name: hand it in as an argument"
             )
         key = value if literal is None else (name, literal)
-        if key in self._names:
-            return self._names[key]
-        own = self._names[key] = f"{name}_{len(self._names)}"
+        if key not in self._names:
+            self._names[key] = self._define(name, value, origin, literal)
+        return self._names[key]
+
+    def _define(self, name: str, value: Any, origin: str, literal: str | None) -> str:
+        lines: dict[int, str] = {}
         if isinstance(value, FunctionType) and not _is_known_to_numba(value):
-            source, lines = self._source(own, value)
-            self._origins[len(self.definitions)] = lines
-            self.definitions.append(f"{self._decorator}\n{source}")
+            name = value.__name__
+            source, lines = self._source(value)
+            definition = f"{self._decorator}\n{source}"
         elif isinstance(value, ModuleType):
             if value.__name__.partition(".")[0] not in _VERSIONED:
                 raise BadInput(
                     f"a kernel uses the module {value.__name__}: import what it needs of it by name, "
                     "so that a change there is noticed"
                 )
-            self.imports.add(f"import {value.__name__} as {own}")
+            definition = f"import {value.__name__} as {_NAME}"
         elif literal is not None:
-            self.definitions.append(f"{own} = {literal}")
+            definition = f"{_NAME} = {literal}"
         elif _is_made_here(value):
-            self.imports.add("import collections")
-            self.definitions.append(f"{own} = collections.namedtuple({own!r}, {value._fields})")
+            definition = f"{_NAME} = collections.namedtuple({name!r}, {value._fields})"
         else:
-            self.imports.add(f"from {value.__module__} import {origin} as {own}  # {_stamp(value)}")
+            definition = f"from {value.__module__} import {origin} as {_NAME}  # {_stamp(value)}"
+        own = f"{name}_{sha256(definition.encode()).hexdigest()[:16]}"
+        self.definitions[own] = definition.replace(_NAME, own)
+        self.places |= {(own, 1 + line): place for line, place in lines.items()}
         return own
 
-    def placed(self, first: int) -> list[str]:
-        """The definitions, which begin at line `first` of a module; fills in `places`."""
-        for index, definition in enumerate(self.definitions):
-            lines = self._origins.get(index, {})
-            self.places |= {first + line: place for line, place in lines.items()}
-            first += definition.count("\n") + 1
-        return self.definitions
-
-    def _source(self, own: str, function: FunctionType) -> tuple[str, dict[int, str]]:
-        """A function under a name of its own, and where its lines, counted from 1, come from."""
+    def _source(self, function: FunctionType) -> tuple[str, dict[int, str]]:
+        """A function called `_NAME`, and where its lines, counted from 1, come from."""
         closure = inspect.getclosurevars(function)
         needed = {**closure.globals, **closure.nonlocals}
         definition = _definition(function)
@@ -326,7 +334,7 @@ class _Bundle:
                     "that the run is given (draws=True)"
                 )
         names = {name: self.add(name, value) for name, value in needed.items()}
-        definition.name = own
+        definition.name = _NAME
         for node in ast.walk(definition):
             if isinstance(node, ast.Name):
                 node.id = names.get(node.id, node.id)
@@ -414,12 +422,20 @@ def _definition(function: FunctionType) -> ast.FunctionDef:
     return definition
 
 
-def _compile(bundle: _Bundle, definition: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function `kernel` that is defined over what a bundle holds, made of `function`."""
-    above = ["from __future__ import annotations", *sorted(bundle.imports)]
-    below = [f"@numba.njit(nogil=True, {bundle.options})", definition, ""]
-    text = "\n".join([*above, *bundle.placed(len(above) + 1), *below])
+def _compile(
+    bundle: _Bundle, called: str, definition: str, function: Callable[..., Any]
+) -> Callable[..., Any]:
+    """The function `kernel` that calls one that a bundle holds, which is made of `function`."""
+    for own, source in bundle.definitions.items():
+        if own not in vars(_PARTS):
+            _execute(source, own, _PARTS)
+    needed = f"import numba\nfrom {_PARTS.__name__} import {called}"
+    text = f"{needed}\n@numba.njit(nogil=True, {bundle.options})\n{definition}\n"
     return _load(text, f"{function.__module__}.{function.__name__}")
+
+
+def _execute(source: str, name: str, module: ModuleType) -> None:
+    exec(compile(source, name, "exec", __future__.annotations.compiler_flag), vars(module))
 
 
 @lru_cache(maxsize=64)
@@ -429,7 +445,7 @@ def _load(text: str, title: str) -> Callable[..., Any]:
     name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
     module = ModuleType(name)
     sys.modules[name] = module  # compiled code that was kept looks for it there
-    exec(compile(text, name, "exec"), module.__dict__)
+    _execute(text, name, module)
     if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         module.kernel._cache = code = _CompiledCode(name, title)
         module.kernel.compile = partial(code.compile, module.kernel.compile)

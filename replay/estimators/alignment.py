@@ -147,6 +147,33 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(int(fix_ns[first]), mean, covariance, how)
 
 
+def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
+    """What looks wrong in the first samples of a body whose start is known.
+
+    It is what `align` refuses, and only said here: the body may begin in motion.
+
+    Args:
+        streams: see `align`.
+        parameters: `AlignmentParameters`.
+    """
+    topic, found = streams["inertial"].topic, []
+    if not len(streams["inertial"]):
+        return []
+    try:
+        samples = _samples(streams["inertial"], parameters)
+        _tilt(samples, topic, parameters)
+    except BadInput as error:
+        return [str(error)]
+    moving = streams.get("velocity")
+    if moving is not None and len(moving):
+        try:
+            _bias(samples, topic, moving, 0, parameters)
+        except BadInput as error:
+            found.append(str(error))
+        found.append(_leap(samples, moving, 0, parameters).removeprefix("; "))
+    return [each for each in found if each]
+
+
 def _samples(inertial: Stream, parameters: Any) -> _Samples:
     """The finite samples at the times at which they were measured."""
     columns = [

@@ -216,7 +216,7 @@ def _prepared(
 @compiled
 def _attitudes(force: NDArray, field: NDArray, orientation: NDArray) -> None:
     for row in range(len(orientation)):
-        orientation[row] = _triad(force[row], field[row])
+        orientation[row] = triad(force[row], field[row])
 
 
 def _reckoning_run(
@@ -259,7 +259,7 @@ def _reckon(
         state.rest_samples[run] += 1
         return
     if (orientation == 0.0).all():
-        orientation[:] = _triad(sums[1], sums[2])
+        orientation[:] = triad(sums[1], sums[2])
     bias = sums[0] / max(state.rest_samples[run], 1) if unbiased else np.zeros(3)
     x, y, z = (rate - bias) * duration_s
     compose(orientation.copy(), _increment(x, y, z), orientation)
@@ -338,7 +338,7 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
         turn_columns(axes, state.increment[run])
         integrate(_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s)), moments, work)
         predict(axes, z, _diagonal(moments))
-    attitude = _triad(state.force[run], state.field[run])
+    attitude = triad(state.force[run], state.field[run])
     if math.isfinite(attitude[0]):
         update(axes, z, _diagonal(_isotropic(model.attitude_sigma_rad)), attitude)
     integrate(z, moments, work)
@@ -396,7 +396,7 @@ def _carry(turned: Vector, vector: NDArray) -> None:
     vector[2] = c + w * f + x * e - y * d
 
 
-def _triad(force: NDArray, field: NDArray) -> NDArray:
+def triad(force: NDArray, field: NDArray) -> NDArray:
     """The orientation (4,) under which force points up and field north; NaN where they are parallel."""
     up = force / math.sqrt((force**2).sum())
     east = _cross(field, up)

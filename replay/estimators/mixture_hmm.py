@@ -137,7 +137,7 @@ def _log_components(model: MixtureHmm, vectors: Floats) -> Floats:
     size = vectors.shape[-1]
     whiten = np.linalg.inv(np.linalg.cholesky(model.covariances))
     shape = (len(vectors), *model.weights.shape, size)
-    white = (vectors @ whiten.reshape(-1, size).T).reshape(shape)
+    white = (vectors @ whiten.reshape(model.weights.size * size, size).T).reshape(shape)
     white -= (whiten @ model.means[..., None])[..., 0]
     log_scale = np.log(np.diagonal(whiten, axis1=-2, axis2=-1)).sum(axis=-1)
     constant = _log(model.weights) + log_scale - 0.5 * size * np.log(2 * np.pi)

@@ -13,13 +13,13 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, into_plane, strapdown
+from recorders.models.inertial import cross, into_body, into_plane, product, strapdown
 from recorders.models.planar import Components
 from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
 from replay.engine.components import components_of
 from replay.engine.tangent import Kind
-from replay.estimators.alignment import AlignmentParameters, align, specific_force, turn_rate
+from replay.estimators.alignment import AlignmentParameters, align, specific_force, suspect, turn_rate
 from replay.estimators.navigation_sensors import carried_sensors
 from replay.inference.model import Control, Model, Motion, Sensor, Start
 
@@ -66,6 +66,7 @@ class NavigationParameters(AlignmentParameters):
     field_north_ut: float | None = None
     field_up_ut: float | None = None
     range_delay_s: float = 0.0
+    standing_delay_s: float = 0.0
     sigma_velocity_mps: PositiveFloat | None = None
     sigma_heading_rad: PositiveFloat | None = None
     sigma_height_m: PositiveFloat | None = None
@@ -116,6 +117,44 @@ def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
     tilted = parameters.gap_tilt_rad**2
     turned = (parameters.gap_turn_radps * duration_s) ** 2
     return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
+
+
+def correct(state: Components, step: Components) -> Components:
+    """The state after a correction: turned about the vertical, its velocity with it, then tilted.
+
+    An inertial unit does not feel where north is, so that a body that is headed elsewhere, with its
+    velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true.
+    Barrau and Bonnabel, The Invariant Extended Kalman Filter as a Stable Observer, IEEE TAC 62(4), 2017,
+    on errors that a symmetry of the motion carries along.
+    """
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
+    turn = ux * step[6] + uy * step[7] + uz * step[8]
+    # the step holds what the turn makes of the velocity, to first order
+    east, north = vx + step[3] + turn * vy, vy + step[4] - turn * vx
+    cosine, sine = np.cos(turn), np.sin(turn)
+    half = np.cos(0.5 * turn), ux * np.sin(0.5 * turn), uy * np.sin(0.5 * turn), uz * np.sin(0.5 * turn)
+    tilt = 1.0, 0.5 * (step[6] - turn * ux), 0.5 * (step[7] - turn * uy), 0.5 * (step[8] - turn * uz)
+    w, x, y, z = product(product((qw, qx, qy, qz), half), tilt)
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return (
+        px + step[0],
+        py + step[1],
+        pz + step[2],
+        cosine * east - sine * north,
+        sine * east + cosine * north,
+        vz + step[5],
+        w / length,
+        x / length,
+        y / length,
+        z / length,
+        gx + step[9],
+        gy + step[10],
+        gz + step[11],
+        bx + step[12],
+        by + step[13],
+        bz + step[14],
+    )
 
 
 def position(state: Components, about: Any, parameters: Any) -> Components:
@@ -197,6 +236,7 @@ INERTIAL = Model(
     ),
     Motion(move, move_noise, lost=lost),
     control=UNIT,
-    start=Start({}, HANDHELD, find=align),
+    start=Start({}, HANDHELD, find=align, suspect=suspect),
+    correct=correct,
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

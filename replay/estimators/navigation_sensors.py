@@ -47,6 +47,12 @@ def stand(state: Components, about: Any, parameters: Any) -> Components:
     return vx, vy, vz
 
 
+def stay_on_wheels(state: Components, samples: Components, parameters: Any) -> Components:
+    """The velocity of the axle to the left and up, see `roll_along`."""
+    _, left, up = roll_along(state, samples, parameters)
+    return left, up
+
+
 def feel_north(state: Components, about: Any, parameters: Any) -> Components:
     """The magnetic field in the body's axes."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
@@ -84,6 +90,12 @@ def standing_noise(parameters: Any) -> Components:
     return variance, variance, variance
 
 
+def slip_noise(parameters: Any) -> Components:
+    """The variances of the slip of wheels, to the side and up."""
+    variance = parameters.sigma_slip_mps**2
+    return variance, variance
+
+
 def field_noise(parameters: Any) -> Components:
     """The variances of a field that does not state them."""
     variance = parameters.sigma_field_ut**2
@@ -115,6 +127,11 @@ def read_standing(stream: Stream) -> Floats:
     """No velocity (n, 3) where the value is not zero, nothing where it is: the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
+
+
+def read_rolling(stream: Stream) -> Floats:
+    """No velocity to the side and up (n, 2) where the value is not zero, nothing where it is."""
+    return read_standing(stream)[:, :2]
 
 
 def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
@@ -154,6 +171,16 @@ def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
             standing_noise,
             read=read_standing,
             linear=True,
+            delay="standing_delay_s",
+        ),
+        Sensor(
+            "rolling",
+            schemas.VECTOR_MEASUREMENT,
+            {"left_mps": "linear", "up_mps": "linear"},
+            stay_on_wheels,
+            slip_noise,
+            read=read_rolling,
+            control=unit,
         ),
         Sensor(
             "magnetic_field",

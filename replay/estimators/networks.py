@@ -6,12 +6,14 @@ measurement again. The log says which message was sent when and where it arrived
 replay's output, so that one run is replayed with any rule. The state is (positions, velocities).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
@@ -25,7 +27,15 @@ from replay.engine.components import components_of
 from replay.engine.estimator import Batch, Bound, Estimator
 from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, states_in
-from replay.estimators.covariance_intersection import Estimate, fuse_by, rule_number
+from replay.estimators.covariance_intersection import (
+    Estimate,
+    blend,
+    determinant,
+    fuse_by,
+    inverted,
+    one_of,
+    rule_number,
+)
 from replay.inference.gaussian import coast, copy_gaussian
 
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
@@ -49,10 +59,21 @@ class NetworkParameters(Parameters):
 
     "alone" fuses nothing, "centralised" is one filter with all sensors and no links, "own-again" is a
     trap: it fuses the own x* and then uses its measurement a second time.
+
+    A node sends at most once in `send_interval_s`, and nothing before its x* differs from what its last
+    message says of now by a Kullback-Leibler divergence of `send_divergence` nats. What it hears it
+    fuses if its prediction agrees with it: honest estimates, however correlated, pass that gate with at
+    least `gate_probability`.
     """
 
     rule: Rule = "ci-trace"
     tolerance: PositiveFloat = 1e-3
+    send_interval_s: NonNegativeFloat = 0.0
+    send_divergence: NonNegativeFloat = 0.0
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    liar: PositiveInt | None = None
+    lie_m: float = 1.0
+    lie_after_s: NonNegativeFloat = 0.0
 
 
 class Activities(NamedTuple):
@@ -60,7 +81,7 @@ class Activities(NamedTuple):
 
     Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
     measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
-    in which a message was sent.
+    in which a message was sent, `may_send` says in which activities a node has a chance to send.
     """
 
     offsets: Integers
@@ -69,6 +90,7 @@ class Activities(NamedTuple):
     measured: Integers
     received: Integers
     message: Integers
+    may_send: Booleans
 
 
 class Sensing(NamedTuple):
@@ -86,22 +108,36 @@ class Sensing(NamedTuple):
 class Fusion(NamedTuple):
     """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
 
-    With `own_first` a node fuses its own x*, not its prediction.
+    With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
+    at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
+    squared distance between a prediction and what is heard, infinity where everything is fused. The
+    index `liar` is -1 where there is none.
     """
 
     rule: int
     tolerance: float
     own_first: bool
+    interval_ns: int
+    divergence: float
+    gate: float
+    liar: int
+    lie_m: float
+    lie_after_ns: int
 
 
 class Results(NamedTuple):
-    """What the kernel fills, a row per activity: estimates, and x* as it is sent."""
+    """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
+
+    `refused` (m,) says of every message that arrived whether the gate kept it out.
+    """
 
     mean: Floats
     covariance: Floats
     sent_mean: Floats
     sent_covariance: Floats
     sent_independent: Floats
+    sent: Booleans
+    refused: Booleans
 
 
 def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
@@ -142,6 +178,46 @@ def observe(
                 covariance[column, row] = covariance[row, column]
 
 
+def squared_distance(difference: Floats, covariance: Floats) -> float:
+    """The squared Mahalanobis distance; infinity where the covariance is singular."""
+    information = np.empty_like(covariance)
+    if not inverted(covariance, information):
+        return np.inf
+    squared = 0.0
+    for row in range(len(difference)):
+        for column in range(len(difference)):
+            squared += difference[row] * information[row, column] * difference[column]
+    return squared
+
+
+def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
+    """The Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    size = len(mean)
+    information, difference = np.empty_like(covariance), np.empty(size)
+    if not inverted(of_covariance, information):
+        return np.inf
+    total = np.log(determinant(of_covariance) / determinant(covariance)) - size
+    for row in range(size):
+        difference[row] = mean[row] - of_mean[row]
+        for column in range(size):
+            total += information[row, column] * covariance[row, column]
+    return 0.5 * (total + squared_distance(difference, of_covariance))
+
+
+def agrees(mean: Floats, covariance: Floats, heard: Estimate, gate: float) -> bool:
+    """Whether an estimate may be of the same state, however both are correlated.
+
+    The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
+    """
+    if gate == np.inf:
+        return True
+    difference, most = np.empty(len(mean)), np.empty_like(covariance)
+    for row in range(len(mean)):
+        difference[row] = heard.mean[row] - mean[row]
+    blend(2.0, covariance, 2.0, heard.covariance, most)
+    return squared_distance(difference, most) <= gate
+
+
 def follow(
     run: int,
     activities: Activities,
@@ -156,7 +232,8 @@ def follow(
     """Move the nodes of one run through their activities, until these end or a fusion fails."""
     nodes, size = len(sensing.density), prior_mean.shape[1]
     mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
-    time_ns = np.empty(nodes, np.int64)
+    time_ns, said_ns = np.empty(nodes, np.int64), np.full(nodes, -1)
+    said_mean, said_covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
     for node in range(nodes):
         copy_gaussian(prior_mean[run], prior_covariance[run], mean[node], covariance[node])
         time_ns[node] = prior_ns[run]
@@ -166,6 +243,7 @@ def follow(
         most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
     weights, square = np.empty(most), (most, size, size)
     parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
+    said = Estimate(np.empty(size), np.empty((size, size)), np.empty((size, size)))
     while begin < last:
         now = activities.time_ns[begin]
         end = begin
@@ -185,28 +263,49 @@ def follow(
                     sensing.value[k],
                     sensing.variance[sensing.sensor[k]],
                 )
+            if activities.may_send[end]:
+                is_due = said_ns[node] < 0
+                if not is_due and now - said_ns[node] >= fusion.interval_ns:
+                    copy_gaussian(said_mean[node], said_covariance[node], said.mean, said.covariance)
+                    silent_s = (now - said_ns[node]) * 1e-9
+                    move(said.mean, said.covariance, sensing.density[node], silent_s)
+                    is_due = fusion.divergence == 0.0 or fusion.divergence <= divergence(
+                        sent_mean, sent_covariance, said.mean, said.covariance
+                    )
+                if is_due:
+                    results.sent[end], said_ns[node] = True, now
+                    copy_gaussian(sent_mean, sent_covariance, said_mean[node], said_covariance[node])
+                if node == fusion.liar and now - prior_ns[run] >= fusion.lie_after_ns:
+                    sent_mean[0] += fusion.lie_m
             end += 1
         for activity in range(begin, end):
             node = activities.node[activity]
-            first = activities.received[activity]
-            count = 1 + activities.received[activity + 1] - first
+            first, last_message = activities.received[activity], activities.received[activity + 1]
+            count = 0
+            for i in range(-1, last_message - first):
+                is_own = i < 0
+                source = activity if is_own else activities.message[first + i]
+                if not is_own and not results.sent[source]:
+                    continue
+                its_mean, its_covariance = mean[node], covariance[node]
+                if not is_own or fusion.own_first:
+                    its_mean = results.sent_mean[source]
+                    its_covariance = results.sent_covariance[source]
+                copy_gaussian(its_mean, its_covariance, parts.mean[count], parts.covariance[count])
+                late_s = (now - activities.time_ns[source]) * 1e-9
+                # what was new in a late one others may have passed on
+                new = 1.0 if not is_own and late_s <= 0.0 else 0.0
+                for row in range(size):
+                    for column in range(size):
+                        own = results.sent_independent[source, row, column]
+                        parts.independent[count, row, column] = new * own
+                if late_s > 0.0:
+                    move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
+                if is_own or agrees(mean[node], covariance[node], one_of(parts, count), fusion.gate):
+                    count += 1
+                else:
+                    results.refused[first + i] = True
             if count > 1:
-                for i in range(count):
-                    source = activities.message[first + i - 1] if i > 0 else activity
-                    its_mean, its_covariance = mean[node], covariance[node]
-                    if i > 0 or fusion.own_first:
-                        its_mean = results.sent_mean[source]
-                        its_covariance = results.sent_covariance[source]
-                    copy_gaussian(its_mean, its_covariance, parts.mean[i], parts.covariance[i])
-                    late_s = (now - activities.time_ns[source]) * 1e-9
-                    # what was new in a late one others may have passed on
-                    new = 1.0 if i > 0 and late_s <= 0.0 else 0.0
-                    for row in range(size):
-                        for column in range(size):
-                            own = results.sent_independent[source, row, column]
-                            parts.independent[i, row, column] = new * own
-                    if late_s > 0.0:
-                        move(parts.mean[i], parts.covariance[i], sensing.density[node], late_s)
                 gap = fuse_by(
                     fusion.rule,
                     count,
@@ -237,9 +336,24 @@ def _compiled() -> Function:
     return compile_over_runs(follow)
 
 
-def _fusion(name: str, tolerance: float) -> Fusion:
+def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> Fusion:
+    name, liar = parameters.rule, parameters.liar
+    if liar is not None and liar not in sensors:
+        raise BadInput(
+            f"liar = {liar} is none of the nodes {', '.join(map(str, sensors))}; name one of them"
+        )
     rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
-    return Fusion(rule_number(rule), tolerance, name == TRAP)
+    return Fusion(
+        rule_number(rule),
+        parameters.tolerance,
+        name == TRAP,
+        round(parameters.send_interval_s * 1e9),
+        parameters.send_divergence,
+        float(chi2.ppf(parameters.gate_probability, states)),
+        -1 if liar is None else list(sensors).index(liar),
+        parameters.lie_m,
+        round(parameters.lie_after_s * 1e9),
+    )
 
 
 def message_bytes(name: str, states: int) -> int:
@@ -259,15 +373,24 @@ def solve(
 ) -> list[Ragged]:
     """Replay the network, see the module; `sensors` are the topics by node.
 
-    Raises BadInput where a link names an unknown node or arrives before it was sent.
+    Raises BadInput where a link or the liar names an unknown node, or a message arrives before it was
+    sent.
     """
     prior_ns, prior_mean, prior_covariance = gaussians(whole["/prior"])
     runs, size = prior_mean.shape
-    activities, sensing, sent = _schedule(whole, sensors, components, prior_ns, parameters.rule)
+    activities, sensing, arrived = _schedule(whole, sensors, components, prior_ns, parameters.rule)
     count = len(activities.node)
     blank = np.full((count, size), np.nan)
     square = np.full((count, size, size), np.nan)
-    results = Results(blank, square, blank.copy(), square.copy(), np.zeros_like(square))
+    results = Results(
+        blank,
+        square,
+        blank.copy(),
+        square.copy(),
+        np.zeros_like(square),
+        np.zeros(count, bool),
+        np.zeros(len(arrived), bool),
+    )
     failed_ns = np.full(runs, -1)
     _compiled()(
         runs,
@@ -276,7 +399,7 @@ def solve(
         prior_mean,
         prior_covariance,
         prior_ns,
-        _fusion(parameters.rule, parameters.tolerance),
+        _fusion(parameters, sensors, size),
         results,
         failed_ns,
     )
@@ -291,11 +414,15 @@ def solve(
     for node, place in enumerate(places):
         own = (activities.node == node) & done
         estimates = ("state", own, "/truth", results.mean, results.covariance)
-        messages = ("sent", own & sent, None, results.sent_mean, results.sent_covariance)
+        messages = ("sent", own & results.sent, None, results.sent_mean, results.sent_covariance)
         is_sender = parameters.rule not in (ALONE, CENTRALISED)
         for leaf, chosen, truth, mean, covariance in [estimates, messages][: 1 + is_sender]:
             rows, where = np.flatnonzero(chosen), f"{topic}/{place}/{leaf}"
             outputs.append(states_in(rows, where, *stamps, kinds, truth, mean, covariance))
+    if parameters.gate_probability < 1.0:
+        links, rows = whole["/links"], np.sort(arrived[results.refused])
+        refused = replace(links.stream.take(rows), topic=f"{topic}/refused")
+        outputs.append(Ragged(refused, np.searchsorted(rows, links.offsets)))
     return outputs
 
 
@@ -305,8 +432,8 @@ def _schedule(
     components: Sequence[str],
     prior_ns: Integers,
     name: str,
-) -> tuple[Activities, Sensing, Booleans]:
-    """The activities of all nodes and runs, their measurements, and in which something is sent."""
+) -> tuple[Activities, Sensing, Integers]:
+    """The activities of all nodes and runs, their measurements, and the rows of what arrives."""
     numbers = list(sensors)
     centralised = name == CENTRALISED
     sensing = _sensing(whole, sensors, components)
@@ -363,9 +490,10 @@ def _schedule(
             np.searchsorted(of_measurement[order], bounds),
             np.searchsorted(of_arrival[received], bounds),
             source[received],
+            sent,
         ),
         sensing._replace(value=sensing.value[order], sensor=sensing.sensor[order]),
-        sent,
+        np.flatnonzero(arrived)[received],
     )
 
 

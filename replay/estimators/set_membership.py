@@ -177,32 +177,32 @@ def solve(
     for run in range(seen.runs):
         found = frames(seen.of_run(run), landmarks.of_run(run), known)
         borders = [(frame, polygons(frame.pairs, frame.arena, parameters)) for frame in found]
-        solved.append(_streams(f"/estimates/{name}", metadata, borders))
+        blamed = [
+            (frame, int(pair))
+            for frame, border in borders
+            if not border
+            for pair in to_blame(frame.pairs, frame.arena)[:1]
+        ]
+        prefix, rings_of = f"/estimates/{name}", [(frame.time_ns, border) for frame, border in borders]
+        solved.append((*set_streams(prefix, metadata, rings_of), fault_stream(prefix, blamed)))
     return [gather(streams) for streams in zip(*solved, strict=True)]
 
 
-def _streams(
-    prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[Frame, list[Floats]]]
-) -> tuple[Stream, ...]:
-    """The sets of a run's frames, how many vertices each has, and what is to blame for empty ones."""
+def set_streams(
+    prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
+) -> tuple[Stream, Stream]:
+    """The sets of a run, by stamp the borders of each, and how many vertices each has."""
 
     def whole(numbers: Iterable[int]) -> Integers:
         return np.fromiter(numbers, np.int64)
 
-    rings_of = [(frame, *each) for frame, found in borders for each in enumerate(found)]
+    rings_of = [(time_ns, *each) for time_ns, found in borders for each in enumerate(found)]
     lengths = whole(len(ring) for *_, ring in rings_of)
-    blamed = [
-        (frame, pair)
-        for frame, found in borders
-        if not found
-        for pair in to_blame(frame.pairs, frame.arena)[:1]
-    ]
-    pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
     return (
         make_stream(
             f"{prefix}/set",
             schemas.SET_ESTIMATE,
-            np.repeat(whole(frame.time_ns for frame, *_ in rings_of), lengths),
+            np.repeat(whole(time_ns for time_ns, *_ in rings_of), lengths),
             metadata=metadata,
             ring_id=np.repeat(whole(number for _, number, _ in rings_of), lengths),
             vertex=np.concatenate([np.empty((0, 2)), *(ring for *_, ring in rings_of)]),
@@ -210,19 +210,24 @@ def _streams(
         make_stream(
             f"{prefix}/size",
             schemas.ESTIMATE_SIZE,
-            whole(frame.time_ns for frame, _ in borders),
+            whole(time_ns for time_ns, _ in borders),
             metadata=metadata,
             elements=whole(sum(map(len, found)) for _, found in borders),
         ),
-        make_stream(
-            f"{prefix}/fault",
-            schemas.RELATIVE_BEARING,
-            whole(frame.time_ns for frame, _ in blamed),
-            metadata={"purpose": "the set is empty; this relative bearing is to blame"},
-            first_id=pairs[:, 0],
-            second_id=pairs[:, 1],
-            angle_rad=np.array([frame.pairs.angle_rad[pair] for frame, pair in blamed]),
-        ),
+    )
+
+
+def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
+    """The relative bearings that are to blame for empty sets, by the frame and its pair."""
+    pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
+    return make_stream(
+        f"{prefix}/fault",
+        schemas.RELATIVE_BEARING,
+        np.array([frame.time_ns for frame, _ in blamed], np.int64),
+        metadata={"purpose": "the set is empty; this relative bearing is to blame"},
+        first_id=pairs[:, 0],
+        second_id=pairs[:, 1],
+        angle_rad=np.array([frame.pairs.angle_rad[pair] for frame, pair in blamed]),
     )
 
 
@@ -240,14 +245,14 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> 
             name=f"{name}{prefix}",
             topic=topic.name,
             truth=f"{prefix}/truth",
-            known=_known(topic, topics["/landmarks"], parameters),
+            known=known_of(topic, topics["/landmarks"], parameters),
             parameters=parameters,
         )
         bound.append(Batch(f"{name}{prefix}", (topic.name,), ("/landmarks",), work))
     return bound
 
 
-def _known(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
+def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
     """What the parameters say and, where they do not, the channels' metadata."""
     bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
     arena_m: tuple[float, ...] | None = parameters.arena_m

@@ -20,6 +20,7 @@ from replay.engine.blocks import Ragged
 from replay.engine.priors import gaussians
 from replay.engine.results import gaussian_stream
 from replay.inference.binding import Recorder, number_fields, settings_type
+from replay.inference.corrections import correcting_more
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.point_errors import (
@@ -170,6 +171,7 @@ def _augmented(model: Model, names: Names) -> Model:
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
+        correct=correcting_more(model, len(names)),
         estimable={},
     )
 

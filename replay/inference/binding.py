@@ -23,6 +23,7 @@ from replay.inference.model import (
     Model,
     ModelParameters,
     Sensor,
+    check_correct,
     check_motion,
     check_sensor,
     check_state,
@@ -181,6 +182,31 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
         return f"it has nothing that {' or '.join(models)} needs"
     missing = "; ".join(part.words for part in parts if not part.is_here)
     return f"model {name} comes nearest and lacks {missing}"
+
+
+def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
+    """Which model the log's prior is of, where only its control has another name; empty where none is.
+
+    As with several inertial units, of which one has to be chosen.
+    """
+    for name, model in models.items():
+        control = model.control
+        if control is None or control.topic in names:
+            continue
+        others = [
+            each for each, topic in topics.items() if topic.schema_name == control.schema.full_name
+        ]
+        end = f"/{names.get(model.prior, model.prior)}"
+        priors = [each for each in topics if each.endswith(end)]
+        for prior in priors:
+            place = resolved(control.topic, prior.rpartition("/")[0])
+            if others and place not in topics and names_state(topics[prior], model, exactly=True):
+                return (
+                    f"{prior} is of model {name}, which needs {place} ({control.schema.full_name}); the "
+                    f"log has {', '.join(others)} of that type: choose one, as with "
+                    f"--set topics.{control.topic}={others[0]}"
+                )
+    return ""
 
 
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
@@ -348,6 +374,7 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
     """The parameters that motion and sensors read; BadInput where the model is not what it says."""
     model, values = stage.model, dict(given)
     check_state(where, model)
+    check_correct(where, model)
     motion, *sensors = recorders = [Recorder(values) for _ in range(1 + len(stage.sensors))]
     for each in stage.modes or (stage.motion,):
         check_motion(where, model, each, motion)

@@ -31,6 +31,7 @@ from replay.inference.model import (
     Model,
     Motion,
     Sensor,
+    check_correct,
     check_motion,
     check_sensor,
     check_state,
@@ -97,6 +98,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
+        check_correct("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
         if model.modes and model.switching:
@@ -119,6 +121,9 @@ def check_model(
             _check_linear(call, part.linear, by_state)
             _check_jumps(call, tried, rng)
             _check_twins(call, tried, rng)
+        if model.correct is not None:
+            for state in tried:
+                _check_small_steps(model.correct, model, state)
         for index, name in enumerate(model.state):
             _check_period(name, index, model, calls, tried)
         for motion in motions.values():
@@ -202,6 +207,16 @@ def _check_derivatives(
             _compare(call, getattr(work, name), slopes, (name, column), 1e-6, "by central differences")
     _check_by_hand(call, part, state, others, work)
     return np.array(work.state)
+
+
+def _check_small_steps(correct: Function, model: Model, state: Floats) -> None:
+    """A small correction moves every component by itself."""
+    for column, name in enumerate(_tangent(model.state)):
+        small = STEP * np.eye(model.tangent)[column]
+        end, start = (np.array(correct(tuple(state), tuple(step))) for step in (small, -small))
+        slopes = _difference(end, start, model.kinds) / (2.0 * STEP)
+        if not np.allclose(slopes, small / STEP, atol=1e-6):
+            raise AssertionError(f"{_place(correct)}: a small step of {name} moves other components too")
 
 
 def _check_by_hand(

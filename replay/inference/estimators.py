@@ -35,6 +35,7 @@ from replay.inference.binding import (
     Found,
     assumed_of,
     complaint_of,
+    elsewhere,
     names_state,
     nearest,
     needs_of,
@@ -182,7 +183,10 @@ def _bind_fitting(
         name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
         for name, model in models.items()
     }
-    fitting = [name for name in models if found[name]]
+    fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]
+    chooses = elsewhere(models, topics, renamed)
+    if chooses:
+        raise BadInput(f"estimator {label}: {chooses}")
     for exactly in (False, True):  # the prior's components tell
         if len(fitting) > 1:
             named_alike = [

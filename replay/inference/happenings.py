@@ -79,24 +79,34 @@ def happenings_of(
     """A block's messages as the recursion takes them, and which of them lack their covariance."""
     events, control = block.events, stage.model.control
     width, start = data_columns(stage)
-    tables: list[Table] = []
+    uses: list[tuple[str, Table]] = []
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
         replaced = {name for each, _ in found.instead for name in each.components}
         own = {name: column for name, column in columns.items() if name not in replaced}
-        tables.append(_control_table(control, block.streams[found.control.name], width, own))
+        name = found.control.name
+        uses.append((name, _control_table(control, block.streams[name], width, own)))
         for each, topic in found.instead:
-            tables.append(_control_table(each, block.streams[topic.name], width, columns))
+            uses.append((topic.name, _control_table(each, block.streams[topic.name], width, columns)))
     for number, (_, topic) in enumerate(found.sensors):
-        tables.append(sensor_table(stage, number, block.streams[topic.name], world, settings))
+        ragged = block.streams[topic.name]
+        uses.append((topic.name, sensor_table(stage, number, ragged, world, settings)))
+    tables = dict(reversed(uses))  # the first use of every topic
     data, source, target, lacking = (
         column[0] if len(column) == 1 else np.concatenate(column)[events.source]
-        for column in zip(*tables, strict=True)
+        for column in zip(*(tables[name] for name in block.streams), strict=True)
     )
     came = np.empty((len(source), 0), np.int64) if block.came is None else block.came
     happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target, came)
+    again = [_again(happenings, block, name, table) for name, table in uses if table is not tables[name]]
     if lacking.any():  # as if these had not come
-        happenings = of_rows(happenings, ~lacking)
+        chosen = ~lacking
+        after = np.cumsum(chosen)
+        again = [(after[places] - 1, others) for places, others in again]
+        happenings = of_rows(happenings, chosen)
+    if again:
+        happenings = _inserted(happenings, again)
+    if lacking.any() or again:
         happenings = happenings._replace(is_due=last_of_stamps(happenings))
     return happenings._replace(is_due=_wanted(stage, happenings)), lacking
 
@@ -158,6 +168,30 @@ class Table(NamedTuple):
     source: Integers
     target_id: Integers
     is_lacking: Booleans
+
+
+def _again(happenings: Happenings, block: Block, name: str, table: Table) -> tuple[Integers, Happenings]:
+    """The messages of a topic as what another sensor measures by them, and their places among all.
+
+    One of which nothing is measured does not come again.
+    """
+    before = list(block.streams).index(name)
+    begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
+    of_topic = block.events.topic == before
+    row = np.where(of_topic, block.events.source - begin, 0)
+    measures = ~np.isnan(table.data).all(axis=1) & ~table.is_lacking
+    chosen = of_topic & measures[row]
+    data, source, target, _ = (column[row[chosen]] for column in table)
+    again = of_rows(happenings, chosen)._replace(data=data, source=source, target_id=target)
+    return np.flatnonzero(chosen), again
+
+
+def _inserted(happenings: Happenings, again: Sequence[tuple[Integers, Happenings]]) -> Happenings:
+    """Events with others after those at whose places they are."""
+    places, others = zip(*again, strict=True)
+    order = np.argsort(np.concatenate([np.arange(len(happenings.time_ns)), *places]), kind="stable")
+    offsets, *columns = zip(happenings, *others, strict=True)
+    return Happenings(sum(offsets), *(np.concatenate(column)[order] for column in columns))
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:

@@ -18,6 +18,7 @@ from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
 from replay.inference.binding import trial_parameters
+from replay.inference.corrections import correcting, relinearising
 from replay.inference.gaussian import (
     kalman_step,
     keep_measured,
@@ -27,7 +28,7 @@ from replay.inference.gaussian import (
     widening,
     wrap,
 )
-from replay.inference.generate import is_flat, resetting, retraction, tuple_of
+from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
 from replay.inference.steps import (
@@ -37,7 +38,6 @@ from replay.inference.steps import (
     Stage,
     Steps,
     Workspace,
-    correcting,
     gaussian_filter,
     kalman_update,
     linear_innovation,
@@ -141,25 +141,19 @@ def iterated_update(stage: Stage, number: int) -> Function:
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
-    flat = is_flat(model.kinds)
     read_state, read_about = tuple_of(n), reading(sensor).about
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
     tell, correct = noting(stage, number), correcting(model)
-    add, turn = retraction(model.kinds), resetting(model.kinds)
+    step_to, chain = relinearising(model)
 
     def relinearise(
         mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
     ) -> None:
         """The innovation by the Jacobian at mean (+) step, as one about the mean."""
         innovation, step, rows = work.innovations[number], work.step, work.rows
-        for row in range(n):
-            work.state[row] = mean[row]
-        add(work.state, step)
+        step_to(mean, work)
         linearise(read_state(work.state), read_about(data), parameters, work)
-        if not flat:
-            for row in range(t):
-                work.turned[row] = -step[row]
-            turn(work.turned, rows[:m].T)
+        chain(rows[:m], work)
         compare(covariance, data, parameters, work)
         for i in range(m):
             for k in range(t):

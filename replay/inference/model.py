@@ -263,12 +263,15 @@ class Start:
         find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
             the model's names for their topics, and the maps; for a state that is found from several
             messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
+        suspect: (streams, parameters) -> sentences: what looks wrong in these messages where the log has
+            a prior. It is only said.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
     align: Callable[..., tuple[Floats, Floats] | None] | None = None
     find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
+    suspect: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
 
 
 class Started(NamedTuple):
@@ -300,6 +303,10 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
+        correct: (state, step) -> state, how an update moves the state by a step of its tangent space,
+            where not every component moves by itself, as small steps must: the derivative at zero is the
+            unit matrix. It says along which curves a belief is Gaussian, which matters where it is wide.
+        by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
 
@@ -347,7 +354,9 @@ class Model:
     needs_sensor: bool = True
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
+    correct: Function | None = None
     takes_fixes: bool = True
+    by_name: bool = False
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
@@ -417,6 +426,13 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         _check(where, motion.lost, (state, 1.0, parameters), (model.tangent,))
     if motion.control_noise is not None:
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
+
+
+def check_correct(where: str, model: Model) -> None:
+    """Call how a model corrects its state once, uncompiled; see `check_motion`."""
+    if model.correct is not None:
+        arguments = trial_state(model.kinds), (0.0,) * model.tangent
+        _check(where, model.correct, arguments, (model.size,))
 
 
 def check_switching(where: str, model: Model, parameters: Any) -> None:

@@ -5,7 +5,7 @@ much wider than that message that the message itself, used like any other, is wh
 a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -60,9 +60,15 @@ class Beginning:
     def opening(self) -> Opening | None:
         """How it is found; None where the log states all."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
-        wanted = [*needs_origin, *(() if self.found.has_prior else self._starting)]
+        needs_messages = not self.found.has_prior or self._suspect is not None
+        wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
         return Opening(topics, self.find) if topics else None
+
+    @property
+    def _suspect(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
+        start = self.stage.model.start
+        return start.suspect if start is not None else None
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
@@ -108,6 +114,8 @@ class Beginning:
             prior, begun = self._prior(first, whole, clock, origins)
             found[self.found.prior.name] = prior
             facts += begun
+        elif self._suspect is not None:
+            facts += self._suspected(self._suspect, first, whole, origins)
         return Opened(found, [*told, *self._told(facts)])
 
     def _prior(
@@ -171,19 +179,10 @@ class Beginning:
         begun: "_Begun",
     ) -> list["_Fact"]:
         """Begin all runs where the model finds them; raises BadInput where it finds none."""
-        model, control = self.stage.model, self.found.control
+        model = self.stage.model
         assert model.start is not None
         assert model.start.find is not None
-        given = {}
-        if model.control is not None and control is not None:
-            given[model.control.topic] = first[control.name]
-        for sensor, topic in self.found.sensors:
-            ragged = first[topic.name]
-            if origins is not None and topic in self.found.geodetic:
-                ragged = in_plane(ragged, origins)
-            given[sensor.topic] = ragged
-            given |= {each.topic: whole[each.topic] for each in sensor.maps}
-        parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
+        given, parameters = self._given(first, whole, origins)
         how = [""] * len(begun.time_ns)
         for run in range(len(how)):
             try:
@@ -198,6 +197,41 @@ class Beginning:
         return [
             _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
             for words in dict.fromkeys(filter(None, how))
+        ]
+
+    def _given(
+        self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], origins: Floats | None
+    ) -> tuple[dict[str, Ragged], Any]:
+        """The first messages and the maps, by the model's names for their topics, and the parameters."""
+        model, control = self.stage.model, self.found.control
+        given = {}
+        if model.control is not None and control is not None:
+            given[model.control.topic] = first[control.name]
+        for sensor, topic in self.found.sensors:
+            ragged = first[topic.name]
+            if origins is not None and topic in self.found.geodetic:
+                ragged = in_plane(ragged, origins)
+            given[sensor.topic] = ragged
+            given |= {each.topic: whole[each.topic] for each in sensor.maps}
+        return given, reading_settings(number_fields(model.parameters))(self.settings, 0)
+
+    def _suspected(
+        self,
+        suspect: Callable[[Mapping[str, Stream], Any], list[str]],
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        origins: Floats | None,
+    ) -> list["_Fact"]:
+        """What the model suspects of the first messages of runs whose prior is known."""
+        given, parameters = self._given(first, whole, origins)
+        said = [
+            suspect({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
+            for run in range(_runs(first))
+        ]
+        time_ns, _, _ = _first_of(next(iter(given.values())), "publish_time", None)
+        return [
+            _Fact(text, time_ns, np.array([text in of_run for of_run in said]))
+            for text in dict.fromkeys(text for of_run in said for text in of_run)
         ]
 
     def _at_first(

@@ -19,6 +19,7 @@ from typing import NamedTuple
 from recorders.errors import BadInput
 from replay.engine.arrays import Function
 from replay.inference.binding import trial_parameters
+from replay.inference.corrections import correcting_more
 from replay.inference.generate import Input, derivative, function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.walks import kept, spread, with_walk_parameters
@@ -73,6 +74,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
         parameters=with_walk_parameters(model.parameters, _names(errors)),
         sensors=tuple(sensor_with_errors(model, sensor, errors) for sensor in model.sensors),
         motion=motion_with_errors(model, model.motion, errors),
+        correct=correcting_more(model, len(errors)),
         modes=model.modes
         and {name: motion_with_errors(model, each, errors) for name, each in model.modes.items()},
     )

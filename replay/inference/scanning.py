@@ -27,11 +27,12 @@ from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.components import Components
 from replay.inference.association import Memory as AssociationMemory
 from replay.inference.association import Weights, memory_for
+from replay.inference.corrections import correcting
 from replay.inference.gaussian import Innovation, kalman_step, whiten, wrap
 from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
 from replay.inference.shared_bias import Pool, pool_of
-from replay.inference.steps import Stage, Workspace, correcting, sensor_derivative, workspace
+from replay.inference.steps import Stage, Workspace, sensor_derivative, workspace
 from replay.inference.tracks import Tracks
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
+from replay.inference.corrections import correcting
 from replay.inference.gaussian import (
     LOG_TWO_PI,
     Innovation,
@@ -33,9 +34,6 @@ from replay.inference.generate import (
     adding_noise,
     derivative,
     filling,
-    is_flat,
-    resetting,
-    retraction,
     tuple_of,
 )
 from replay.inference.model import Model, Motion, Sensor
@@ -510,25 +508,6 @@ def noting(stage: Stage, number: int) -> Function:
                 note.covariance[places[i], places[j]] = entry
 
     return tell
-
-
-def correcting(model: Model) -> Function:
-    """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it."""
-    add = retraction(model.kinds)
-    if is_flat(model.kinds):
-
-        def move(mean: Floats, covariance: Floats, work: Workspace) -> None:
-            add(mean, work.step)
-
-        return move
-    reset = resetting(model.kinds)
-
-    def move_and_turn(mean: Floats, covariance: Floats, work: Workspace) -> None:
-        add(mean, work.step)
-        reset(work.step, covariance)
-        reset(work.step, covariance.T)
-
-    return move_and_turn
 
 
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:

@@ -94,7 +94,7 @@ def _judge(
     places = np.concatenate(truth)
     in_arena, bound_holds = np.concatenate(
         [
-            _premises_hold(sizes.of_run(number), source, truth[number])
+            premises_hold(sizes.of_run(number), source, truth[number])
             for number, source in enumerate(sources)
         ],
         axis=1,
@@ -119,7 +119,7 @@ def _judge(
     )
 
 
-def _premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
+def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
     """Whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
     measured = sizes.metadata["measured"]
     streams = source.read(["/landmarks", measured])

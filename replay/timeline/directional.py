@@ -17,6 +17,7 @@ from recorders.log import Stream, schemas
 from replay.distributions import bingham, wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal
 from replay.estimators.grid import torus_grid
+from replay.judging.disturbances import COMPONENTS, disturbances
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (
     TRUTH,
@@ -31,9 +32,10 @@ from replay.timeline.canvas import (
     escaped,
     thin,
 )
-from replay.timeline.events import above_events, draw_events
+from replay.timeline.events import Happened, above_events, draw_events
 from replay.timeline.plots import draw_quality
 
+QUATERNION = COMPONENTS[:4]
 # Pictures and outlines are large: fewer of them than of numbers.
 PICTURES = 500
 CELLS = 96
@@ -60,6 +62,10 @@ def _tracks(scene: Scene, case: str, width: int, rows: int) -> Iterator[Track]:
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if stream["mean"].shape[1] == width:
             yield _track(estimator, scene.colour(estimator), stream, "mean", rows)
+        elif width == 4 and set(QUATERNION) <= set(stream.components):
+            found = _track(estimator, scene.colour(estimator), stream, "mean", rows)
+            places = [stream.components.index(name) for name in QUATERNION]
+            yield found._replace(states=found.states[:, places], covariances=None)
 
 
 def _track(name: str, colour: Colour, stream: Stream, field: str, rows: int) -> Track:
@@ -78,10 +84,26 @@ def _draw_with(
     """A board above the events of each case, its errors beside it."""
 
     def draw_case(case: str) -> rrb.Container:
-        left = above_events(board(canvas, scene, case), draw_events(canvas, scene, case))
+        left = above_events(
+            board(canvas, scene, case), draw_events(canvas, scene, case, also=_disturbed(scene, case))
+        )
         return beside(left, draw_quality(canvas, scene, case), case)
 
     return draw_cases(scene, draw_case)
+
+
+def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
+    """Where estimators that know the magnetic field of the place find it disturbed."""
+    topic = f"/{case}/inertial".replace("//", "/")
+    for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
+        if topic in scene.source.topics and set(COMPONENTS) <= set(stream.components):
+            found = disturbances(scene.read(topic), stream)
+            lasted_s = (found.end_ns - found.begin_ns) * 1e-9
+            texts = [
+                f"magnetic field disturbed for {seconds:.0f} s, by up to {largest_ut:.0f} uT"
+                for seconds, largest_ut in zip(lasted_s, found.largest_ut, strict=True)
+            ]
+            yield Happened(estimator, "WARN", found.begin_ns, texts)
 
 
 def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:

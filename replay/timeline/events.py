@@ -23,8 +23,19 @@ NOT_SENSED = frozenset(
 )
 
 
-# Of a receiver's solution, as RTKLIB numbers them.
-QUALITIES = {1: "fixed", 2: "float", 3: "SBAS", 4: "differential", 5: "single", 6: "PPP"}
+# What components say of a receiver's solution, as RTKLIB numbers them, and of a body.
+STATES: Mapping[str, Mapping[float, str]] = {
+    "quality": {
+        1: "solution fixed",
+        2: "solution float",
+        3: "solution SBAS",
+        4: "solution differential",
+        5: "solution single",
+        6: "solution PPP",
+    },
+    "standing": {0: "moves", 1: "stands: no velocity"},
+    "rolling": {0: "may slip", 1: "rolls: no velocity to the side or up"},
+}
 
 
 class Happened(NamedTuple):
@@ -130,20 +141,21 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
         gaps = _gaps(scene.read(topic))
         explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
         sensor = topic.removeprefix(f"/{case}").removeprefix("/")
-        yield _qualities(sensor, scene.read(topic))
+        yield from _changes(sensor, scene.read(topic))
         yield _spans(sensor, "dead for", outages)
         yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])
 
 
-def _qualities(sensor: str, stream: Stream) -> Happened:
-    """Where the quality of a receiver's solution changes, by RTKLIB's numbers."""
-    is_vector = stream.schema.full_name == schemas.VECTOR_MEASUREMENT.full_name
-    if not (is_vector and "quality" in stream.components):
-        return Happened(sensor, "INFO", stream.publish_time_ns[:0], [])
-    quality = stream["value"][:, stream.components.index("quality")]
-    rows = np.flatnonzero(np.diff(quality, prepend=np.nan) != 0.0)
-    texts = [f"solution {QUALITIES.get(number, f'{number:g}')}" for number in quality[rows].tolist()]
-    return Happened(sensor, "INFO", stream.publish_time_ns[rows], texts)
+def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
+    """Where what a sensor says of its solution or its body changes, see STATES."""
+    if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
+        return
+    for column, component in enumerate(stream.components):
+        if component in STATES:
+            numbers, words = stream["value"][:, column], STATES[component]
+            rows = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0.0)
+            texts = [words.get(number, f"{component} {number:g}") for number in numbers[rows].tolist()]
+            yield Happened(sensor, "INFO", stream.publish_time_ns[rows], texts)
 
 
 def _gaps(stream: Stream) -> Times:

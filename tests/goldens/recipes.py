@@ -103,6 +103,19 @@ OVERTAKING = {
     "odometry_latency_s": 0.03,
     "range_bearing": {"latency_s": 0.2, "latency_jitter_s": 0.3},
 }
+# the studies take them from other robots of a log
+SET_BOUNDS = {
+    "bound_deg": 2.5,
+    "bearing_bound_rad": 0.05,
+    "position_error_m": 0.1,
+    "position_error_mps": 0.03,
+    "heading_error_rad": 0.4,
+    "heading_error_radps": 0.02,
+}
+SET_FILTERS = {
+    name: {"kind": "set-filter:exact", "most_edges": edges, **SET_BOUNDS}
+    for name, edges in (("filter", 400), ("filter-l8", 4))
+}
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 # a diagnosis is a search, which its own tests hold to what is known
@@ -111,7 +124,12 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
         "biometrics-bssr1",
         estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
     ),
+    "biometrics-sequential": Recipe("biometrics-sequential", estimators={"ratio": {"pairs": "trimmed"}}),
+    "biometrics-sequential-simulated": Recipe(
+        "biometrics-sequential-simulated", parameters={"users": 120}
+    ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
+    "broad-peers": Recipe("broad-peers", part="07_undisturbed_fast_rotation_B.hdf5", span_s=30.0),
     # scans that come late, and vessels that go side by side
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
@@ -160,13 +178,21 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
             for label in ("smoother:ekf", "smoother:ukf:lag=500ms", "smoother:iterated")
         },
     ),
+    # a node that lies, is refused, and sends what is new alone
+    "ispace-stress": Recipe(
+        "ispace-stress",
+        estimators={"ci": {"liar": 2, "gate_probability": 0.999, "send_divergence": 0.3}},
+    ),
     "lcd-sampling": Recipe(
         "lcd-sampling",
         over={"options": {"sizes": [[2, 5], [2, 12], [4, 9]], "starts": 1, "contained": [2]}},
     ),
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
+    "mrclam-set-filter": Recipe("mrclam-set-filter", estimators=SET_FILTERS, alone=True, span_s=60.0),
     "mrclam-sets": Recipe("mrclam-sets", span_s=60.0),
+    "mrclam-stress": Recipe("mrclam-stress", span_s=60.0),
+    "set-filter": Recipe("set-filter", parameters=SHORT, estimators=SET_FILTERS, alone=True),
     "uwb-outdoor": Recipe("uwb-outdoor", part="uwb_outdoor/LOS/Trajectory_B/Case_3", span_s=20.0),
     "uwb-pose": Recipe(
         "uwb-pose",

@@ -125,6 +125,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=soon": ("LOG=SECONDS", "-0.5"),
     "merge log.mcap log.estimates.mcap -o new.mcap --offset log.mcap=nan": ("is nan", "give seconds"),
     "relabel log.mcap -o new.mcap": ("nothing to rename",),
+    "constrain log.mcap -o new.mcap": ("has no inertial unit",),
     "relabel log.mcap --topic /robot1/truht=/truth -o new.mcap": ("did you mean '/robot1/truth'",),
     "relabel log.mcap --topic /robot1/truth=truth -o new.mcap": ("=truth", "/old=/new"),
     "relabel log.mcap --topic /robot1/=/b -o new.mcap": ("/robot1/=/b", "/robot1/=/robot2/"),

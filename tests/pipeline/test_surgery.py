@@ -190,3 +190,49 @@ def test_what_is_no_column_is_counted_and_said(log: Path, fuselog: Fuselog) -> N
     refused = fuselog("cut", "foreign.mcap", "--topics", "/texts", "-o", "texts.mcap")
     assert refused.code == 2
     assert not Path("texts.mcap").exists()
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_a_body_that_stands_does_not_drift(tmp_path: Path, fuselog: Fuselog) -> None:
+    """A person waits for 20 s without fixes: the unit knows, and where they walk it says nothing."""
+    unit, gnss = {"rate_hz": 10.0}, {"outages_s": [[5.0, 24.9]], "rate_hz": 1.0, "velocity_rate_hz": 1.0}
+    person = {"carrier": "pedestrian", "speed_mps": 1.4, "rest_s": 25.0, "duration_s": 40.0}
+    recording = fl.record("navigation", seed=2, unit=unit, gnss=gnss, **person)
+    fl.write(tmp_path / "walk.mcap", recording)
+    said = fuselog("constrain", "walk.mcap", "-o", "known.mcap", "--set", "rolling_hz=2")
+    assert said.code == 0
+    assert "/body/rolling: holds at 81 of 81 stamps" in said.err
+    known = fl.open("known.mcap")
+    assert known.run is not None
+    assert known.run.notes["changes"].endswith("by /body/inertial: /body/standing /body/rolling")
+    standing = known["/body/standing"]
+    since_s = (standing.publish_time_ns - known.epoch_ns) * 1e-9
+    stands = standing["value"][:, 0] == 1.0
+    assert stands[(since_s > 1.0) & (since_s < 25.0)].all()
+    assert not stands[since_s > 27.0].any()
+    drift = {}
+    for path in ("walk.mcap", "known.mcap"):
+        replayed = fl.replay(path, {"ekf": {"topics": {"rolling": ""}, "every_s": 1.0}})
+        states = replayed.estimates[0]["/estimates/ekf/body/state"]
+        waiting_s = (states.publish_time_ns - known.epoch_ns) * 1e-9
+        inside = states["mean"][(waiting_s > 5.5) & (waiting_s < 24.5)]
+        drift[path] = np.hypot(*(inside[-1] - inside[0])[:2])
+    assert drift["known.mcap"] < 0.02
+    assert drift["walk.mcap"] > 10.0 * drift["known.mcap"]
+
+
+def test_a_log_without_a_unit_or_with_several_is_refused(tmp_path: Path, log: Path) -> None:
+    with pytest.raises(fl.BadInput, match="has no inertial unit"):
+        fl.constrain(log, "out.mcap")
+    drive = fl.record("navigation", seed=2, duration_s=12.0)
+    fl.write(tmp_path / "one.mcap", drive)
+    fl.relabel("one.mcap", "two.mcap", topics={"/body/": "/other/"})
+    fl.merge(["one.mcap", "two.mcap"], "both.mcap")
+    with pytest.raises(fl.BadInput, match=r"choose one with --unit: /body/inertial, /other/inertial"):
+        fl.constrain("both.mcap", "out.mcap")
+    fl.constrain("both.mcap", "out.mcap", unit="/other/inertial")
+    with pytest.raises(fl.BadInput, match=r"out.mcap: has a topic /other/standing"):
+        fl.constrain("out.mcap", "again.mcap", unit="/other/inertial")
+    with pytest.raises(fl.BadInput, match="standing_hz and rolling_hz are zero"):
+        fl.constrain("one.mcap", "none.mcap", settings={"standing_hz": 0.0})
+    assert not Path("none.mcap").exists()

@@ -211,12 +211,24 @@ delay_s = 0.5
     (tmp_path / "raw.csv").write_text("80\n1,5000\n2,5500\n3,7000\n4,70")  # both ends are cut
     tagged = mapping.replace(
         'rate_hz = 8, zero = "2026-01-01"', 'column = "tick", unit = "ms", tag = ".tag"'
-    ).replace("[[tables]]", '[[tables]]\ncolumns = ["x", "tick"]', 1)
+    ).replace("[[tables]]", '[[tables]]\nfiles = "*.csv"\ncolumns = ["x", "tick"]', 1)
     streams, notes = imported(tmp_path / "raw.csv", tagged.replace("0.5", "0.0"))
     since = streams["/x"].publish_time_ns - 1756402240_250000000
     assert since.tolist() == [0, 500_500_000, 2_002_000_000]  # 2000 ms of the counter are 2002
     assert notes["raw.csv: rows left out, of another number of cells than 2"] == "1"
     assert notes["raw.csv: rows without a time are left out"] == "1"
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    (raw / "raw.csv.tag").write_bytes((tmp_path / "raw.csv.tag").read_bytes())
+    (raw / "raw.csv").write_text("1,500\n2,1000\n3,2500\n4,1500")  # of 15005
+    streams, notes = imported(raw, tagged.replace("0.5", "0.0"))
+    assert (streams["/x"].publish_time_ns - 1756402240_250000000).tolist() == [
+        0,
+        500_500_000,
+        2_002_000_000,
+    ]
+    assert notes["raw.csv: rows without a time are left out"] == "1"
+    assert "files not taken" not in notes
     (tmp_path / "raw.csv.tag").write_bytes(b"no tag")
     with pytest.raises(BadInput, match="is no time tag of RTKLIB"):
         imported(tmp_path / "raw.csv", tagged)

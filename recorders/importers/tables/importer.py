@@ -93,8 +93,9 @@ def _blocks(
         raise BadInput(f"{paths[0]}: nothing of it could be imported: {facts}")
     told.notes.update(_notes(sources, plane, mapping))
     told.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
-    if others:
-        told.notes["files not taken"] = ", ".join(sorted({other.name for other in others}))
+    not_taken = {other.name for other in others} - {source.tag_name for source in sources}
+    if not_taken:
+        told.notes["files not taken"] = ", ".join(sorted(not_taken))
 
 
 def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:

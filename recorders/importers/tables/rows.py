@@ -66,6 +66,11 @@ class Rows:
             decimal=own.decimal,
         )
 
+    @property
+    def tag_name(self) -> str:
+        """The name of the time tag that tells when the file was begun; empty where there is none."""
+        return self.path.name + self._time.tag if self._time.tag else ""
+
     def _clock(self, given: TimeMapping) -> TimeMapping:
         """The time mapping with columns as the file names them; a counter is read here."""
         columns = [self.table.column(name) for name in given.columns]

@@ -163,16 +163,21 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
 
 
 class Counter(NamedTuple):
-    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes."""
+    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes.
+
+    `cut_ns` is the last reading where its line was cut off within it, else NOT_A_TIME.
+    """
 
     first_ns: int
     start_ns: int
     rate: float
+    cut_ns: int
 
     def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
-        """The stamps (n,) of readings; a reading before the first is of a line that was cut off."""
+        """The stamps (n,) of readings; one of a line that was cut off has none."""
         since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
-        return np.where(ticks_ns < self.first_ns, NOT_A_TIME, self.start_ns + since)
+        none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
+        return np.where(none, NOT_A_TIME, self.start_ns + since)
 
 
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
@@ -196,4 +201,5 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter
     if len(every) < 2 or every.max() <= every[0]:
         raise BadInput(f"{path}: its counter does not go on; {tag.name} cannot tell its times")
     rate = float(last_ms) * 1e6 / float(every.max() - every[0])
-    return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate)
+    cut_ns = int(every[-1]) if every[-1] < every.max() else NOT_A_TIME
+    return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)

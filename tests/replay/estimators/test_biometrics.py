@@ -155,6 +155,14 @@ def test_the_forward_recursion_sums_over_all_paths_and_missing_scores_integrate_
     np.testing.assert_allclose(log_likelihood(model, sequence), np.log(total))
 
 
+def test_a_vector_of_which_all_is_missing_says_nothing():
+    model = MixtureHmm(
+        np.ones(1), np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1, 1)), np.ones((1, 1, 1, 1))
+    )
+    found = log_likelihood(model, np.array([[[np.nan]], [[1.0]]]))
+    np.testing.assert_allclose(found, [0.0, -0.5 - 0.5 * np.log(2.0 * np.pi)])
+
+
 def test_ergodic_likelihood_never_falls():
     """More steps of Baum-Welch without a floor cannot be worse."""
     rng = np.random.default_rng(8)

@@ -19,7 +19,7 @@ from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import difference
 from replay.estimators.alignment import align
-from replay.estimators.navigation import INERTIAL, NavigationParameters
+from replay.estimators.navigation import INERTIAL, NavigationParameters, correct
 from replay.inference.checking import check_model
 from tests.replay.inference.replays import outputs
 
@@ -201,14 +201,11 @@ def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: Mem
 # --- simulated runs --------------------------------------------------------------------------------
 
 
-@pytest.mark.paper
-@pytest.mark.parametrize("method", ["ekf", "smoother"])
-def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
-    """From 8 s on, when they move, the mean NEES of 40 drives is in its 95 % interval nearly always."""
+def aligned_nees(method: str, **values: Any) -> tuple[Any, int]:
+    """NEES (stamps, runs) of drives of 40 s, from 8 s on, when they move, and how many runs."""
     runs = 40
-    sources = [
-        memory_source(*record_run("navigation", {"duration_s": 40.0}, 1, run)) for run in range(runs)
-    ]
+    given = {"duration_s": 40.0, **values}
+    sources = [memory_source(*record_run("navigation", given, 1, run)) for run in range(runs)]
     states = outputs(INERTIAL, method, sources)["state"]
     nees = []
     for run, source in enumerate(sources):
@@ -217,7 +214,36 @@ def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
         error = difference(own["mean"], truth["state"][row], INERTIAL.kinds)
         covariance = own["covariance"].reshape(-1, 15, 15)
         nees.append(np.sum(error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0], axis=1))
+    return np.array(nees).T[40:], runs
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("method", ["ekf", "smoother"])
+def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
+    """The mean NEES of 40 drives is in its 95 % interval nearly always."""
+    nees, runs = aligned_nees(method)
     low, high = chi2.ppf([0.025, 0.975], 15 * runs) / runs
-    mean = np.mean(nees, axis=0)[40:]
+    mean = nees.mean(axis=1)
     assert np.mean((mean > low) & (mean < high)) > 0.9
     assert mean.mean() == pytest.approx(15.0, abs=1.0)
+
+
+def test_a_corrected_heading_leaves_tilt_and_speed_as_they_are():
+    """A step of 40 deg about up, and what that makes of the velocity to first order."""
+    before = np.array([5.0, 6.0, 7.0, 3.0, -4.0, 1.0, *np.zeros(10)])
+    before[6:10] = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_quat(scalar_first=True)
+    up, step = np.array(into_body(before[6:10], (0.0, 0.0, 1.0))), np.zeros(15)
+    turn = np.radians(40.0)
+    step[3:5], step[6:9] = turn * np.array([4.0, 3.0]), turn * up
+    after = np.array(correct(tuple(before), tuple(step)))
+    assert_allclose(into_body(after[6:10], (0.0, 0.0, 1.0)), up, atol=1e-12)
+    assert_allclose(into_body(after[6:10], after[3:6]), into_body(before[6:10], before[3:6]), atol=1e-12)
+    turned = Rotation.from_euler("Z", turn).apply(before[3:6])
+    assert_allclose(after[3:6], turned, atol=1e-12)
+
+
+@pytest.mark.paper
+def test_a_filter_survives_a_heading_that_is_off_by_20_deg():
+    """The mean NEES of 15 components is above 20 where each component is corrected by itself."""
+    nees, _ = aligned_nees("ekf", prior={"heading_sigma_rad": np.radians(20.0)})
+    assert nees.mean() < 18.0

@@ -1,19 +1,25 @@
 """What is wrong with a log is said, and a run goes on where it can: gaps, clocks, no numbers."""
 
 import json
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from recorders.errors import BadInput
 from recorders.log import Stream
+from recorders.parameters import build
 from recorders.recording import Recording, record_run
+from replay.engine.blocks import gather
+from replay.engine.estimator import find_estimator
+from replay.engine.failures import sentences_of
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import difference
 from replay.estimators.alignment import align
 from replay.estimators.navigation import INERTIAL, NavigationParameters
-from tests.replay.inference.replays import outputs
+from tests.replay.inference.replays import bound, outputs
 
 
 def drive(change: Any, run: int = 0, **values: Any) -> MemorySource:
@@ -110,3 +116,80 @@ def test_a_shift_by_leap_seconds_is_told(shift_s: int):
         assert f"inertial_delay_s={shift_s} moves the unit's" in how
         mended = align(moved, NavigationParameters(inertial_delay_s=float(shift_s)))
         assert "leap seconds" not in mended.how
+
+
+UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("scales", "words"),
+    [
+        ({"specific_force_mps2": 1 / 9.80665}, "gravity reads 1.0.* it looks like g"),
+        ({"turn_rate_radps": 180 / np.pi}, "at rest it turns by .* looks like deg/s"),
+        (
+            {"specific_force_mps2": UPSIDE_DOWN, "turn_rate_radps": UPSIDE_DOWN},
+            "points down .* mounting_roll_rad=3.14159",
+        ),
+        ({}, ""),
+    ],
+)
+def test_wrong_units_and_axes_are_said_of_a_log_with_a_prior_too(scales: dict[str, Any], words: str):
+    """On the topic of what was assumed; the run begins at its prior all the same."""
+    recording, metadata = record_run("navigation", {"duration_s": 12.0}, 1, 0)
+    streams = [
+        replace(
+            each, columns={name: column * scales.get(name, 1.0) for name, column in each.columns.items()}
+        )
+        if each.topic.endswith("/inertial")
+        else each
+        for each in recording.streams
+    ]
+    source = memory_source(Recording(streams), metadata)
+    [filtered] = bound(INERTIAL, "ekf", [source])
+    assert filtered.opening is not None
+    first = {name: gather([source[name]]) for name in filtered.opening.topics}
+    told = filtered.opening.find(first, {}, "publish_time").told
+    said = [text for ragged in told for text in sentences_of(ragged.stream)]
+    if words:
+        assert len(said) == 1
+        assert re.search(f"topic /body/inertial: .*{words}", said[0])
+    else:
+        assert said == []
+
+
+def test_several_units_are_told_apart_before_another_model_is_taken():
+    """A prior of the inertial model and no unit of its name: which units there are is said."""
+    recording, metadata = record_run("navigation", {"duration_s": 12.0}, 1, 0)
+    streams = [
+        replace(each, topic=each.topic.replace("/body/inertial", f"/body/imu{number}/inertial"))
+        for each in recording.streams
+        for number in ((1, 2) if each.topic.endswith("/inertial") else (0,))
+    ]
+    topics = memory_source(Recording(streams), metadata).topics
+    estimator, _ = find_estimator("ekf")
+    with pytest.raises(
+        BadInput,
+        match=r"/body/prior is of model inertial, which needs /body/inertial .* the log has "
+        r"/body/imu1/inertial, /body/imu2/inertial of that type: .*topics.inertial=/body/imu1/inertial",
+    ):
+        estimator.bind("ekf", topics, build(estimator.parameters, {}, "test"))
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize(("method", "goes_on"), [("bank", True), ("particles", False)])
+def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, goes_on: bool):
+    """A bank goes on after it as its filters do; a cloud of particles has no such step, and says so."""
+    slow = {"unit": {"rate_hz": 10.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
+    count = {} if goes_on else {"particles": 20}
+    source = drive(silent, duration_s=26.0, **slow)
+    found = outputs(INERTIAL, method, [source], **count)
+    times_s = since_s(found["state"].stream)
+    last_s = times_s[-1]
+    failures = sentences_of(found["failure"].stream)
+    if goes_on:
+        assert failures == []
+        assert last_s == pytest.approx(26.0)
+        assert not ((times_s > 20.01) & (times_s < 22.99)).any()
+    else:
+        assert failures == ["what drives the motion is silent for too long"]
+        assert last_s == pytest.approx(20.0)

@@ -50,6 +50,11 @@ def test_wheels_measure_at_their_axle_and_do_not_slip():
     stream = make_stream(
         "/a/wheel", schemas.ODOMETRY, np.array([1]), forward_mps=np.array([7.0]), turn_radps=np.zeros(1)
     )
+    assert sensors.stay_on_wheels(STATE, samples, given) == sensors.roll_along(STATE, samples, given)[1:]
+    rolling = make_stream(
+        "/a/rolling", schemas.VECTOR_MEASUREMENT, np.array([1, 2]), value=np.array([[1.0], [0.0]])
+    )
+    assert_allclose(sensors.read_rolling(rolling), [[0.0] * 2, [np.nan] * 2])
     read = sensors.read_wheels(stream)
     assert_allclose(read, [[7.0, 0.0, 0.0]])
 

@@ -111,6 +111,13 @@ def moving(function: Any, **changes: Any) -> Model:
 LINEAR_HEADING = {**vehicle_a.STATE, "heading_rad": "linear"}
 LINEAR_BEARING = replace(RANGE_BEARING, measured={"range_m": "linear", "bearing_rad": "linear"})
 COMPASS = (replace(ATTITUDE.sensors[0], measure=first_of_quaternion),)
+
+
+def moved_by(state: Any, step: Any) -> Any:
+    x, y, heading, speed, turn = state
+    return x + step[0], y + step[1], heading + step[2], speed + step[3] + step[2] * turn, turn + step[4]
+
+
 WRONG: dict[str, tuple[Model, str]] = {
     "a Jacobian of a sensor": (with_speed(jacobian=rows_by_hand), "read_speed .* as written by hand"),
     "a measured angle declared linear": (
@@ -155,6 +162,10 @@ WRONG: dict[str, tuple[Model, str]] = {
     "a kind that does not exist": (
         replace(VEHICLE_A, state={**vehicle_a.STATE, "x_m": "metres"}),
         "known are linear",
+    ),
+    "a correction that is none for small steps": (
+        replace(VEHICLE_A, correct=moved_by),
+        "moved_by .* a small step of heading_rad moves other components too",
     ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),

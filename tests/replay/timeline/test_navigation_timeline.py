@@ -77,7 +77,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
         metadata={"components": "quality,satellites", "kinds": "linear,linear"},
         value=np.stack([np.where(seconds < 30, 1.0, 2.0), seconds], axis=1),
     )
-    source = memory_source(Recording([fix, quality]), RunMetadata("table"))
+    standing = make_stream(
+        "/standing",
+        schemas.VECTOR_MEASUREMENT,
+        STAMPS,
+        metadata={"components": "standing", "kinds": "linear"},
+        value=np.where(seconds < 50, 0.0, 1.0)[:, None],
+    )
+    source = memory_source(Recording([fix, quality, standing]), RunMetadata("table"))
     outputs = {each.topic: gather([each]) for each in (estimate, innovation)}
     path = tmp_path_factory.mktemp("navigation") / "run.rrd"
     show(source, outputs, [], save=path)
@@ -118,8 +125,12 @@ def test_biases_have_bands_and_each_sensor_its_innovations(drawn: Drawn):
         assert_allclose(np.concatenate(squares), np.arange(first, 60, 2))
 
 
-def test_the_map_has_the_estimates_and_events_the_solutions(drawn: Drawn):
+def test_the_map_has_the_estimates_and_events_the_solutions_and_stops(drawn: Drawn):
     [[way]] = drawn.still["/geodetic/ekf"]["GeoLineStrings:line_strings"]
     assert_allclose(way[-1], [48.0 + 118.0 / 111_194.0, 9.0], atol=1e-5)
-    texts = [text for row in drawn.moving["/events/quality"]["TextLog:text"] for text in row]
-    assert texts == ["quality: solution fixed", "quality: solution float"]
+    told = {
+        sensor: [text for row in drawn.moving[f"/events/{sensor}"]["TextLog:text"] for text in row]
+        for sensor in ("quality", "standing")
+    }
+    assert told["quality"] == ["quality: solution fixed", "quality: solution float"]
+    assert told["standing"] == ["standing: moves", "standing: stands: no velocity"]

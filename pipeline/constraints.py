@@ -1,0 +1,65 @@
+"""What the samples of an inertial unit say of its body: that it stands, that its wheels do not slip.
+
+It becomes topics of their own, which the model `inertial` takes beside those of sensors.
+"""
+
+import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.standing import unrest
+from recorders.parameters import Parameters
+
+
+class ConstraintParameters(Parameters):
+    """What is told of a body, and how it is known that it stands.
+
+    `standing_hz` times a second it is told whether the body stands: whether during the last `window_s`
+    the standard deviation of the specific force was below `still_mps2`, and the root mean square of the
+    turn rate below `still_radps`. `rolling_hz` times a second it is told that the body moves neither to
+    the side nor up, as on wheels. A rate of zero leaves it out.
+    """
+
+    standing_hz: NonNegativeFloat = 5.0
+    rolling_hz: NonNegativeFloat = 0.0
+    window_s: PositiveFloat = 0.5
+    still_mps2: PositiveFloat = 0.1
+    still_radps: PositiveFloat = 0.05
+
+
+def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[Stream]:
+    """The topics `standing` and `rolling` beside that of a unit: messages that hold 1 where it is so.
+
+    Args:
+        inertial: the unit's samples.
+        parameters: see `ConstraintParameters`.
+
+    Raises BadInput where there are no samples, or nothing is asked for.
+    """
+    if not len(inertial):
+        raise BadInput(f"topic {inertial.topic}: has no samples to tell anything of")
+    time_ns = inertial.publish_time_ns
+    force, rate = inertial["specific_force_mps2"], inertial["turn_rate_radps"]
+    shaken, turned = unrest(time_ns, force, rate, parameters.window_s)
+    stands = (shaken < parameters.still_mps2) & (turned < parameters.still_radps)
+    rates_hz = {"standing": parameters.standing_hz, "rolling": parameters.rolling_hz}
+    told = {"standing": stands, "rolling": np.ones(len(stands), bool)}
+    beside, found = inertial.topic.rpartition("/")[0], []
+    for name, rate_hz in rates_hz.items():
+        if rate_hz > 0.0:
+            turn = np.floor((time_ns - time_ns[0]) * (1e-9 * rate_hz) + 1e-6)
+            rows = np.flatnonzero(np.diff(turn, prepend=-1.0) > 0.0)
+            value = told[name][rows, None].astype(float)
+            metadata = {"components": name, "kinds": "linear"}
+            stream = make_stream(
+                f"{beside}/{name}",
+                schemas.VECTOR_MEASUREMENT,
+                time_ns[rows],
+                metadata=metadata,
+                value=value,
+            )
+            found.append(stream)
+    if not found:
+        raise BadInput("nothing to tell: standing_hz and rolling_hz are zero; give one of them")
+    return found

@@ -1,0 +1,48 @@
+"""Where a magnetic field is disturbed, by an estimate of orientation and of the field of the place."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream
+from recorders.models.inertial import into_body
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+COMPONENTS = (*(f"orientation_{part}" for part in "wxyz"), "field_north_ut", "field_up_ut")
+AVERAGED_NS = 1_000_000_000
+
+
+class Disturbances(NamedTuple):
+    """Spans (n,) in which the field differs from that of the place: from, to, by how much at most."""
+
+    begin_ns: Integers
+    end_ns: Integers
+    largest_ut: Floats
+
+
+def disturbances(samples: Stream, estimates: Stream, limit_ut: float = 8.0) -> Disturbances:
+    """The seconds in which the mean deviation of the field is longer than a limit, joined to spans.
+
+    Args:
+        samples: of an inertial unit with a magnetometer.
+        estimates: that have `COMPONENTS`; samples without an estimate say nothing.
+        limit_ut: as a rule four times the standard deviation of a field that is not disturbed.
+    """
+    row = np.searchsorted(estimates.publish_time_ns, samples.publish_time_ns).clip(0, len(estimates) - 1)
+    field = samples["magnetic_field_ut"]
+    usable = (estimates.publish_time_ns[row] == samples.publish_time_ns) & np.isfinite(field).all(axis=1)
+    places = [estimates.components.index(name) for name in COMPONENTS]
+    w, x, y, z, north, up = estimates["mean"][row[usable]][:, places].T
+    expected = np.stack(into_body((w, x, y, z), (0.0, north, up)), axis=1)
+    second, of_sample = np.unique(samples.publish_time_ns[usable] // AVERAGED_NS, return_inverse=True)
+    sums = [np.bincount(of_sample, column) for column in (field[usable] - expected).T]
+    deviation = np.linalg.norm(sums, axis=0) / np.maximum(np.bincount(of_sample), 1)
+    over = np.flatnonzero(deviation > limit_ut)
+    spans = np.split(over, np.flatnonzero(np.diff(second[over]) > 1) + 1) if len(over) else []
+    return Disturbances(
+        np.array([second[span[0]] for span in spans], np.int64) * AVERAGED_NS,
+        np.array([second[span[-1]] + 1 for span in spans], np.int64) * AVERAGED_NS,
+        np.array([deviation[span].max() for span in spans]),
+    )

@@ -1,0 +1,102 @@
+"""Sequential tests of log-likelihood ratios: Wald's of two hypotheses, Page's of a change.
+
+Wald, "Sequential Tests of Statistical Hypotheses", Annals of Mathematical Statistics 16(2), 1945; Page,
+"Continuous Inspection Schemes", Biometrika 41, 1954. What they promise holds for ratios that are
+calibrated and independent.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+
+
+class Rates(NamedTuple):
+    """Rates of error of a test: of accepting an impostor, and of rejecting the person."""
+
+    false_accept: float
+    false_reject: float
+
+
+class Decisions(NamedTuple):
+    """What became of sequences (n,): whether they were accepted, and after how many probes.
+
+    Those that came to no decision have 0 probes and are not accepted.
+    """
+
+    accepted: Booleans
+    probes: Integers
+
+    @property
+    def rejected(self) -> Booleans:
+        """Which sequences (n,) were rejected."""
+        return ~self.accepted & (self.probes > 0)
+
+
+def thresholds(rates: Rates) -> tuple[float, float]:
+    """Between which sums of log-likelihood ratios there is no decision: below reject, above accept.
+
+    Raises BadInput where a rate is not above zero, or their sum not below one.
+    """
+    accept, reject = rates
+    if not (accept > 0.0 and reject > 0.0 and accept + reject < 1.0):
+        raise BadInput(f"rates of error {accept:g} and {reject:g}: give two above 0, their sum below 1")
+    return float(np.log(reject / (1.0 - accept))), float(np.log((1.0 - reject) / accept))
+
+
+def wald_bounds(rates: Rates) -> Rates:
+    """What the rates of error cannot exceed by those thresholds: Wald's inequalities (3.18), (3.19)."""
+    accept, reject = rates
+    return Rates(accept / (1.0 - reject), reject / (1.0 - accept))
+
+
+def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
+    """The mean number of probes by Wald's approximation (4.8): the sum ends on a threshold exactly.
+
+    `mean_ratio` is the mean log-likelihood ratio of a probe, of the person (`genuine`) or of impostors.
+    """
+    low, high = thresholds(rates)
+    accepted = 1.0 - rates.false_reject if genuine else rates.false_accept
+    return (accepted * high + (1.0 - accepted) * low) / mean_ratio
+
+
+def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, most: int) -> Decisions:
+    """Wald's test of `count` sequences of at most so many probes.
+
+    `ratio_of(sequences)` gives the next probe's log-likelihood ratio of each of these sequences.
+    """
+    low, high = thresholds(rates)
+    total, probes = np.zeros(count), np.zeros(count, np.int64)
+    going = np.arange(count)
+    for probe in range(1, most + 1):
+        total[going] += ratio_of(going)
+        ends = (total[going] <= low) | (total[going] >= high)
+        probes[going[ends]] = probe
+        going = going[~ends]
+        if not len(going):
+            break
+    return Decisions((probes > 0) & (total >= high), probes)
+
+
+def page_sums(ratios: Floats) -> Floats:
+    """Page's cumulative sums (..., n) of ratios (..., n) of a change: begun anew where below zero."""
+    total = np.cumsum(ratios, axis=-1)
+    return total - np.minimum(np.minimum.accumulate(total, axis=-1), 0.0)
+
+
+def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
+    """After how many probes (...,) one of the sums (..., n) is over its threshold; 0 for never.
+
+    The threshold is log(together * run_length), where each probe adds to so many sums: by the
+    martingale of Shiryaev and Roberts the mean number of probes until a false alarm is then no less than
+    `run_length` (Pollak, Annals of Statistics 13(1), 1985).
+    """
+    over = sums >= np.log(together * run_length)
+    return np.where(over.any(axis=-1), np.argmax(over, axis=-1) + 1, 0)
