@@ -301,7 +301,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
         speed = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
         if len(speed) < 2 or np.ptp(speed) <= 1e-6 * speed.max():
             raise BadInput(
-                f"{trajectory.name}: its speed never changes, so no time offset can be found; give it in s"
+                f"{trajectory.name}: its speed never changes, so no offset can be found; give it in s"
             )
         speeds.append(speed - speed.mean())
     offset_s = float(times[1][0] - times[0][0] + _best_lag(*speeds) * step_s)

@@ -9,6 +9,7 @@ import pytest
 from pipeline.claims import Claim
 from pipeline.experiment import load_experiment, shipped
 from pipeline.results import Outcome, result_folder, write_outcome
+from tests.bench import __main__ as bench
 from tests.claims import pages
 from tests.docs.reference import reference
 
@@ -76,3 +77,16 @@ def test_a_changed_result_changes_its_page(tmp_path: Path, monkeypatch: pytest.M
     assert pages.rendered(text) == text
     kept["metrics"]["ekf.rmse_m"] = 0.5
     assert "0.50 and 1\n" in pages.rendered(text)
+
+
+def test_a_benchmark_is_kept_beside_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "SPEED", tmp_path / "speed.json")
+    bench.keep("phd", [["GM-PHD, us; a peer", "2", "6", "3 times"]])
+    bench.keep("log", [["read: fuselog, mcap", "2", "8", "4.2"]])
+    bench.keep("phd", [["GM-PHD, us; a peer", "2", "10", "5 times"]])
+    speed = pages.Speed(json.loads((tmp_path / "speed.json").read_text(encoding="utf-8")))
+    monkeypatch.setattr(pages, "speed", lambda: speed)
+    template = "{speed[GM-PHD, us; a peer]:.0f} and {speed[read: fuselog, mcap]:.1f}, {speed.machine}"
+    said = pages.rendered(f"<!-- results\n{template}\n-->\n<!-- end -->")
+    assert f"-->\n5 and 4.2, {bench.machine()}\n" in said
+    assert "cores" in bench.machine()
