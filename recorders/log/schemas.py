@@ -189,6 +189,15 @@ LINE_OF_SIGHT = _declare(
     _real("azimuth_rad"),
     _real("elevation_rad"),
 )
+MOVING_LINE_OF_SIGHT = _declare(
+    "MovingLineOfSight",
+    "Azimuth and elevation of one target in the frame of a sensor that moves, and its pose then.",
+    _identifier("target_id"),
+    _real("azimuth_rad"),
+    _real("elevation_rad"),
+    _vector("position_m"),
+    _vector("quaternion"),
+)
 SHOT_DETECTION = _declare(
     "ShotDetection",
     "One shot heard by one sensor; the shockwave is missing where it cannot be heard.",

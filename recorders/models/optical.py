@@ -11,6 +11,7 @@ from recorders.models.planar import Component, Components
 
 Triple = tuple[Component, Component, Component]
 ANGLES = ("yaw", "pitch", "roll")
+SENSORS, TARGETS = 3, 2  # that move; those that stand may be as many as wanted
 
 
 def azimuth_elevation(x: Components) -> tuple[Component, Component]:
@@ -120,3 +121,13 @@ def target_components(target: int) -> list[str]:
 def bias_components(sensor: int) -> list[str]:
     """The names of a sensor's attitude biases in a state."""
     return [f"sensor_{sensor}_{angle}_bias_rad" for angle in ANGLES]
+
+
+def moving_target_components(target: int) -> list[str]:
+    """The names of a moving target's coordinates and velocities in a state."""
+    return target_components(target) + [f"target_{target}_v{axis}_mps" for axis in "xyz"]
+
+
+def clock_component(sensor: int) -> str:
+    """The name of how far a sensor's clock is ahead, in a state."""
+    return f"sensor_{sensor}_clock_s"

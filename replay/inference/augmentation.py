@@ -26,6 +26,7 @@ from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.point_errors import (
     Errors,
     PointError,
+    jacobians_with,
     motion_with_errors,
     point_errors,
     sensor_with_errors,
@@ -197,6 +198,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
     recorder = _recorder(model)
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, recorder)
+    reads_none = not recorder.read & set(names)
     lost = motion.lost and _reading(
         model,
         names,
@@ -219,14 +221,21 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         ),
         noise=_reading(model, names, given, "state, duration_s", "first(state), duration_s", variances),
         noises=motion.noises + len(names) if motion.noises else 0,
-        linear=motion.linear and not recorder.read & set(names),
-        jacobians=None,
+        linear=motion.linear and reads_none,
+        jacobians=jacobians_with(model, motion, tuple(_kept(model, name) for name in names))
+        if reads_none and not motion.noises
+        else None,
         moments=None,
     )
 
 
+def _kept(model: Model, name: str) -> str:
+    """The share that a component of this name keeps in a step; an angle has no mean to come back to."""
+    return "1.0" if model.estimable[name] == "angle" else kept(name)
+
+
 def _stay(model: Model, name: str, state: str) -> str:
-    """A component of this name after a step; an angle has no mean to come back to."""
+    """A component of this name after a step."""
     if model.estimable[name] == "angle":
         return state
     return f"{kept(name)} * {state} + (1.0 - {kept(name)}) * parameters.{name}"

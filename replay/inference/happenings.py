@@ -247,6 +247,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
         about.append(places.at(rows))
     if sensor.control is not None:  # see `with_control`
         about.append(np.full((len(stream), len(sensor.control.components)), np.nan))
+    about += [_field(stream, name, size) for name, size in sensor.fields.items()]
     if sensor.is_numbered:
         about.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
     parts[1:1] = about
@@ -271,6 +272,18 @@ def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
 
 def _fields(stream: Stream, names: Sequence[str]) -> Floats:
     return np.stack([stream[name] for name in names], axis=1)
+
+
+def _field(stream: Stream, name: str, size: int) -> Floats:
+    """A field of numbers or vectors (n, size); raises BadInput where it has another width."""
+    if not len(stream):  # vectors have no width here
+        return np.empty((0, size))
+    numbers = np.asarray(stream[name], float).reshape(len(stream), -1)
+    if numbers.shape[1] != size:
+        raise BadInput(
+            f"topic {stream.topic}: {name} has {numbers.shape[1]} components; the model needs {size}"
+        )
+    return numbers
 
 
 def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:

@@ -178,6 +178,9 @@ class Sensor:
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
         about: what the message is about: a point of a map, or one of each of several maps.
+        fields: numbers that a message states beside what it measures, such as the pose of a sensor that
+            moves: fields of the schema, and how many components each has. `about` has them behind the
+            points and the control.
         is_numbered: whether `about` ends with the numbers of these points.
         control: the model's, which has to be interpolated, where what is measured depends on it:
             `about` then ends with its numbers at the stamp.
@@ -200,6 +203,7 @@ class Sensor:
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
     about: Map | tuple[Map, ...] | None = None
+    fields: Mapping[str, int] = field(default_factory=dict)
     is_numbered: bool = False
     control: Control | None = None
     read: Callable[[Stream], Floats] | None = None
@@ -221,9 +225,10 @@ class Sensor:
 
     @property
     def about_size(self) -> int:
-        """How many numbers `measure` gets as `about`: of points, of the control, the points' numbers."""
+        """How many numbers `measure` gets as `about`: points, control, fields, the points' numbers."""
         controls = len(self.control.components) if self.control else 0
-        return self.control_start + controls + (len(self.maps) if self.is_numbered else 0)
+        numbers = len(self.maps) if self.is_numbered else 0
+        return self.control_start + controls + sum(self.fields.values()) + numbers
 
 
 @lru_cache(maxsize=64)

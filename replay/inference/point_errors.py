@@ -112,22 +112,24 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
         noise=noise,
         noises=noises + len(errors) if noises else 0,
         noise_block=t if not noises and len(entries) != t else 0,
-        jacobians=None if noises else _motion_jacobians(model, motion, errors),
+        jacobians=None if noises else jacobians_with(model, motion, tuple(map(kept, _names(errors)))),
         moments=None,
     )
 
 
-def _motion_jacobians(model: Model, motion: Motion, errors: Errors) -> Function:
-    """`jacobians(state, control, duration_s, parameters, by_state, by_control)`; see `model.Motion`."""
-    t, end = model.tangent, model.tangent + len(errors)
+def jacobians_with(model: Model, motion: Motion, kept_of: Sequence[str]) -> Function:
+    """The Jacobians of a motion, and of what walks beside it: `model.Motion.jacobians`.
+
+    `kept_of` are expressions of the share that each of the latter keeps in a step. The motion does not
+    read them, so that jets are of its own state alone: they take a compiler the square of its size.
+    """
+    t, end = model.tangent, model.tangent + len(kept_of)
     inputs = [
         Input("state", model.kinds, "transition"),
         Input("control", ("linear",) * model.controls, "gain" if motion.control_noise else ""),
     ]
     linearise = derivative(motion.move, inputs, model.kinds, ("duration_s", "parameters"))
-    diagonal = [
-        f"    by_state[{t + row}, {t + row}] = {kept(each)}" for row, each in enumerate(_names(errors))
-    ]
+    diagonal = [f"    by_state[{t + row}, {t + row}] = {each}" for row, each in enumerate(kept_of)]
     return function_of(
         "def jacobians(state, control, duration_s, parameters, by_state, by_control):\n"
         "    linearise(state, control, duration_s, parameters, Target(by_state, by_control))\n"

@@ -14,8 +14,10 @@ import click
 import numpy as np
 
 from pipeline.experiment import Experiment, load_experiment, load_scenario, shipped
+from pipeline.studies.los_moving import unknowns
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
+from recorders.simulators.moving_optical import MovingOpticalParameters
 from replay.engine.sources import MemorySource, memory_source
 
 # Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive
@@ -116,6 +118,7 @@ SET_FILTERS = {
     name: {"kind": "set-filter:exact", "most_edges": edges, **SET_BOUNDS}
     for name, edges in (("filter", 400), ("filter-l8", 4))
 }
+BIASES = {"model": "moving-sights", **unknowns(MovingOpticalParameters())}
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 # a diagnosis is a search, which its own tests hold to what is known
@@ -186,6 +189,24 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
     "lcd-sampling": Recipe(
         "lcd-sampling",
         over={"options": {"sizes": [[2, 5], [2, 12], [4, 9]], "starts": 1, "contained": [2]}},
+    ),
+    # a manoeuvre, biases and clocks in the state
+    "los-moving": Recipe(
+        "los-moving",
+        parameters={"duration_s": 6.0, "weave_m": [0.0, 0.0, 1000.0]},
+        estimators={"ekf": BIASES, "smoother": {"kind": "smoother:ekf", **BIASES}},
+        alone=True,
+    ),
+    "lrkf-dimension": Recipe(
+        "lrkf-dimension",
+        over={
+            "runs": 2,
+            "options": {
+                "dimensions": [2, 5],
+                "functions": 3,
+                "drives": {"robot": {"scenario": "landmarks", "parameters": {"duration_s": 4.0}}},
+            },
+        },
     ),
     "mrclam": Recipe("mrclam", span_s=300.0),
     "mrclam-cooperative": Recipe("mrclam-cooperative", span_s=300.0),
