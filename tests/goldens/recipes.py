@@ -29,6 +29,7 @@ DATA = {
     **dict.fromkeys(
         ("walk", "quadrotor", "uwb-lias", "uwb-outdoor"), ("navigation", "navigation.tar.xz")
     ),
+    "sound-recordings": ("acoustic", "acoustic.tar.xz"),
     "torus": ("torus", "torus.tar.xz"),
 }
 
@@ -112,6 +113,16 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
         estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
+    # echoes and wrong associations
+    "acoustic-sequence": Recipe(
+        "acoustic-sequence",
+        parameters={
+            "shots": 6,
+            "echo_probability": 0.2,
+            "wrong_association_probability": 0.2,
+            "dropout_probability": 0.2,
+        },
+    ),
     # scans that come late, and vessels that go side by side
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails
