@@ -1,6 +1,6 @@
 # make demo, make test: each does all of its own set-up in .venv; only Python 3.11 or newer is needed.
-# make docs makes the pages' tables from the stored results; make docs-claims FUSELOG_DATA=FOLDER runs the
-# experiments first, all or those that NAMES="..." lists.
+# make docs makes the pages' tables from the stored results, and the site from the pages, in site/;
+# make docs-claims FUSELOG_DATA=FOLDER runs the experiments first, all or those that NAMES="..." lists.
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
 BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # --no-compile: Python compiles the modules that are imported, which are few of them
@@ -56,6 +56,7 @@ faults: .venv/with-test
 
 docs: .venv/with-test
 	$(BIN)/python -m tests.claims render
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 docs-claims: .venv/with-test
 	$(BIN)/python -m tests.claims run $(NAMES)
@@ -66,7 +67,7 @@ format: .venv/with-test
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf .venv demo out build dist *.egg-info
+	rm -rf .venv demo out site build dist *.egg-info
 
 .venv/with-fuselog: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -75,7 +76,7 @@ clean:
 
 .venv/with-test: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(INSTALL) --editable '.[test]'
+	$(INSTALL) --editable '.[docs,test]'
 	@touch .venv/with-fuselog
 	@touch $@
 

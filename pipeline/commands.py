@@ -3,8 +3,7 @@
 Rerun and matplotlib take long to import: only what draws imports them.
 """
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from pipeline.results import (
     split_metric,
     write_outcome,
 )
+from pipeline.settings import read_settings, settings_of_estimators, sigmas_of
 from pipeline.starting import check_same_run, order_of, origins_of, span_of
 from pipeline.studies.localization import summarise, summary_table
 from pipeline.sweeps import DRAWN, Sampling, nested, parse_over, points_of, run_sweep
@@ -44,18 +44,14 @@ from pipeline.terminal import (
 )
 from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput
 from recorders.log import Companions, Log, NotMcap, open_log
 from recorders.parameters import merge, parse_settings
-from recorders.parsing import parse_json, read_toml
-from replay.engine.estimator import find_estimator
+from recorders.parsing import parse_json
 from replay.engine.sources import LogSource, Source
 from replay.judging.judge import Judge
 from replay.judging.metrics import find_metrics
 from replay.judging.trajectories import Comparison
-
-# Parameters of estimators that have an option of their own.
-OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
 def replay_logs(
@@ -90,10 +86,7 @@ def replay_logs(
         "settings": [settings_file] if settings_file else [],
     }
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
-    stated = {"model": model, "every_s": every_s}
-    chosen = {key: value for key, value in stated.items() if value is not None}
-    tuned = read_settings(settings_file, names)
-    estimators = settings_of_estimators(names, {**parse_settings(settings), **chosen}, tuned)
+    estimators = settings_of_estimators(names, settings, settings_file, model=model, every_s=every_s)
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
     opened = [LogSource(open_log(path, recover=recover)) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
@@ -143,67 +136,6 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
         if places.count(place) > 1:
             raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
     return paths
-
-
-def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label, from the tables of a TOML file; none without a file.
-
-    Raises BadInput where the file has settings of another estimator.
-    """
-    tables = {} if path is None else read_toml(path)
-    for label, table in tables.items():
-        if label not in labels or not isinstance(table, dict):
-            raise BadInput(
-                f"{path}: has settings of {label}, and a settings file has a table for each estimator "
-                f"that is replayed: {', '.join(labels)}"
-            )
-    return tables
-
-
-def settings_of_estimators(
-    labels: Sequence[str],
-    settings: Mapping[str, Any],
-    base: Mapping[str, Mapping[str, Any]],
-) -> dict[str, dict[str, Any]]:
-    """Parameters by estimator label: those of `base`, and settings over them.
-
-    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter. Raises
-    BadInput where none has.
-    """
-    chosen: dict[str, dict[str, Any]] = {}
-    known: dict[str, set[str]] = {}
-    for label in labels:
-        own = settings.get(label, {})
-        if not isinstance(own, dict):
-            raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
-        chosen[label] = dict(own)
-        kind = {**base.get(label, {}), **own}.get("kind", label)
-        estimator, _ = find_estimator(str(kind))
-        known[label] = set(estimator.parameters.model_fields)
-    for key in [each for each in settings if each not in chosen]:
-        takers = [label for label in chosen if key in known[label]]
-        if not takers and key in OPTIONS:
-            raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
-        if not takers:
-            names = sorted(set(chosen).union(*known.values()))
-            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
-        for label in takers:
-            chosen[label].setdefault(key, settings[key])
-    return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
-
-
-def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
-    sigmas: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            sigmas[name] = float(value)
-        except ValueError:
-            sigmas[name] = math.nan
-        if not 0 < sigmas[name] < math.inf:
-            raise BadInput(f"{option} {text}: expected COMPONENT=SIGMA with a positive number")
-    return sigmas
 
 
 def _state_losses(logs: Iterable[Log]) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.commands import sigmas_of
 from pipeline.replays import Log, sources_of
+from pipeline.settings import sigmas_of
 from pipeline.starting import span_of
 from pipeline.terminal import print_json, print_table
 from recorders.errors import BadInput

@@ -6,11 +6,10 @@ from pathlib import Path
 from pipeline.checking.checking import check, runs_of, update
 from pipeline.checking.golden import Tolerance, read
 from pipeline.checking.junit import JUNIT, write_junit
-from pipeline.commands import read_settings, settings_of_estimators
 from pipeline.outputs import check_files
+from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, say
 from recorders.errors import BadInput
-from recorders.parameters import parse_settings
 
 
 def check_path(
@@ -30,9 +29,7 @@ def check_path(
 ) -> bool:
     """Check a path against a golden, or write that; whether all is as in the golden."""
     if is_update:
-        chosen = settings_of_estimators(
-            labels, parse_settings(settings), read_settings(settings_file, labels)
-        )
+        chosen = settings_of_estimators(labels, settings, settings_file)
         made = update(
             path,
             golden,

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.commands import read_settings, settings_of_estimators
 from pipeline.comparing.comparing import compare
 from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, print_table, progress, say, warn
-from recorders.parameters import parse_settings
 
 COLUMNS = {
     "quantity": "metric",
@@ -46,8 +45,7 @@ def compare_sides(
         check_folder(out, inputs)
     if save is not None:
         check_files([(save, TIMELINE)], inputs)
-    tuned = read_settings(settings_file, labels)
-    chosen = settings_of_estimators(labels, parse_settings(settings), tuned)
+    chosen = settings_of_estimators(labels, settings, settings_file)
     found = compare(
         *sides,
         estimators=[{label: values} for label, values in chosen.items()],

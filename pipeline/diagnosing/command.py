@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.commands import read_settings, settings_of_estimators
 from pipeline.diagnosing.diagnosis import diagnose
 from pipeline.outputs import TIMELINE, check_files, check_folder
 from pipeline.results import plain
+from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, print_metrics, print_table, say, status
 from recorders.errors import BadInput
 from recorders.log import open_log
@@ -34,12 +34,12 @@ def diagnose_log(
         check_folder(out, {"log": [log]})
     if save is not None:
         check_files([(save, TIMELINE)], {"log": [log]})
-    given = parse_settings(settings) | ({} if model is None else {"model": model})
     if label is not None:
-        chosen = settings_of_estimators([label], given, read_settings(settings_file, [label]))
-        given = chosen[label]
+        given = settings_of_estimators([label], settings, settings_file, model=model)[label]
     elif settings_file is not None:
         raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
+    else:
+        given = parse_settings(settings) | ({} if model is None else {"model": model})
     with status() as show:
         show("replaying with one fault undone after another")
         found = diagnose(

@@ -5,16 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.commands import read_settings, settings_of_estimators
 from pipeline.outputs import check_folder
 from pipeline.results import plain
+from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, print_metrics, print_table, say, status
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
 from recorders.log import open_log
-from recorders.parameters import parse_settings
 from replay.engine.sources import LogSource
 
 
@@ -40,8 +39,7 @@ def tune_logs(
 ) -> None:
     """Tune, write the result folder, and print values, notes and metrics."""
     check_folder(out, {"log": [*logs, *held_out]})
-    given = parse_settings(settings) | ({} if model is None else {"model": model})
-    chosen = settings_of_estimators([label], given, read_settings(settings_file, [label]))
+    chosen = settings_of_estimators([label], settings, settings_file, model=model)
     with status() as show:
 
         def tell(best: Best) -> None:

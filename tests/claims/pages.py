@@ -25,7 +25,7 @@ from pipeline.results import MetricValue, Result, read_result
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
-TOLD = ("diagnosing", "tuning")  # pages that are of no family, and hold results
+TOLD = ("diagnose", "tune")  # pages that are of no family, and hold results
 PAGES = [*sorted(FOLDER.parent.glob("*.md")), *(ROOT / "docs" / f"{name}.md" for name in TOLD)]
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 

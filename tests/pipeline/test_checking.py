@@ -74,7 +74,7 @@ def test_a_change_in_the_seventh_digit_is_found_at_its_first_stamp(
     assert bits.startswith(f"bits of {INNOVATION} differ from {first_ns} ns on")
     assert "NIS" in innovation
     assert str(first_ns) in innovation
-    page = (Path(__file__).parents[2] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "compare.md").read_text(encoding="utf-8")
     [told] = re.findall(r"^run\.mcap /estimates.*?(?=\n```)", page, re.MULTILINE | re.DOTALL)
     number = r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?"
     assert re.sub(number, "#", told) == re.sub(number, "#", "\n".join([first, bits, innovation]))

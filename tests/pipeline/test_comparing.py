@@ -208,7 +208,7 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
 @pytest.mark.paper
 def test_the_page(fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its commands give its table, and a check of what has not changed."""
-    page = (Path(__file__).parents[2] / "docs" / "comparing.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "compare.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     told = [fuselog(*shlex.split(line)) for line in re.findall(r"^fuselog (.*)$", page, re.MULTILINE)]
     assert [each.code for each in told] == [0] * 5

@@ -317,7 +317,7 @@ def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its commands give its sentences; what they say to try leaves nothing to be found."""
-    page = (Path(__file__).parents[2] / "docs" / "diagnosing.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^fuselog (record|diagnose) (.*)$", page, re.MULTILINE)
     told = [fuselog(command, *shlex.split(options)) for command, options in commands]

@@ -1,4 +1,4 @@
-"""docs/own-estimator.md: its code is a package that is installed here, and its commands are run."""
+"""docs/your-estimator.md: its code is a package that is installed here, and its commands are run."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import pytest
 from pipeline.command_line import main
 from recorders.log import open_log, read_streams
 
-PAGE = (Path(__file__).parents[2] / "docs" / "own-estimator.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "your-estimator.md").read_text()
 
 # More entry points, for what goes wrong in the code of others.
 BROKEN = """

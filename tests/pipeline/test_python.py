@@ -23,7 +23,7 @@ from replay.engine.estimator import Estimator
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-LOCAL = (ROOT / "docs" / "own-estimator.md").read_text(encoding="utf-8")
+LOCAL = (ROOT / "docs" / "your-estimator.md").read_text(encoding="utf-8")
 SHORT = {"duration_s": 4.0}
 POSE = "/estimates/ekf/robot1/pose"
 Fuselog = Callable[..., Any]

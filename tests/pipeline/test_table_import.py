@@ -78,7 +78,7 @@ def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path,
     words.write_text("name,colour\na,red\n")
     guess = fuselog("import", "table", str(words), "--guess", "-o", str(tmp_path / "words.toml"))
     assert (guess.code, guess.err.count("\n")) == (2, 1)
-    assert "write a mapping by hand, as docs/own-log.md says" in guess.err
+    assert "write a mapping by hand, as docs/your-log.md says" in guess.err
     assert not (tmp_path / "words.toml").exists()
     two = fuselog("import", "ros", *files, "-o", str(out))
     assert (two.code, "ros data are one file or folder" in two.err) == (2, True)

@@ -178,7 +178,7 @@ def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its commands give its table, a result folder, and settings that replay, run and tune take."""
-    page = (Path(__file__).parents[2] / "docs" / "tuning.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "tune.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^fuselog (.*)$", page, re.MULTILINE)
     told = [fuselog(*shlex.split(command)) for command in commands]

@@ -64,7 +64,7 @@ def guess(paths: Sequence[Path]) -> str:
     if not tables:
         raise BadInput(notes[0] if len(notes) == 1 else f"{paths[0]}: holds no table among its files")
     head = [
-        "# What fuselog guessed; mend what is wrong: docs/own-log.md says how.",
+        "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
         *(f"# not taken: {note}" for note in notes),
     ]
@@ -89,7 +89,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     if not columns or (not used and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no times, and no columns of {_FEWEST} numbers or more; write a mapping "
-            "by hand, as docs/own-log.md says"
+            "by hand, as docs/your-log.md says"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):

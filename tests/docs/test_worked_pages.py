@@ -1,0 +1,145 @@
+"""Pages that are worked from top to bottom: their files are written, their commands and code are run.
+
+In a page, a block with a title is a file, a block of Python is run, and a line that begins with
+`fuselog` or `python` is a command. Every line of a `text` block is something that was printed before it.
+"""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from importlib.util import find_spec
+from io import StringIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from tests.pipeline.conftest import run_here
+
+DOCS = Path(__file__).parents[2] / "docs"
+WORKED = ["start", "judge", "smooth", "contract", "coming-from"]
+PEERS = (
+    "evo",
+    "filterpy",
+    "stonesoup",
+)  # of the extra `bench`, and evo; without one its code is not run
+_BLOCK = re.compile(r"^```(\w*)(?: title=\"(.*?)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+class Fenced(NamedTuple):
+    """A block of a page: its language, the file that it is, if any, and its text."""
+
+    language: str
+    file: str
+    text: str
+
+
+def blocks_of(name: str) -> list[Fenced]:
+    """All blocks of a page, in order."""
+    return [Fenced(*each) for each in _BLOCK.findall((DOCS / f"{name}.md").read_text(encoding="utf-8"))]
+
+
+def commands_in(text: str) -> Iterator[list[str]]:
+    """The commands of a block that are run: those of fuselog but the viewer's window, and Python."""
+    for line in text.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:2] == ["fuselog", "view"] and not {"--save", "--screenshot"} & set(words):
+            continue
+        if words[:1] in (["fuselog"], ["python"]):
+            yield words
+
+
+def printed_by(words: list[str]) -> str:
+    """What a command prints; it has to succeed."""
+    if words[0] == "python":
+        done = subprocess.run([sys.executable, *words[1:]], capture_output=True, text=True, check=True)
+        return done.stdout
+    said = run_here(*words[1:])
+    assert said.code == 0, (words, said.err)
+    return said.out
+
+
+def missing_peers(code: str) -> list[str]:
+    """The peers that code imports and that are not installed here."""
+    return [name for name in PEERS if f"from {name}" in code and find_spec(name) is None]
+
+
+def flat(text: str) -> str:
+    """Text without its line breaks and rules."""
+    return " ".join(re.sub("[─│]", "", text).split())
+
+
+@pytest.mark.parametrize("name", WORKED)
+def test_a_page_can_be_worked_through(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    printed, shown, left_out = "", 0, list[str]()
+    for language, file, text in blocks_of(name):
+        if file:
+            Path(file).parent.mkdir(parents=True, exist_ok=True)
+            Path(file).write_text(text, encoding="utf-8")
+        elif language == "python" and (missing := missing_peers(text)):
+            left_out += missing
+        elif language == "python":
+            out = StringIO()
+            with redirect_stdout(out):
+                exec(text, names)
+            printed = out.getvalue()
+        elif language == "sh":
+            printed = "\n".join(map(printed_by, commands_in(text)))
+        elif language == "text":
+            for line in text.splitlines():
+                assert flat(line) in flat(printed), f"{name}.md shows\n{line}\nprinted was\n{printed}"
+                shown += 1
+    assert shown, "a worked page shows what its commands print"
+    if left_out:
+        pytest.skip(f"all but the code for {', '.join(left_out)}, which are not installed here")
+
+
+def test_readers_in_other_languages_read_what_fuselog_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The readers of the contract's page give every value of a log, bit for bit."""
+    monkeypatch.chdir(tmp_path)
+    for block in blocks_of("contract"):
+        if block.file:
+            Path(block.file).write_text(block.text, encoding="utf-8")
+    assert run_here("record", "landmarks", "--set", "duration_s=2", "-o", "packed.mcap").code == 0
+    plain = ["record", "landmarks", "--set", "duration_s=2", "--compression", "none", "-o", "plain.mcap"]
+    assert run_here(*plain).code == 0
+    names: dict[str, Any] = {}
+    exec(Path("read_log.py").read_text(encoding="utf-8"), names)
+    for path in ("packed.mcap", "plain.mcap"):
+        _compare(names["read"](path), fl.open(path))
+    if shutil.which("node") is None:
+        pytest.skip("no node on this machine: the reader in JavaScript was not run")
+    dump = "(name, value) => (typeof value === 'bigint' ? Number(value) : value)"
+    Path("dump.mjs").write_text(
+        "import { readFileSync } from 'node:fs'; import { read } from './read_log.mjs';\n"
+        f"console.log(JSON.stringify(read(readFileSync(process.argv[2])), {dump}));\n"
+    )
+    done = subprocess.run(["node", "dump.mjs", "plain.mcap"], capture_output=True, text=True, check=True)
+    listed, _, dumped = done.stdout.rstrip().rpartition("\n")
+    columns = json.loads(dumped)
+    assert listed.splitlines()[0] == f"/landmarks: {', '.join(sorted(columns['/landmarks']))}"
+    _compare(columns, fl.open("plain.mcap"))
+
+
+def _compare(read: dict[str, dict[str, list[Any]]], log: fl.LogSource) -> None:
+    assert set(read) == set(log)
+    for topic, columns in read.items():
+        stream = log[topic]
+        clocks = {"publish_time_ns": stream.publish_time_ns, "log_time_ns": stream.log_time_ns}
+        ours = {**stream.columns, **clocks}
+        assert set(columns) == set(ours)
+        for name, values in columns.items():
+            np.testing.assert_array_equal(np.array(values, ours[name].dtype), ours[name])
