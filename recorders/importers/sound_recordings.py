@@ -78,7 +78,8 @@ class Array(NamedTuple):
 def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     """Read a folder; microphones that are left out and what is doubtful is told in the notes.
 
-    Raises BadInput that names the file where one cannot be used at all, or too few are left.
+    Sounds that too few microphones heard are left out, too. Raises BadInput that names the file where
+    one cannot be used at all, or no sound is left.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: is no folder; give one of WAV files with the table of their places")
@@ -103,6 +104,9 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
         for sound in _sounds(array, tables, epoch_ns)
         for stream in _streams(sound, array, epoch_ns, parameters, notes)
     ]
+    if not streams:
+        left = "; ".join(f"{what}: {why}" for what, why in notes.items())
+        raise BadInput(f"{folder}: holds no sound that can be located ({left or 'none is detected'})")
     missing = sorted(parameters.truth_m.keys() - {stream.topic.split("/")[1] for stream in streams})
     if missing:
         notes["truth_m"] = f"no sound is called {', '.join(missing)}"
@@ -244,13 +248,18 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
             is_there = (table[kind].map(_number) > 0.0) & (first_ns >= 0)
             at_once = begin_ns[is_there].groupby(begin_ns[is_there]).groups
             for number, rows in enumerate(at_once.values(), start=1):
-                name = f"{path.stem}-{kind}" + (f"-{number}" if len(at_once) > 1 else "")
+                name = _topic(f"{path.stem}-{kind}" + (f"-{number}" if len(at_once) > 1 else ""))
                 lasts_ns = round(float((end - begin)[rows].max()) * 1e9)
                 at_ns = int(begin_ns[rows].iloc[0])
                 yield Sound(name, list(dict.fromkeys(file[rows])), at_ns, at_ns + lasts_ns)
     if not has_one:
         begins, ends = zip(*spans.values(), strict=True)
-        yield Sound(array.path.stem, list(spans), max(begins), min(ends))
+        yield Sound(_topic(array.path.stem), list(spans), max(begins), min(ends))
+
+
+def _topic(name: str) -> str:
+    """A name that a topic may have as one of its parts."""
+    return re.sub(r"[^\w-]+", "_", name)
 
 
 def _streams(
@@ -260,7 +269,7 @@ def _streams(
     parameters: SoundRecordingsParameters,
     notes: dict[str, str],
 ) -> Iterator[Stream]:
-    """The differences of one sound, and the truth where it is known; BadInput where too few heard it.
+    """The differences of one sound, and the truth where it is known; none where too few heard it.
 
     It is looked for a little longer than it lasts on both sides, as long as sound travels between the
     microphones. A file that does not cover the sound itself, or is silent there, is left out.
@@ -296,11 +305,8 @@ def _streams(
     places = np.array([array.places[each] for each in kept]).reshape(-1, 3)
     needed = 3 if len(places) and np.ptp(places[:, 2]) == 0.0 else 4
     if len(kept) < needed:
-        left = "; ".join(f"{each} {why}" for each, why in notes.items())
-        raise BadInput(
-            f"sound {name}: {len(kept)} microphones heard it, {needed} are needed to locate it"
-            + (f" ({left})" if left else "")
-        )
+        notes[name] = f"{len(kept)} microphones heard it, {needed} are needed to locate it: left out"
+        return
     low, high = parameters.band_hz or (200.0, 0.45 * rate_hz)
     if not low < high <= 0.5 * rate_hz:
         raise BadInput(
