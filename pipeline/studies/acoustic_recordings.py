@@ -38,7 +38,10 @@ class Published(Parameters):
 
 
 class Simulated(Parameters):
-    """Simulated recordings: the scenario `sound-source` with these parameters, at each of the noises."""
+    """Simulated recordings: the scenario `sound-source` with these parameters, at each of the noises.
+
+    Where there are no noises, nothing is simulated.
+    """
 
     runs: PositiveInt = 100
     seed: Annotated[int, Field(ge=0)] = 1
@@ -75,8 +78,14 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     for each in replayed.innovations:
         if each.estimator == label:
             outcome.claims.append(_explained(each.case, each.squared, table))
-    simulated = simulate(runner, options.simulated, label)
+    if options.simulated.snr_db:
+        _judge_simulated(simulate(runner, options.simulated, label), label, outcome)
+    return outcome
+
+
+def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> None:
     outcome.tables["simulated"] = simulated
+    outcome.figures["simulated"] = _chart(simulated)
     for snr_db, rows in simulated.groupby("snr_db", sort=False):
         outcome.metrics |= {
             f"{label}.median_error_m.snr-{snr_db:g}": float(rows["error_m"].median()),
@@ -84,8 +93,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             f"{label}.coverage_share.snr-{snr_db:g}": float(rows["inside"].mean()),
         }
         outcome.claims += covariance_claims(float(str(snr_db)), rows)
-    outcome.figures["simulated"] = _chart(simulated)
-    return outcome
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:

@@ -5,10 +5,11 @@ of single-shot solutions, which know of no motion, where the shot was fired. Cla
 the runs of the logarithm of two estimators' RMSE: a run that is lost counts, but not for all others.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 
 from pipeline.charts import Axis, Chart, Panel, curve
 from pipeline.claims import Claim, judged
@@ -28,7 +29,7 @@ SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 class Options(Parameters):
     """What differs in the scenario, by the name of a case; the first has no faults."""
 
-    cases: dict[str, dict[str, float]] = {"clean": {}}
+    cases: Annotated[dict[str, dict[str, float]], Field(min_length=1)] = {"clean": {}}
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
