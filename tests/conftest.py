@@ -98,6 +98,15 @@ def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return _unpacked(archive, tmp_path_factory) / "navigation"
 
 
+@pytest.fixture(scope="session")
+def acoustic(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of opensoundscape's recordings and tables, unpacked once."""
+    archive = real_data / "acoustic.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    return _unpacked(archive, tmp_path_factory) / "acoustic"
+
+
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("data")
     with tarfile.open(path) as archive:

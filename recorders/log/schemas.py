@@ -206,6 +206,28 @@ SHOT_DETECTION = _declare(
     _real("shockwave_azimuth_rad", may_be_nan=True),
     _real("time_difference_s", may_be_nan=True),
 )
+SHOT_REPORT = _declare(
+    "ShotReport",
+    "What one of several sensors tells of a shot: where the muzzle blast came from, the bullet's "
+    "direction as its shockwave tells it, and by how much the shockwave was ahead, one of two by the "
+    "side of the muzzle blast from which it came.",
+    _identifier("sensor_id"),
+    _real("muzzle_blast_azimuth_rad"),
+    _real("trajectory_rad", may_be_nan=True),
+    _real("left_lead_s", may_be_nan=True),
+    _real("right_lead_s", may_be_nan=True),
+)
+ARRIVAL_DIFFERENCE = _declare(
+    "ArrivalDifference",
+    "By how much later a sound came at one microphone (a Landmark) than at a reference, and the "
+    "variances of both arrivals; all differences of one stamp share the error of the reference's.",
+    _identifier("microphone_id"),
+    _identifier("reference_id"),
+    _real("difference_s"),
+    _real("variance_s2"),
+    _real("reference_variance_s2"),
+    _real("likeness"),
+)
 POSITION_FIX = _declare(
     "PositionFix",
     "A position in the log's Cartesian frame, of two or three numbers, with its covariance, row-major "

@@ -43,6 +43,21 @@ def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, C
     return np.arctan2(y, x), np.hypot(x, y)
 
 
+def fired_from(
+    place: Components, velocity: Components, sensor: Components, speed_of_sound_mps: Component
+) -> tuple[Component, Component]:
+    """Where something was whose sound a sensor hears now, when it is at `place` by now.
+
+    The sound's time of travel is that of the distance now, corrected once: what is left out is the
+    square of velocity over the speed of sound, 2 cm of 1 km at 1.5 m/s.
+    """
+    x, y = place
+    for _ in range(2):
+        travelled_s = np.hypot(x - sensor[0], y - sensor[1]) / speed_of_sound_mps
+        x, y = place[0] - velocity[0] * travelled_s, place[1] - velocity[1] * travelled_s
+    return x, y
+
+
 def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
     """On which side of the line of fire a sensor hears the shockwave: +1 or -1; 0 where it does not.
 
@@ -66,6 +81,16 @@ def measured_side(azimuth: Component, shockwave: Component) -> Component:
 def trajectory_from_shockwave(shockwave: Component, side: Component, medium: Medium) -> Component:
     """The bullet's direction, eq (7) turned around."""
     return wrap_angle(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
+
+
+def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Component:
+    """The side that a sensor works out; 0 where it cannot be sure, or heard no shockwave.
+
+    That is where both directions of arrival are within three standard deviations of each other.
+    """
+    unsure = 3.0 * np.hypot(noise.muzzle_blast_rad, noise.shockwave_rad)
+    is_sure = np.abs(wrap_angle(azimuth - shockwave)) >= unsure
+    return np.where(is_sure, measured_side(azimuth, shockwave), 0.0)
 
 
 def time_difference(distance: Component, separation: Component, medium: Medium) -> Component:

@@ -72,11 +72,7 @@ def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Record
     shooter = np.array(parameters.shooter_position_m)
     sensors = np.array(parameters.sensor_position_m)
     travel_s = np.linalg.norm(sensors - shooter, axis=1) / parameters.speed_of_sound_mps
-    if travel_s.max() >= parameters.interval_s:
-        raise BadInput(
-            f"interval_s = {parameters.interval_s}: the sound travels {travel_s.max():.3g} s to the "
-            "farthest sensor; fire less often"
-        )
+    require_time_to_hear(parameters.interval_s, travel_s.max())
     shots_s = parameters.interval_s * np.arange(float(parameters.shots))
     streams = [_truth(parameters, shots_s, travel_s)]
     for number, (place, delay_s) in enumerate(zip(sensors, travel_s, strict=True), start=1):
@@ -85,6 +81,15 @@ def simulate(parameters: AcousticParameters, rng: np.random.Generator) -> Record
             _detections(parameters, number, place, shots_s + delay_s, rng),
         ]
     return Recording(streams)
+
+
+def require_time_to_hear(interval_s: float, longest_s: float) -> None:
+    """Raise BadInput where the sound of a shot travels longer than it takes until the next one."""
+    if longest_s >= interval_s:
+        raise BadInput(
+            f"interval_s = {interval_s}: the sound travels {longest_s:.3g} s to the "
+            "farthest sensor; fire less often"
+        )
 
 
 def _truth(parameters: AcousticParameters, shots_s: Array, travel_s: Array) -> Stream:

@@ -31,6 +31,7 @@ DATA = {
     **dict.fromkeys(
         ("walk", "quadrotor", "uwb-lias", "uwb-outdoor"), ("navigation", "navigation.tar.xz")
     ),
+    "sound-recordings": ("acoustic", "acoustic.tar.xz"),
     "torus": ("torus", "torus.tar.xz"),
 }
 
@@ -133,6 +134,16 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
     ),
     "biometrics-simulated": Recipe("biometrics-simulated", parameters={"users": 120}),
     "broad-peers": Recipe("broad-peers", part="07_undisturbed_fast_rotation_B.hdf5", span_s=30.0),
+    # echoes and wrong associations
+    "acoustic-sequence": Recipe(
+        "acoustic-sequence",
+        parameters={
+            "shots": 6,
+            "echo_probability": 0.2,
+            "wrong_association_probability": 0.2,
+            "dropout_probability": 0.2,
+        },
+    ),
     # scans that come late, and vessels that go side by side
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails

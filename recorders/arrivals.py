@@ -1,0 +1,63 @@
+"""The streams of a sound that microphones heard: differences of its arrivals, and where they are."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, make_stream, schemas
+from recorders.models.arrivals import Weighting, arrivals
+
+Floats = NDArray[np.float64]
+
+
+def difference_stream(
+    prefix: str,
+    time_ns: int,
+    recordings: Floats,
+    rate_hz: float,
+    places_m: Floats,
+    microphone_id: NDArray[np.int64],
+    *,
+    band_hz: tuple[float, float],
+    speed_of_sound_mps: float,
+    weighting: Weighting = "phat",
+) -> Stream:
+    """The arrivals of one sound at n microphones, as recorded at the same time (n, samples).
+
+    Args:
+        prefix: of the topic, which ends with `/differences`.
+        time_ns: the stamp of all its messages.
+        recordings: (n, samples), of the same time.
+        rate_hz: of the samples.
+        places_m: of the microphones (n, 3).
+        microphone_id: their numbers (n,).
+        band_hz: the frequencies that are used.
+        weighting: see `recorders.models.arrivals`.
+        speed_of_sound_mps: sets how much later a sound may come at all, and is stated.
+    """
+    away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
+    longest_s = away_m / speed_of_sound_mps + 2.0 / rate_hz
+    found = arrivals(recordings, rate_hz, band_hz, longest_s, weighting)
+    others = np.delete(np.arange(len(recordings)), found.reference)
+    return make_stream(
+        f"{prefix}/differences",
+        schemas.ARRIVAL_DIFFERENCE,
+        np.full(len(others), time_ns),
+        metadata={"speed_of_sound_mps": repr(float(speed_of_sound_mps))},
+        microphone_id=microphone_id[others],
+        reference_id=np.full(len(others), microphone_id[found.reference]),
+        difference_s=found.delay_s[others],
+        variance_s2=found.variance_s2[others],
+        reference_variance_s2=np.full(len(others), found.variance_s2[found.reference]),
+        likeness=found.likeness[others],
+    )
+
+
+def microphone_stream(time_ns: int, places_m: Floats) -> Stream:
+    """Where microphones are (n, 3), numbered from 1 on."""
+    return make_stream(
+        "/microphones",
+        schemas.LANDMARK,
+        np.full(len(places_m), time_ns),
+        landmark_id=np.arange(1, len(places_m) + 1),
+        position_m=places_m,
+    )

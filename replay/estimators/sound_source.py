@@ -1,0 +1,128 @@
+"""Where a sound came from, by differences of its arrivals at microphones: the model `sound-source`.
+
+All differences are of one reference, whose own error they share: it is a part of the state, so that the
+differences are independent given it. A source of microphones that all are at one height is taken to be
+there, for nothing tells by how much it is above or below.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import PositiveFloat
+from scipy.optimize import least_squares
+
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
+from recorders.models.planar import Components
+from replay.engine.arrays import Floats
+from replay.engine.measurements import SPACE
+from replay.estimators.ranging import distance
+from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+
+# A source is sought on a grid about the microphones, so many times as large as they are apart, and from
+# the best of its points on.
+SOUGHT = np.linspace(-1.5, 1.5, 21)
+BEST = 3
+
+
+class SoundSourceParameters(ModelParameters):
+    """The air and the start; None takes what the log's channels state.
+
+    The start is found by least squares, and is as uncertain as `start_sigma_m` says: it counts little
+    beside the differences. In a plane `height_sigma_m` is how far a source may be from that.
+    """
+
+    speed_of_sound_mps: PositiveFloat | None = None
+    start_sigma_m: PositiveFloat = 100.0
+    height_sigma_m: PositiveFloat = 0.01
+
+
+def stay(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """What does not move."""
+    x, y, z, reference = state
+    return x, y, z, reference
+
+
+def hear(state: Components, about: Components, parameters: Any) -> Components:
+    """By how much later a sound comes at the first of two points than at the second, and errs there."""
+    away = distance(state, about), distance(state, (about[3], about[4], about[5]))
+    return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
+
+
+def read_differences(stream: Stream) -> Floats:
+    """What is measured (n, 1)."""
+    return stream["difference_s"][:, None]
+
+
+def read_variances(stream: Stream) -> Floats:
+    """Its covariance (n, 1, 1)."""
+    return stream["variance_s2"][:, None, None]
+
+
+def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
+    """The place that fits the differences of the first stamp best, sought from all sides.
+
+    Raises BadInput where they are fewer than the coordinates that they have to tell.
+    """
+    stream, points = streams["differences"], streams[MICROPHONES.topic]
+    first = stream.take(stream.publish_time_ns == stream.publish_time_ns[:1])
+    places = dict(zip(points["landmark_id"].tolist(), points["position_m"], strict=True))
+    pairs = np.stack([first["microphone_id"], first["reference_id"]], axis=1)
+    known = np.array([pair[0] in places and pair[1] in places for pair in pairs.tolist()], bool)
+    about = np.array([[*places[m], *places[r]] for m, r in pairs[known].tolist()]).reshape(-1, 6)
+    measured = first["difference_s"][known]
+    array = np.unique(about.reshape(-1, 3), axis=0)
+    is_flat = len(array) > 0 and np.ptp(array[:, 2]) == 0.0
+    free = 2 if is_flat else 3
+    if len(measured) < free:
+        raise BadInput(
+            f"topic {stream.topic}: {len(measured)} differences of microphones in {MICROPHONES.topic} "
+            f"at its first stamp; {free} are needed to locate a source"
+        )
+    shared_s2 = first["reference_variance_s2"][0]
+    sigma = np.sqrt(first["variance_s2"][known] + shared_s2)
+    middle, size = array.mean(axis=0), np.linalg.norm(np.ptp(array, axis=0))
+
+    def residuals(place: Floats) -> Floats:
+        state = (*place, *middle[free:], 0.0)
+        return (hear(state, about.T, parameters)[0] - measured) / sigma
+
+    grid = np.stack(np.meshgrid(*[SOUGHT] * free), axis=-1).reshape(-1, free, 1)
+    starts = middle[:free, None] + size * grid
+    costs = np.sum(residuals(np.swapaxes(starts, 0, 1)) ** 2, axis=1)
+    scale = np.full(free, size)
+    fits = [
+        least_squares(residuals, start[:, 0], x_scale=scale, loss="soft_l1")
+        for start in starts[np.argsort(costs, kind="stable")[:BEST]]
+    ]
+    place = min(fits, key=lambda fit: float(fit.cost)).x
+    spread = np.array([parameters.start_sigma_m**2] * free + [parameters.height_sigma_m**2] * (3 - free))
+    covariance = np.diag(np.append(spread, shared_s2))
+    time_ns = int(first.publish_time_ns[0])
+    return Started(time_ns, np.array([*place, *middle[free:], 0.0]), covariance, HOW)
+
+
+HOW = "where its differences fit best"
+MICROPHONES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "microphone_id")
+REFERENCES = Map("/microphones", schemas.LANDMARK, "landmark_id", "position_m", SPACE, "reference_id")
+SOUND_SOURCE = Model(
+    "where a sound came from, from differences of its arrivals at microphones",
+    {"x_m": "linear", "y_m": "linear", "z_m": "linear", "reference_s": "linear"},
+    SoundSourceParameters,
+    (
+        Sensor(
+            "differences",
+            schemas.ARRIVAL_DIFFERENCE,
+            {"difference_s": "linear"},
+            hear,
+            about=(MICROPHONES, REFERENCES),
+            read=read_differences,
+            covariance=read_variances,
+        ),
+    ),
+    Motion(stay, linear=True),
+    start=Start({}, find=find_source),
+    estimable={"speed_of_sound_mps": "linear"},
+    takes_fixes=False,
+)

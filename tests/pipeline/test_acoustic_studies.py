@@ -1,0 +1,118 @@
+"""Shots in sequence and sounds in recordings: what errors are of, and which numbers hold a claim."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.results import Outcome
+from pipeline.studies.acoustic_recordings import (
+    Options,
+    Published,
+    _explained,
+    _published,
+    covariance_claims,
+    differences_of,
+    known_place,
+)
+from pipeline.studies.acoustic_sequence import claims, log_ratio, of_runs, positions, shots_of
+from recorders.errors import BadInput
+from recorders.recording import import_run, record_run
+from replay.engine.sources import memory_source
+from replay.judging.evaluation import Errors
+
+
+def test_a_shot_is_where_it_was_fired_and_when_it_was_heard_last():
+    values = {"shots": 3, "start_sigma_mps": 4.0, "dropout_probability": 0.3}
+    source = memory_source(*record_run("shot-sequence", values, 4))
+    fired, last_ns = shots_of(source)
+    truth = source.streams["/shooter/truth"]
+    at_shots = np.searchsorted(truth.publish_time_ns, source.epoch_ns + 5 * 10**9 * np.arange(3))
+    assert fired == pytest.approx(truth["state"][at_shots, :2], abs=1e-6)
+    reports_ns = source.streams["/shooter/reports"].publish_time_ns
+    assert last_ns[-1] == reports_ns[-1]
+    assert np.isin(last_ns, reports_ns).all()
+    # meanwhile the shooter has moved
+    assert np.linalg.norm(positions(source, last_ns) - fired, axis=1).min() > 0.1
+
+
+def runs_of(**rmse_m: list[float]) -> pd.DataFrame:
+    """The runs of one case, by estimator."""
+    tables = [
+        pd.DataFrame({"run": range(len(each)), "estimator": label.replace("_", "-"), "rmse_m": each})
+        for label, each in rmse_m.items()
+    ]
+    return pd.concat(tables).assign(case="clean", nees=1.0, located=1.0)
+
+
+def test_a_run_that_is_lost_counts_as_one_run():
+    """RMSE half as large in all runs, a thousandth in one: the mean of logarithms."""
+    runs = runs_of(student=[1.0, 2.0, 0.001], not_robust=[2.0, 4.0, 1.0])
+    mean, low, high = log_ratio(runs, "clean", "student", "not-robust")
+    assert mean == pytest.approx(np.log(0.5 * 0.5 * 0.001) / 3)
+    assert low < np.log(0.5) < high
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.05, "confirmed"), (1.15, "refuted")])
+def test_what_robustness_may_cost(factor, verdict):
+    plain = [1.0, 2.0, 3.0]
+    runs = runs_of(student=[factor * each for each in plain], not_robust=plain)
+    (claim,) = claims(runs, ["clean"])
+    assert (claim.verdict, claim.ours[:4]) == (verdict, f"{factor:.2f}")
+
+
+def test_runs_are_judged_by_the_shots_that_were_located():
+    shots = pd.DataFrame({"error_m": [3.0, 4.0, np.nan], "nees": [1.0, 3.0, np.nan]})
+    (row,) = of_runs(shots.assign(case="clean", estimator="ekf", run=0)).to_dict("records")
+    assert row["rmse_m"] == pytest.approx(np.sqrt(12.5))
+    assert (row["nees"], row["located"]) == (2.0, pytest.approx(2 / 3))
+
+
+def test_the_real_array_is_held_to_what_was_published(acoustic):
+    given = {"band_hz": [5000.0, 10000.0]}
+    table = differences_of(memory_source(*import_run("sound-recordings", acoustic, given)))
+    name = "LOCA_2021_detections-zeep"
+    rows = table[table["sound"] == name]
+    assert rows["microphone"].tolist() == sorted(rows["microphone"])
+    assert rows["z_m"].tolist() == [14.392, 2.9, 15.092, 3.6, 14.392, 2.9]
+    assert rows["sigma_s"].between(1e-5, 1e-3).all()
+    published = [0.0, 0.0325, -0.002, 0.0316, -0.0086, 0.024]
+    for change_s, verdict in ((0.0, "confirmed"), (2e-3, "refuted")):
+        known = Published(delay_s=[*published[:-1], published[-1] + change_s])
+        (claim,) = _published(table, Options(published={name: known}), Outcome())
+        assert claim.verdict == verdict
+    with pytest.raises(BadInput, match="2 delays for 6 microphones"):
+        _published(table, Options(published={name: Published(delay_s=[0.0, 1.0])}), Outcome())
+    # two differences more than coordinates: 5.99 with 95 %
+    for squared, verdict in ((1.1, "confirmed"), (1.3, "refuted")):
+        assert _explained(name, np.full(5, squared), table).verdict == verdict
+
+
+def test_a_known_place_is_held_to_its_error_and_region():
+    none = np.zeros(1, np.int64)
+    errors = Errors(
+        "ekf",
+        "aru",
+        ("x_m", "y_m"),
+        ("linear",) * 2,
+        none,
+        none,
+        none,
+        np.zeros(1),
+        np.array([[0.03, 0.03]]),
+        np.empty((1, 2, 2)),
+        np.array([6.5]),
+        0,
+        (),
+    )
+    assert [each.verdict for each in known_place(errors, 0.05)] == ["confirmed", "refuted"]
+    assert [each.verdict for each in known_place(errors, 0.04)] == ["refuted", "refuted"]
+
+
+@pytest.mark.parametrize(
+    ("nees", "inside", "verdicts"),
+    [(2.0, 95, ["confirmed"] * 2), (2.6, 92, ["refuted", "confirmed"]), (1.5, 90, ["refuted"] * 2)],
+)
+def test_covariances_are_right_within_chi_square(nees, inside, verdicts):
+    """Of 100 sounds in the plane: NEES from 1.63 to 2.41, at least 91 in their regions."""
+    rows = pd.DataFrame({"nees": [nees] * 100, "inside": np.arange(100) < inside, "coordinates": 2})
+    assert [claim.verdict for claim in covariance_claims(10.0, rows)] == verdicts
