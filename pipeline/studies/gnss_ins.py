@@ -181,7 +181,8 @@ def _recording(
     """The recording with the fixes that are used, and the rows of the receiver."""
     assert experiment.import_ is not None
     values = experiment.import_.parameters
-    source = memory_source(*import_run(experiment.import_.source, folder, values))
+    recording = memory_source(*import_run(experiment.import_.source, folder, values))
+    source = MemorySource(recording.streams, recording.run, str(folder))
     rows = rows_of(source)
     streams = dict(source.streams)
     begin_ns = streams[INERTIAL].publish_time_ns[0] + round(1e9 * options.settle_s)

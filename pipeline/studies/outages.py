@@ -62,8 +62,10 @@ def rows_of(source: MemorySource) -> Rows:
     """The receiver's rows of a recording; raises BadInput where a topic is missing or has no message."""
     for topic in NEEDED:
         if topic not in source.topics or not source.topics[topic].messages:
+            why = "; rows with a fixed solution make it, and there are none" if topic == TRUTH else ""
             raise BadInput(
-                f"{source.name}: has no messages of {topic}; outages are made of {', '.join(NEEDED)}"
+                f"{source.name}: has no messages of {topic}{why}; outages are made of "
+                f"{', '.join(NEEDED)}"
             )
     fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
     # a delay that the mapping states moves publish times alone

@@ -17,10 +17,14 @@ from pipeline.studies.outages import (
     hermite,
     in_runs,
     length_table,
+    rows_of,
     window_table,
     windows_of,
 )
 from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from recorders.log.run import RunMetadata
+from replay.engine.sources import MemorySource
 
 
 def accelerated() -> Rows:
@@ -162,3 +166,14 @@ def test_several_recordings_and_none(tmp_path: Path):
             (tmp_path / folder / file).touch()
     with pytest.raises(BadInput, match=r"several recordings; give one of .*one, .*two with --data"):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
+
+
+def test_a_recording_of_float_solutions_alone_has_no_truth():
+    stamps_ns, place, spread = np.array([10**9]), np.zeros((1, 3)), np.ones((1, 9))
+    fix = make_stream("/fix", schemas.POSITION_FIX, stamps_ns, position_m=place, covariance_m2=spread)
+    velocity = make_stream(
+        "/velocity", schemas.VELOCITY_FIX, stamps_ns, velocity_mps=place, covariance_m2ps2=spread
+    )
+    streams = {"/fix": fix, "/velocity": velocity}
+    with pytest.raises(BadInput, match=r"^drive: has no messages of /truth; rows with a fixed"):
+        rows_of(MemorySource(streams, RunMetadata("table"), "drive"))
