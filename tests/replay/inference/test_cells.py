@@ -29,6 +29,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "extended-target": ("extended-target", {}),
     "inertial": ("navigation", {"duration_s": 12.0}),
     "moving-shooter": ("shot-sequence", {"shots": 4}),
+    "moving-sights": ("moving-los", {"duration_s": 6.0}),
     "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
     "ranging-position": ("ranging", {**FEW_RANGES, "tags_m": [(0.0, 0.0, 0.0)]}),
     "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
@@ -48,10 +49,11 @@ CELLS = [
     for name, model in registered_models().items()
     for method, each in METHODS.items()
     if not each.lacks(model) and method != "bound"  # which estimates nothing, see `test_bound`
-    # of 15 components, ten thousand particles leave too few near what sharp fixes say
-    if (name, method) != ("inertial", "particles")
-    # located at one stamp, so that there are no steps; see `test_sound_source`
-    if name != "sound-source"
+    # of 12 and 15 components, ten thousand particles leave too few near what sharp sensors say
+    if (name, method) not in (("inertial", "particles"), ("moving-sights", "particles"))
+    # what is located at one stamp has no steps, and no recorder simulates a unit with a magnetometer:
+    # see `test_sound_source` and `test_attitude`
+    if name not in ("sound-source", "orientation")
 ]
 
 
