@@ -123,16 +123,19 @@ def correct(state: Components, step: Components) -> Components:
     """The state after a correction: turned about the vertical, its velocity with it, then tilted.
 
     An inertial unit does not feel where north is, so that a body that is headed elsewhere, with its
-    velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true.
+    velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true. A
+    velocity that fixes have said is tied to no heading, and turns as far as the step says, from 0 to all.
     Barrau and Bonnabel, The Invariant Extended Kalman Filter as a Stable Observer, IEEE TAC 62(4), 2017,
     on errors that a symmetry of the motion carries along.
     """
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
     ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
     turn = ux * step[6] + uy * step[7] + uz * step[8]
-    # the step holds what the turn makes of the velocity, to first order
-    east, north = vx + step[3] + turn * vy, vy + step[4] - turn * vx
-    cosine, sine = np.cos(turn), np.sin(turn)
+    # the velocity takes part as far as the step has its turn to first order, with the rest left as it is
+    tied = turn * (vx * step[4] - vy * step[3])
+    whole = turn * turn * (vx * vx + vy * vy)
+    swing = turn * np.clip(tied / whole, 0.0, 1.0) if whole > 0.0 else 0.0 * turn
+    cosine, sine = np.cos(swing), np.sin(swing)
     half = np.cos(0.5 * turn), ux * np.sin(0.5 * turn), uy * np.sin(0.5 * turn), uz * np.sin(0.5 * turn)
     tilt = 1.0, 0.5 * (step[6] - turn * ux), 0.5 * (step[7] - turn * uy), 0.5 * (step[8] - turn * uz)
     w, x, y, z = product(product((qw, qx, qy, qz), half), tilt)
@@ -141,8 +144,8 @@ def correct(state: Components, step: Components) -> Components:
         px + step[0],
         py + step[1],
         pz + step[2],
-        cosine * east - sine * north,
-        sine * east + cosine * north,
+        cosine * vx - sine * vy + step[3] + swing * vy,
+        sine * vx + cosine * vy + step[4] - swing * vx,
         vz + step[5],
         w / length,
         x / length,

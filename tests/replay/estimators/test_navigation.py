@@ -195,7 +195,7 @@ def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: Mem
     assert likelihood(lever_y_m=-0.05) - best == pytest.approx(17, abs=5)
     assert best - likelihood(lever_y_m=0.05) == pytest.approx(74, abs=15)
     # without a gate it has turned around by then
-    assert best - likelihood(mounting_yaw_rad=np.pi, gate_probability=0.9999986) > 3000
+    assert best - likelihood(mounting_yaw_rad=np.pi, gate_probability=0.9999986) > 2500
 
 
 # --- simulated runs --------------------------------------------------------------------------------
@@ -240,6 +240,17 @@ def test_a_corrected_heading_leaves_tilt_and_speed_as_they_are():
     assert_allclose(into_body(after[6:10], after[3:6]), into_body(before[6:10], before[3:6]), atol=1e-12)
     turned = Rotation.from_euler("Z", turn).apply(before[3:6])
     assert_allclose(after[3:6], turned, atol=1e-12)
+
+
+def test_a_velocity_turns_only_as_far_as_the_step_has_it():
+    """Where a fix has said how fast a body is, its heading may turn without its velocity."""
+    before = np.array([5.0, 6.0, 7.0, 3.0, -4.0, 1.0, 1.0, *np.zeros(9)])
+    step, more = np.zeros(15), np.array([-0.6, 0.8])
+    step[3:5], step[8] = more, np.radians(40.0)
+    assert_allclose(correct(tuple(before), tuple(step))[3:5], before[3:5] + more)
+    step[3:5] = 0.5 * step[8] * np.array([4.0, 3.0])
+    half = Rotation.from_euler("Z", 0.5 * step[8]).apply(before[3:6])
+    assert_allclose(correct(tuple(before), tuple(step))[3:6], half)
 
 
 @pytest.mark.paper
