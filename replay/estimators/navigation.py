@@ -124,7 +124,7 @@ def correct(state: Components, step: Components) -> Components:
 
     An inertial unit does not feel where north is, so that a body that is headed elsewhere, with its
     velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true. A
-    velocity that fixes have said is tied to no heading, and turns as far as the step says, from 0 to all.
+    velocity that fixes have said is tied to no heading, and turns as far as the step says.
     Barrau and Bonnabel, The Invariant Extended Kalman Filter as a Stable Observer, IEEE TAC 62(4), 2017,
     on errors that a symmetry of the motion carries along.
     """
