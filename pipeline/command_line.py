@@ -38,19 +38,21 @@ class OutputFile(click.Path):
         return path
 
 
-class Seconds(click.FloatRange):
+class Seconds(click.ParamType):
     """A time in seconds that fits the stamps of a log."""
 
     name = "seconds"
 
     def __init__(self, minimum: float = -1e9) -> None:
-        super().__init__(minimum, 1e9)
+        self._minimum = minimum
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number."""
-        seconds = float(super().convert(value, param, ctx))
-        if math.isnan(seconds):
-            self.fail(f"{value} is no number of seconds", param, ctx)
+        seconds = float(click.FLOAT.convert(value, param, ctx))
+        if not self._minimum <= seconds <= 1e9:
+            self.fail(
+                f"{seconds:g} is not between {self._minimum:.0f} and 1000000000 seconds", param, ctx
+            )
         return seconds
 
 
@@ -73,7 +75,7 @@ settings_option = click.option(
     "settings_file",
     type=ANY_PATH,
     metavar="FILE",
-    help="Parameters of estimators from this TOML file, as fuselog tune writes; --set goes over it.",
+    help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides it.",
 )
 set_option = click.option(
     "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
@@ -82,7 +84,7 @@ errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, of one core each."
+    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, each on one core."
 )
 scheduler_option = click.option(
     "--scheduler",
@@ -94,7 +96,7 @@ parameters_option = click.option(
     "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
 )
 recover_option = click.option(
-    "--recover", is_flag=True, help="Read what is whole of a log that was cut off or damaged."
+    "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
 )
 out_log_option = click.option("-o", "--out", type=FILE, required=True, help="The log to write.")
 gap_option = click.option(
@@ -103,25 +105,27 @@ gap_option = click.option(
     type=Seconds(0),
     default=0.2,
     show_default=True,
-    help="Seconds over which truth is interpolated at most.",
+    help="The longest gap over which truth is interpolated.",
 )
 
 
 arrival_option = click.option(
-    "--arrival-order", is_flag=True, help="Go by log time, as the messages arrived."
+    "--arrival-order",
+    is_flag=True,
+    help="Process messages in the order in which they arrived (log time).",
 )
 late_option = click.option(
     "--late",
     metavar="drop|wait:SECONDS|rewind:SECONDS",
-    help="With --arrival-order: go by the stamps at which things were measured all the same, and leave "
-    "out what comes late, wait for it so long, or go back for it so far.",
+    help="With --arrival-order: process measurements in the order of their stamps all the same; drop "
+    "late ones, wait SECONDS for them, or rewind by up to SECONDS to take them in.",
 )
 
 
 foxglove_option = click.option(
     "--foxglove",
     is_flag=True,
-    help="Write messages of Foxglove beside the streams, so that its viewers show them.",
+    help="Also write the messages that Foxglove's viewer shows.",
 )
 
 
@@ -300,14 +304,14 @@ def _say_written(path: Path, messages: int) -> None:
     "-o",
     "--out",
     type=ANY_PATH,
-    help="Where to write LOG.estimates.mcap: a folder, or for one log a name.mcap [default: beside].",
+    help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
 @click.option(
     "--every",
     "every_s",
     type=Seconds(0),
-    help="Give estimates every so many seconds too, not at measurements alone.",
+    help="Give estimates every so many seconds, not only at measurements.",
 )
 @arrival_option
 @late_option
@@ -317,7 +321,7 @@ def _say_written(path: Path, messages: int) -> None:
     "origins",
     multiple=True,
     metavar="truth|ESTIMATES",
-    help="What filters begin with at --start: the log's truth, or the estimates log of an earlier "
+    help="What filters start with at --start: the log's truth, or the estimates log of an earlier "
     "replay (one per log).",
 )
 @click.option(
@@ -325,7 +329,7 @@ def _say_written(path: Path, messages: int) -> None:
     "sigmas",
     multiple=True,
     metavar="COMPONENT=SIGMA",
-    help="How well --start-from truth knows a component (repeatable) [default: as the log's prior].",
+    help="Standard deviation of a component for --start-from truth (repeatable) [default: the prior's].",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
@@ -360,20 +364,20 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
     default="likelihood",
     show_default=True,
-    help="What is best: the largest likelihood, NIS or NEES as they should be, the smallest RMSE.",
+    help="What to optimise: the likelihood, NIS or NEES (nearest to their expectation), or RMSE.",
 )
 @click.option(
     "--bound",
     "bounds",
     multiple=True,
     metavar="NAME=LOW:HIGH",
-    help="Between what a parameter is searched (repeatable) [default: 1e-4 to 1e4 times its start].",
+    help="The bounds of a parameter (repeatable) [default: 1e-4 to 1e4 times its start].",
 )
 @click.option(
     "--grid",
     type=click.IntRange(min=1),
     default=1,
-    help="Start from the best of so many values of each parameter between its bounds.",
+    help="Start the search from the best of N values of each parameter between its bounds.",
 )
 @click.option(
     "--validate",
@@ -386,7 +390,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "--folds",
     type=COUNT,
     default=0,
-    help="Cut the logs into so many parts, and judge by each the others.",
+    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
 )
 @click.option(
     "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
@@ -400,7 +404,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @settings_option
 @set_option
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
-    """Search the parameters of an estimator that explain LOGS best, and say how well the logs tell them.
+    """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
 
     The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
     but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
@@ -437,7 +441,7 @@ def diagnose(log: Path, **options: Any) -> None:
 
 
 @_command(
-    "Say what the measurements of logs tell of a model's state.",
+    "Say how well the measurements of logs determine a model's state.",
     "fuselog observability run.mcap --window 10",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
@@ -446,24 +450,24 @@ def diagnose(log: Path, **options: Any) -> None:
     "--window",
     "window_s",
     type=Seconds(),
-    help="Seconds of measurements to look at in turn [default: the whole run].",
+    help="The length of a window; one follows another [default: the whole run].",
 )
 @click.option(
     "--scale",
     "scales",
     multiple=True,
     metavar="COMPONENT=SIGMA",
-    help="What is worth one, instead of the prior's standard deviation (repeatable).",
+    help="The standard deviation that counts as one, instead of the prior's (repeatable).",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @recover_option
 @json_option
 @set_option
 def observability(logs: tuple[Path, ...], **options: Any) -> None:
-    """Say how much the measurements of LOGS tell of the state, and which direction they tell least of.
+    """Say how well the measurements of LOGS determine the state, and which direction least.
 
     For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
-    trajectory, in units of what the prior tells.
+    trajectory, in units of the prior's information.
     """
     from pipeline.observing import show_observability
 
@@ -478,8 +482,12 @@ def observability(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where ESTIMATES is one as a file.")
-@click.option("--format", type=FORMAT, help="Of a trajectory file [default: its content tells].")
-@click.option("--truth-format", type=FORMAT, help="Of the true one [default: its content tells].")
+@click.option(
+    "--format", type=FORMAT, help="The format of trajectory files [default: found from their content]."
+)
+@click.option(
+    "--truth-format", type=FORMAT, help="The format of the true one [default: found from its content]."
+)
 @click.option(
     "--align",
     type=click.Choice(["none", "yaw", "se2", "se3", "sim3"]),
@@ -640,7 +648,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 )
 @recover_option
 def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
-    """Write one log of LOGS, which have no topic in common: fuselog relabel tells topics apart."""
+    """Write one log of LOGS, which have no topic in common: fuselog relabel renames topics."""
     from pipeline.surgery import merge as merge_logs
 
     offsets_s = {}
@@ -807,7 +815,9 @@ def run(
     help="A parameter and its values, evenly between two ends, or evenly in the logarithm (repeatable).",
 )
 @click.option(
-    "--samples", type=click.IntRange(min=1), help="So many points from the ranges in place of the grid."
+    "--samples",
+    type=click.IntRange(min=1),
+    help="Draw N points from the ranges instead of taking the whole grid.",
 )
 @click.option("--sampling", type=click.Choice(["sobol", "random"]), default="sobol", show_default=True)
 @click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
@@ -850,7 +860,7 @@ def sweep(
     type=click.FloatRange(min=0),
     default=0.02,
     show_default=True,
-    help="Which share of a metric is no matter.",
+    help="The relative difference of a metric that does not matter.",
 )
 @click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
 @click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
@@ -904,7 +914,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 def check(path: Path, golden: Path, **options: Any) -> None:
     """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
 
-    It exits with 1 where something is different, and tells the first difference with its stamp. An
+    It exits with 1 where something is different, and prints the first difference with its stamp. An
     intended change updates the golden in the same commit.
     """
     from pipeline.checking.command import check_path
