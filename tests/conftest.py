@@ -83,31 +83,24 @@ def autoferry(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 @pytest.fixture(scope="session")
 def trajectories(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of TUM and KITTI trajectories and of evo's results, unpacked once."""
-    archive = real_data / "trajectories.tar.xz"
-    if not archive.exists():
-        pytest.skip(f"no {archive}")
-    return _unpacked(archive, tmp_path_factory) / "trajectories"
+    return _unpacked(real_data / "trajectories.tar.xz", tmp_path_factory) / "trajectories"
 
 
 @pytest.fixture(scope="session")
 def navigation(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of GNSS, inertial and UWB recordings, unpacked once."""
-    archive = real_data / "navigation.tar.xz"
-    if not archive.exists():
-        pytest.skip(f"no {archive}")
-    return _unpacked(archive, tmp_path_factory) / "navigation"
+    return _unpacked(real_data / "navigation.tar.xz", tmp_path_factory) / "navigation"
 
 
 @pytest.fixture(scope="session")
 def acoustic(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of opensoundscape's recordings and tables, unpacked once."""
-    archive = real_data / "acoustic.tar.xz"
-    if not archive.exists():
-        pytest.skip(f"no {archive}")
-    return _unpacked(archive, tmp_path_factory) / "acoustic"
+    return _unpacked(real_data / "acoustic.tar.xz", tmp_path_factory) / "acoustic"
 
 
 def _unpacked(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not path.exists():
+        pytest.skip(f"no {path}")
     place = tmp_path_factory.mktemp("data")
     with tarfile.open(path) as archive:
         archive.extractall(place, filter="data")

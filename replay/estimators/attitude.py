@@ -7,24 +7,25 @@ Information Fusion 91, 2023, and its uncertainty is known. The gate keeps out a 
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
-from recorders.log import Stream, schemas
+from recorders.log import Stream
 from recorders.models.inertial import into_body, into_plane, product, rotation
 from recorders.models.planar import Components
 from replay.engine.arrays import Booleans, Floats
 from replay.engine.tangent import Kind
 from replay.estimators.alignment import STANDARD_GRAVITY_MPS2
 from replay.estimators.inertial import triad
-from replay.estimators.navigation import read_inertial
-from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.estimators.navigation import UNIT as CARRIED
+from replay.estimators.orientation import ORIENTATION
+from replay.inference.model import Model, ModelParameters, Motion, Sensor, Start, Started
 
 PERIOD_NS = 1_000_000_000
-ORIENTATION: Mapping[str, Kind] = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}
 VELOCITY: Mapping[str, Kind] = {f"v{axis}_mps": "linear" for axis in "xyz"}
 PLACE: Mapping[str, Kind] = {"field_north_ut": "linear", "field_up_ut": "linear"}
@@ -165,15 +166,7 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(begin_ns, mean, np.diag(sigma**2), "at rest, levelled, north by its magnetometer")
 
 
-UNIT = Control(
-    "inertial",
-    schemas.INERTIAL_SAMPLE,
-    tuple(f"force_{axis}_mps2" for axis in "xyz") + tuple(f"rate_{axis}_radps" for axis in "xyz"),
-    read_inertial,
-    interpolated=True,
-    gap="inertial_gap_s",
-    estimates=True,
-)
+UNIT = replace(CARRIED, delay="", estimates=True)  # its own clock is the only one
 ATTITUDE = Model(
     "orientation of what is carried about with a gyro, an accelerometer and a magnetometer",
     {**ORIENTATION, **BIAS, **VELOCITY, **PLACE},

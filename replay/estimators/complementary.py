@@ -7,7 +7,6 @@ Automatic Control 53(5), 2008; VQF is its authors' library, as it is. Gains and 
 authors' own. Quaternions turn body vectors into east, north, up; each begins with its first sample.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,14 +17,10 @@ from recorders.log import schemas
 from recorders.models.inertial import cross, into_body, into_plane, product
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Integers
-from replay.engine.components import Components
-from replay.engine.estimator import Estimator
-from replay.engine.measurements import Vectors
-from replay.engine.plain import Estimates, Given, Messages, OneRun, Results, batch, each_run, recursive
+from replay.engine.plain import Estimates, Given, Messages, OneRun, Results, batch, each_run
 from replay.estimators.inertial import triad
+from replay.estimators.orientation import FIELDS, ORIENTATION, of_inertial_samples
 
-ORIENTATION: Components = {f"orientation_{part}": "quaternion" for part in "wxyz"}
-FIELDS = ("specific_force_mps2", "turn_rate_radps", "magnetic_field_ut")
 HALF = np.sqrt(0.5)
 
 
@@ -201,23 +196,14 @@ def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
     return Estimates(time_ns, mean, np.tile(parameters.covariance, (len(mean), 1, 1)))
 
 
-def _following(summary: str, parameters: type[Any], follow: Callable[..., None]) -> Estimator[Any]:
-    return recursive(
-        summary,
-        parameters=parameters,
-        streams={"inertial": schemas.INERTIAL_SAMPLE},
-        whole={},
-        components=ORIENTATION,
-        truth="truth",
-        vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},
-        start=start,
-        follow=follow,
-    )
-
-
-MADGWICK = _following("Madgwick's orientation by gradient descent", MadgwickParameters, follow_madgwick)
-MAHONY = _following(
-    "Mahony's complementary filter of orientation and bias", MahonyParameters, follow_mahony
+MADGWICK = of_inertial_samples(
+    "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+)
+MAHONY = of_inertial_samples(
+    "Mahony's complementary filter of orientation and bias",
+    MahonyParameters,
+    start,
+    follow=follow_mahony,
 )
 VQF = batch(
     "VQF of Laidig and Seel, by the package vqf",

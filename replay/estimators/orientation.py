@@ -71,11 +71,15 @@ def _follow_all(
         part[:] = changed
 
 
-def _inertial(
+def of_inertial_samples(
     summary: str,
     parameters: type[Any],
-    start: Callable[[Given[Any]], tuple[tuple[InertialModel, Advance], Any]],
+    start: Callable[[Given[Any]], tuple[Any, Any]],
+    *,
+    follow: Callable[..., None] | None = None,
+    follow_all: Callable[..., None] | None = None,
 ) -> Estimator[Any]:
+    """An estimator of orientation from nine-axis samples; see `replay.engine.plain.recursive`."""
     return recursive(
         summary,
         parameters=parameters,
@@ -85,7 +89,8 @@ def _inertial(
         truth="truth",
         vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},
         start=start,
-        follow_all=_follow_all,
+        follow=follow,
+        follow_all=follow_all,
     )
 
 
@@ -107,16 +112,21 @@ def _start_triad(given: Given[InertialParameters]) -> tuple[tuple[InertialModel,
     return (given.parameters.model, advance), start_reckoning(given.runs)
 
 
-BINGHAM_INERTIAL = _inertial(
+BINGHAM_INERTIAL = of_inertial_samples(
     "recursive Bingham filter of gyro increments and averaged TRIAD attitudes",
     InertialParameters,
     _start_bingham,
+    follow_all=_follow_all,
 )
-GYRO = _inertial(
-    "the gyro alone, from the attitude of the rest at the start on", GyroParameters, _start_gyro
+GYRO = of_inertial_samples(
+    "the gyro alone, from the attitude of the rest at the start on",
+    GyroParameters,
+    _start_gyro,
+    follow_all=_follow_all,
 )
-TRIAD = _inertial(
+TRIAD = of_inertial_samples(
     "the TRIAD attitude of every sample's accelerometer and magnetometer",
     InertialParameters,
     _start_triad,
+    follow_all=_follow_all,
 )

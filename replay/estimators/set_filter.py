@@ -52,6 +52,7 @@ from replay.estimators.set_membership import (
     frames,
     known_of,
     polygons,
+    set_metadata,
     set_streams,
 )
 
@@ -296,12 +297,8 @@ def solve(
 ) -> list[Ragged]:
     """A set at every frame of every run; see `replay.engine.estimator.Batch`."""
     metadata = {
-        "components": "x_m,y_m",
-        "kinds": "linear,linear",
-        "truth": truth,
-        "measured": topic,
+        **set_metadata(topic, truth, known),
         "odometry": odometry,
-        **known.metadata(),
         **dict(
             zip(STATED, map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad)), strict=True)
         ),

@@ -165,13 +165,7 @@ def solve(
     parameters: SetParameters,
 ) -> list[Ragged]:
     """A set for every frame of every run; see `replay.engine.estimator.Batch`."""
-    metadata = {
-        "components": "x_m,y_m",
-        "kinds": "linear,linear",
-        "truth": truth,
-        "measured": topic,
-        **known.metadata(),
-    }
+    metadata = set_metadata(topic, truth, known)
     landmarks, seen = whole["/landmarks"], whole[topic]
     solved = []
     for run in range(seen.runs):
@@ -186,6 +180,17 @@ def solve(
         prefix, rings_of = f"/estimates/{name}", [(frame.time_ns, border) for frame, border in borders]
         solved.append((*set_streams(prefix, metadata, rings_of), fault_stream(prefix, blamed)))
     return [gather(streams) for streams in zip(*solved, strict=True)]
+
+
+def set_metadata(topic: str, truth: str, known: Known) -> dict[str, str]:
+    """What sets say of themselves: of which components, beside which truth, from which frames."""
+    return {
+        "components": "x_m,y_m",
+        "kinds": "linear,linear",
+        "truth": truth,
+        "measured": topic,
+        **known.metadata(),
+    }
 
 
 def set_streams(
