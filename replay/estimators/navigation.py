@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.log import Stream, schemas
-from recorders.models.inertial import cross, into_body, into_plane, product, strapdown
+from recorders.models.inertial import cross, into_plane, strapdown
 from recorders.models.planar import Components
 from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats
@@ -21,6 +21,7 @@ from replay.engine.components import components_of
 from replay.engine.tangent import Kind
 from replay.estimators.alignment import AlignmentParameters, align, specific_force, suspect, turn_rate
 from replay.estimators.navigation_sensors import carried_sensors
+from replay.estimators.turning import WITH_HEADING
 from replay.inference.model import Control, Model, Motion, Sensor, Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
@@ -119,47 +120,6 @@ def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
     return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
 
 
-def correct(state: Components, step: Components) -> Components:
-    """The state after a correction: turned about the vertical, its velocity with it, then tilted.
-
-    An inertial unit does not feel where north is, so that a body that is headed elsewhere, with its
-    velocity, is as well explained by all samples: what they say of tilt, biases and speed stays true. A
-    velocity that fixes have said is tied to no heading, and turns as far as the step says.
-    Barrau and Bonnabel, The Invariant Extended Kalman Filter as a Stable Observer, IEEE TAC 62(4), 2017,
-    on errors that a symmetry of the motion carries along.
-    """
-    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
-    ux, uy, uz = into_body((qw, qx, qy, qz), (0.0, 0.0, 1.0))
-    turn = ux * step[6] + uy * step[7] + uz * step[8]
-    # the velocity takes part as far as the step has its turn to first order, with the rest left as it is
-    tied = turn * (vx * step[4] - vy * step[3])
-    whole = turn * turn * (vx * vx + vy * vy)
-    swing = turn * np.clip(tied / whole, 0.0, 1.0) if whole > 0.0 else 0.0 * turn
-    cosine, sine = np.cos(swing), np.sin(swing)
-    half = np.cos(0.5 * turn), ux * np.sin(0.5 * turn), uy * np.sin(0.5 * turn), uz * np.sin(0.5 * turn)
-    tilt = 1.0, 0.5 * (step[6] - turn * ux), 0.5 * (step[7] - turn * uy), 0.5 * (step[8] - turn * uz)
-    w, x, y, z = product(product((qw, qx, qy, qz), half), tilt)
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    return (
-        px + step[0],
-        py + step[1],
-        pz + step[2],
-        cosine * vx - sine * vy + step[3] + swing * vy,
-        sine * vx + cosine * vy + step[4] - swing * vx,
-        vz + step[5],
-        w / length,
-        x / length,
-        y / length,
-        z / length,
-        gx + step[9],
-        gy + step[10],
-        gz + step[11],
-        bx + step[12],
-        by + step[13],
-        bz + step[14],
-    )
-
-
 def position(state: Components, about: Any, parameters: Any) -> Components:
     """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
@@ -240,6 +200,6 @@ INERTIAL = Model(
     Motion(move, move_noise, lost=lost),
     control=UNIT,
     start=Start({}, HANDHELD, find=align, suspect=suspect),
-    correct=correct,
+    correct=WITH_HEADING,
     estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

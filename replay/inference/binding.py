@@ -23,7 +23,7 @@ from replay.inference.model import (
     Model,
     ModelParameters,
     Sensor,
-    check_correct,
+    check_correction,
     check_motion,
     check_sensor,
     check_state,
@@ -374,7 +374,7 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
     """The parameters that motion and sensors read; BadInput where the model is not what it says."""
     model, values = stage.model, dict(given)
     check_state(where, model)
-    check_correct(where, model)
+    check_correction(where, model)
     motion, *sensors = recorders = [Recorder(values) for _ in range(1 + len(stage.sensors))]
     for each in stage.modes or (stage.motion,):
         check_motion(where, model, each, motion)

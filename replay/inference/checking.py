@@ -28,10 +28,11 @@ from replay.inference.generate import (
     things,
 )
 from replay.inference.model import (
+    Correction,
     Model,
     Motion,
     Sensor,
-    check_correct,
+    check_correction,
     check_motion,
     check_sensor,
     check_state,
@@ -98,7 +99,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
-        check_correct("check_model", model)
+        check_correction("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
         if model.modes and model.switching:
@@ -123,7 +124,7 @@ def check_model(
             _check_twins(call, tried, rng)
         if model.correct is not None:
             for state in tried:
-                _check_small_steps(model.correct, model, state)
+                _check_correction(model.correct, model, state, rng)
         for index, name in enumerate(model.state):
             _check_period(name, index, model, calls, tried)
         for motion in motions.values():
@@ -209,14 +210,25 @@ def _check_derivatives(
     return np.array(work.state)
 
 
-def _check_small_steps(correct: Function, model: Model, state: Floats) -> None:
-    """A small correction moves every component by itself."""
-    for column, name in enumerate(_tangent(model.state)):
-        small = STEP * np.eye(model.tangent)[column]
-        end, start = (np.array(correct(tuple(state), tuple(step))) for step in (small, -small))
-        slopes = _difference(end, start, model.kinds) / (2.0 * STEP)
-        if not np.allclose(slopes, small / STEP, atol=1e-6):
-            raise AssertionError(f"{_place(correct)}: a small step of {name} moves other components too")
+def _check_correction(
+    correct: Correction, model: Model, state: Floats, rng: np.random.Generator
+) -> None:
+    """A small correction moves every component by itself, and a step back is found again."""
+    at, slope = tuple(state), rng.normal(size=model.tangent)
+    slope /= np.dot(slope, correct.along(at))
+    for moved in (correct.move, correct.back):
+        for column, name in enumerate(_tangent(model.state)):
+            small = STEP * np.eye(model.tangent)[column]
+            end, start = (np.array(moved(at, tuple(step), slope)) for step in (small, -small))
+            slopes = _difference(end, start, model.kinds) / (2.0 * STEP)
+            if not np.allclose(slopes, small / STEP, atol=1e-6):
+                place = _place(moved)
+                raise AssertionError(f"{place}: a small step of {name} moves other components too")
+    step = 0.3 * rng.normal(size=model.tangent)
+    again = correct.step(at, correct.back(at, tuple(step), slope), slope)
+    if not np.allclose(again, step, atol=1e-9):
+        both = f"{_place(correct.step)} does not find the step of {_place(correct.back)}"
+        raise AssertionError(both)
 
 
 def _check_by_hand(

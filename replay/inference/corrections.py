@@ -1,8 +1,9 @@
 """How an update moves a state by a step of its tangent space, and what becomes of the covariance.
 
-Components move by themselves (`generate.retraction`), unless the model says that they move together
-(`Model.correct`). Either way the covariance is carried from the tangent space of the old mean to that of
-the new one, by the derivative of the moved state by the step.
+Components move by themselves (`generate.retraction`), unless a model says how they bend together
+(`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
+of the new one by the derivative of the moved state by the step, and the other way by that of the step by
+the state to which it leads.
 """
 
 from typing import Any
@@ -12,23 +13,55 @@ from replay.inference.gaussian import moved_covariance
 from replay.inference.generate import (
     Input,
     derivative,
+    differencing,
     filling,
     function_of,
     is_flat,
     resetting,
     retraction,
+    tangent_size,
     tuple_of,
 )
-from replay.inference.model import Model
+from replay.inference.model import Correction, Model
+
+Kinds = tuple[str, ...]
 
 
-def correcting(model: Model) -> Function:
+def sloping(kinds: Kinds, correct: Correction | None) -> Function:
+    """`fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
+
+    Where nothing bends it is left as it is.
+    """
+    if correct is None:
+
+        def leave(mean: Floats, covariance: Floats, slope: Floats) -> None:
+            pass
+
+        return leave
+    along, read_state, t = correct.along, tuple_of(len(kinds)), tangent_size(kinds)
+
+    def fill(mean: Floats, covariance: Floats, slope: Floats) -> None:
+        direction, variance = along(read_state(mean)), 0.0
+        for row in range(t):
+            slope[row] = 0.0
+            for column in range(t):
+                slope[row] += covariance[row, column] * direction[column]
+            variance += direction[row] * slope[row]
+        for row in range(t):
+            slope[row] = slope[row] / variance if variance > 0.0 else 0.0
+
+    return fill
+
+
+def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) -> Function:
     """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
-    Where components move together it uses the workspace's `state`, `transition` and `product`.
+    Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
+    `product`. With `back` it is a step of a smoother's way back.
     """
-    if model.correct is not None:
-        step_together, fill = _stepping(model, model.correct), filling(model.size)
+    if correct is not None:
+        step_together = _stepping(kinds, correct.back if back else correct.move)
+        fill = filling(len(kinds))
 
         def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
             step_together(mean, work)
@@ -36,14 +69,13 @@ def correcting(model: Model) -> Function:
             moved_covariance(covariance, work.transition, work.product)
 
         return move_together
-    add = retraction(model.kinds)
-    if is_flat(model.kinds):
+    add, reset = retraction(kinds), resetting(kinds)
+    if is_flat(kinds):
 
         def move(mean: Floats, covariance: Floats, work: Any) -> None:
             add(mean, work.step)
 
         return move
-    reset = resetting(model.kinds)
 
     def move_and_turn(mean: Floats, covariance: Floats, work: Any) -> None:
         add(mean, work.step)
@@ -51,6 +83,45 @@ def correcting(model: Model) -> Function:
         reset(work.step, covariance.T)
 
     return move_and_turn
+
+
+def comparing(kinds: Kinds, correct: Correction | None) -> Function:
+    """`compare(origin, mean, covariance, work)`: the step that `correcting` takes back, found again.
+
+    Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
+    from the mean's tangent space to the origin's.
+    """
+    if correct is not None:
+        t, read_state = tangent_size(kinds), tuple_of(len(kinds))
+        read_slope = tuple_of(t)
+        inputs = [
+            Input("origin", kinds),
+            Input("target", kinds, "transition"),
+            Input("slope", ("linear",) * t),
+        ]
+        linearise = derivative(correct.step, inputs, ("linear",) * t, (), "step")
+
+        def compare_together(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+            linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
+            for row in range(t):
+                work.change[0, row] = work.step[row]
+            moved_covariance(covariance, work.transition, work.product)
+
+        return compare_together
+    subtract, reset_back = differencing(kinds), resetting(kinds, back=True)
+    if is_flat(kinds):
+
+        def compare(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+            subtract(mean, origin, work.change, 0)
+
+        return compare
+
+    def compare_and_turn(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+        subtract(mean, origin, work.change, 0)
+        reset_back(work.change[0], covariance)
+        reset_back(work.change[0], covariance.T)
+
+    return compare_and_turn
 
 
 def relinearising(model: Model) -> tuple[Function, Function]:
@@ -72,7 +143,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
                 for column in range(t):
                     rows[i, column] = work.turned[column]
 
-        return _stepping(model, model.correct), chain_together
+        return _stepping(model.kinds, model.correct.move), chain_together
     fill, add, flat = filling(model.size), retraction(model.kinds), is_flat(model.kinds)
     turn = resetting(model.kinds)
 
@@ -89,33 +160,43 @@ def relinearising(model: Model) -> tuple[Function, Function]:
     return step_to, chain
 
 
-def _stepping(model: Model, correct: Function) -> Function:
+def _stepping(kinds: Kinds, move: Function) -> Function:
     """`step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
-    inputs = [
-        Input("state", model.kinds),
-        Input("step", ("linear",) * model.tangent, "transition"),
-    ]
-    linearise = derivative(correct, inputs, model.kinds, (), "state")
-    read_state, read_step = tuple_of(model.size), tuple_of(model.tangent)
+    straight = ("linear",) * tangent_size(kinds)
+    inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
+    linearise = derivative(move, inputs, kinds, (), "state")
+    read_state, read_step = tuple_of(len(kinds)), tuple_of(len(straight))
 
     def step_to(mean: Floats, work: Any) -> None:
-        linearise(read_state(mean), read_step(work.step), work)
+        linearise(read_state(mean), read_step(work.step), read_step(work.slope), work)
 
     return step_to
 
 
-def correcting_more(model: Model, more: int) -> Function | None:
-    """The `correct` of a model whose state gets so many more components, which move by themselves."""
+def correcting_more(model: Model, more: int) -> Correction | None:
+    """How a model is corrected whose state gets so many more components, which move by themselves."""
     if model.correct is None:
         return None
     n, t = model.size, model.tangent
-    entries = [f"moved[{each}]" for each in range(n)]
-    entries += [f"state[{n + each}] + step[{t + each}]" for each in range(more)]
-    return function_of(
-        "def correct(state, step):\n"
-        "    moved = inner(first(state), first_step(step))\n"
-        f"    return ({', '.join(entries)})\n",
-        inner=model.correct,
-        first=tuple_of(n),
-        first_step=tuple_of(t),
+    first, first_step = tuple_of(n), tuple_of(t)
+
+    def longer(text: str, entries: list[str], inner: Function) -> Function:
+        body = f"    return ({', '.join(entries)})\n"
+        return function_of(text + body, inner=inner, first=first, first_step=first_step)
+
+    moved = [f"moved[{each}]" for each in range(n)]
+    moved += [f"state[{n + each}] + step[{t + each}]" for each in range(more)]
+    move = "def move(state, step, slope):\n"
+    move += "    moved = inner(first(state), first_step(step), first_step(slope))\n"
+    found = [f"step[{each}]" for each in range(t)]
+    found += [f"target[{n + each}] - state[{n + each}]" for each in range(more)]
+    find = "def step_to(state, target, slope):\n"
+    find += "    step = inner(first(state), first(target), first_step(slope))\n"
+    ahead = [f"found[{each}]" for each in range(t)] + ["0.0"] * more
+    correct = model.correct
+    return Correction(
+        longer("def along(state):\n    found = inner(first(state))\n", ahead, correct.along),
+        longer(move, moved, correct.move),
+        longer(find, found, correct.step),
+        longer(move, moved, correct.back),
     )

@@ -18,7 +18,7 @@ from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
 from replay.inference.binding import trial_parameters
-from replay.inference.corrections import correcting, relinearising
+from replay.inference.corrections import correcting, relinearising, sloping
 from replay.inference.gaussian import (
     kalman_step,
     keep_measured,
@@ -143,7 +143,8 @@ def iterated_update(stage: Stage, number: int) -> Function:
     n, t, m = model.size, model.tangent, len(sensor.measured)
     read_state, read_about = tuple_of(n), reading(sensor).about
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    tell, correct = noting(stage, number), correcting(model)
+    tell, correct = noting(stage, number), correcting(model.kinds, model.correct)
+    find_slope = sloping(model.kinds, model.correct)
     step_to, chain = relinearising(model)
 
     def relinearise(
@@ -175,6 +176,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
         if present == 0:
             return NOTHING_MEASURED
         innovation, step, factor = work.innovations[number], work.step, 1.0
+        find_slope(mean, covariance, work.slope)
         for row in range(t):
             step[row] = 0.0
         for iteration in range(ITERATIONS):

@@ -289,6 +289,28 @@ class Started(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Correction:
+    """How a state is corrected where one direction of its error, such as a heading, bends all others.
+
+    A belief that is wide in that direction is no ellipsoid: given how far the state is off along it, the
+    mean of the rest moves on a curve. `slope` (t,) is the tangent there, P d / d' P d with the
+    covariance P and the direction d. Small steps move every component by itself: the derivative of the
+    moved state at zero is the unit matrix.
+
+    Attributes:
+        along: state -> d (t,).
+        move: (state, step, slope) -> the state after an update's step (t,) of its tangent space.
+        step: (state, target, slope) -> the step that `back` takes from the state to the target.
+        back: (state, step, slope) -> the state after a step of a smoother's way back.
+    """
+
+    along: Function
+    move: Function
+    step: Function
+    back: Function
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """A model of one kind of thing; a log may hold several of them, each under its own prefix.
 
@@ -308,9 +330,7 @@ class Model:
         needs_sensor: whether a log without any of its sensors does not fit.
         start: what is assumed of a log without the prior; None where that does not fit.
         takes_fixes: whether position fixes are sensors of it.
-        correct: (state, step) -> state, how an update moves the state by a step of its tangent space,
-            where not every component moves by itself, as small steps must: the derivative at zero is the
-            unit matrix. It says along which curves a belief is Gaussian, which matters where it is wide.
+        correct: how an update moves the state where not every component moves by itself.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         estimable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.augmentation`: those that motion and sensors read, and no noise.
@@ -359,7 +379,7 @@ class Model:
     needs_sensor: bool = True
     estimable: Components = field(default_factory=dict)
     start: Start | None = None
-    correct: Function | None = None
+    correct: Correction | None = None
     takes_fixes: bool = True
     by_name: bool = False
 
@@ -433,11 +453,14 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
 
-def check_correct(where: str, model: Model) -> None:
-    """Call how a model corrects its state once, uncompiled; see `check_motion`."""
+def check_correction(where: str, model: Model) -> None:
+    """Call the functions of how a model is corrected once, uncompiled; see `check_motion`."""
     if model.correct is not None:
-        arguments = trial_state(model.kinds), (0.0,) * model.tangent
-        _check(where, model.correct, arguments, (model.size,))
+        state, error = trial_state(model.kinds), (0.0,) * model.tangent
+        _check(where, model.correct.along, (state,), (model.tangent,))
+        for moved in (model.correct.move, model.correct.back):
+            _check(where, moved, (state, error, error), (model.size,))
+        _check(where, model.correct.step, (state, state, error), (model.tangent,))
 
 
 def check_switching(where: str, model: Model, parameters: Any) -> None:

@@ -27,7 +27,7 @@ from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.components import Components
 from replay.inference.association import Memory as AssociationMemory
 from replay.inference.association import Weights, memory_for
-from replay.inference.corrections import correcting
+from replay.inference.corrections import correcting, sloping
 from replay.inference.gaussian import Innovation, kalman_step, whiten, wrap
 from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
@@ -332,7 +332,8 @@ def comparing(kind: ScanSensor) -> Function:
 
 def updating(model: Model, kind: ScanSensor) -> Function:
     """`update(track, mode, detections, mean, covariance, memory)`: by the associations in the mode."""
-    m, correct = len(kind.measured), correcting(model)
+    m, correct = len(kind.measured), correcting(model.kinds, model.correct)
+    find_slope = sloping(model.kinds, model.correct)
 
     def update(
         track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: Memory
@@ -354,6 +355,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
             for j in range(m):
                 moment[i, j] += shift[i] * shift[j]
         gain = memory.cross[track, mode]
+        find_slope(mean, covariance, memory.step.slope)
         for row in range(len(covariance)):
             step[row] = 0.0
             for i in range(m):

@@ -138,15 +138,17 @@ class Smoother(Filter):
         state = super().start(whole)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
-        chain = Chain(mean, covariance, mean.copy(), gain, rest, np.zeros(len(mean), np.int64))
+        slope, none = np.zeros(covariance.shape[:2]), np.zeros(len(mean), np.int64)
+        chain = Chain(mean, covariance, mean.copy(), slope, gain, rest, none)
         return state._replace(carried=state.carried._replace(belief=chain), kept=())
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, noted, slots)
         end, times, mean, covariance = estimates
+        predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
         gain, rest = (np.empty_like(covariance) for _ in range(2))
-        return Nodes(end, times, mean, covariance, np.empty_like(mean), gain, rest), innovations
+        return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
     def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
@@ -217,7 +219,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            going_back(model.kinds)(runs, *arguments, scratch=memory)
+            going_back(model.kinds, model.correct)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 

@@ -7,8 +7,8 @@ prediction (m-, P-) and D, the covariance of the state before with the state aft
     G = D P-^-1,  ms_k = m_k (+) G (ms_(k+1) (-) m-),  Ps_k = (P_k - G D') + G Ps_(k+1) G'
 
 with the derivative's D for extended filters and that of the samples for the others. Several predictions
-between two nodes are one such step: their G multiply. On a manifold covariances are carried from the
-tangent space of one mean to that of another by the right Jacobian.
+between two nodes are one such step: their G multiply. Where the state is no vector, (+) and (-) and the
+tangent spaces of the covariances are those of `replay.inference.corrections`.
 
 Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
 """
@@ -20,8 +20,10 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
+from replay.inference.corrections import Kinds, comparing, correcting, sloping
 from replay.inference.gaussian import copy_gaussian, moved_covariance, multiply, semidefinite_cholesky
-from replay.inference.generate import differencing, is_flat, resetting, retraction
+from replay.inference.generate import tangent_size
+from replay.inference.model import Correction
 from replay.inference.recursion import Estimates
 from replay.inference.steps import Note, Stage, Steps
 
@@ -36,7 +38,8 @@ class Chain(NamedTuple):
 
     Attributes:
         mean, covariance: the filter's, (runs, n) and (runs, t, t).
-        predicted: (runs, n) the last prediction, before it was corrected.
+        predicted, slope: (runs, n) the last prediction, before it was corrected, and (runs, t) its
+            tangent, see `replay.inference.model.Correction`.
         gain, rest: (runs, t, t) G and P - G D' of the predictions since the last node.
         predictions: (runs,) how many these are.
     """
@@ -44,6 +47,7 @@ class Chain(NamedTuple):
     mean: Floats
     covariance: Floats
     predicted: Floats
+    slope: Floats
     gain: Floats
     rest: Floats
     predictions: Integers
@@ -57,6 +61,7 @@ class Nodes(NamedTuple):
     mean: Floats
     covariance: Floats
     predicted: Floats
+    slope: Floats
     gain: Floats
     rest: Floats
 
@@ -73,8 +78,8 @@ class ForwardMemory(NamedTuple):
 
 def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
     """The steps of a filter that leaves nodes; its `predict` fills `Workspace.product`."""
-    t = stage.model.tangent
-    predict_filter = steps.predict
+    model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
+    find_slope = sloping(model.kinds, model.correct)
 
     def predict(
         run: int,
@@ -106,6 +111,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
                 rest[row, column] = rest[column, row] = entry
         lengthen(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
         belief.predictions[run] += 1
+        find_slope(mean, covariance, belief.slope[run])
         for row in range(len(mean)):
             belief.predicted[run, row] = mean[row]
         return True
@@ -118,6 +124,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
             nodes.predicted[row, i] = belief.predicted[run, i]
             belief.predicted[run, i] = mean[i]
         for i in range(t):
+            nodes.slope[row, i] = belief.slope[run, i]
             for j in range(t):
                 unit = 1.0 if i == j else 0.0
                 nodes.gain[row, i, j] = unit if still else belief.gain[run, i, j]
@@ -196,63 +203,56 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
 
 
 class Later(NamedTuple):
-    """The first node of the piece behind this one, smoothed, and how it came from the last node here.
-
-    First axis = run; `is_there` says in which runs there is one.
-    """
+    """The node behind a piece: in which runs there is one, and these, smoothed, a row for each run."""
 
     is_there: Integers
-    mean: Floats
-    covariance: Floats
-    predicted: Floats
-    gain: Floats
-    rest: Floats
+    nodes: Nodes
 
 
 class BackMemory(NamedTuple):
-    """What the way back of one core works in: a Gaussian, what carries it, and a step's matrices."""
+    """What the way back of one core works in: a Gaussian, what carries it, and a step's vectors."""
 
     mean: Floats
     covariance: Floats
     product: Floats
-    change: Floats
-    step: Floats
     rest: Floats
+    change: Floats
+    state: Floats
+    transition: Floats
+    step: Floats
+    slope: Floats
 
 
 @lru_cache(maxsize=64)
-def going_back(kinds: tuple[str, ...]) -> Function:
+def going_back(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The same over all runs, compiled; see `way_back`."""
-    return compile_over_runs(way_back(kinds), allocates=False)
+    return compile_over_runs(way_back(kinds, correct), allocates=False)
 
 
-def way_back(kinds: tuple[str, ...]) -> Function:
+def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The loop over the nodes of one run, from its last to its first."""
-    add, subtract, flat = retraction(kinds), differencing(kinds), is_flat(kinds)
-    reset, reset_back = resetting(kinds), resetting(kinds, back=True)
+    move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
+    find_slope, t = sloping(kinds, correct), tangent_size(kinds)
 
-    def go_back(mean: Floats, predicted: Floats, gain: Floats, rest: Floats, work: BackMemory) -> None:
-        """Move the Gaussian of `work` to the node before, whose filtered mean is `mean`."""
-        change, step, covariance = work.change[0], work.step, work.covariance
-        subtract(work.mean, predicted, work.change, 0)
-        for row in range(len(step)):
+    def go_back(mean: Floats, covariance: Floats, nodes: Nodes, node: int, work: BackMemory) -> None:
+        """Move the Gaussian of `work` from a node to the one before, whose filtered one is given."""
+        gain, rest, step, change = nodes.gain[node], nodes.rest[node], work.step, work.change[0]
+        for row in range(t):
+            work.slope[row] = nodes.slope[node, row]
+        compare(nodes.predicted[node], work.mean, work.covariance, work)
+        for row in range(t):
             entry = 0.0
-            for k in range(len(step)):
+            for k in range(t):
                 entry += gain[row, k] * change[k]
             step[row] = entry
-        if not flat:
-            reset_back(change, covariance)
-            reset_back(change, covariance.T)
-        moved_covariance(covariance, gain, work.product)
-        for row in range(len(step)):
-            for column in range(len(step)):
-                covariance[row, column] += rest[row, column]
+        moved_covariance(work.covariance, gain, work.product)
+        for row in range(t):
+            for column in range(t):
+                work.covariance[row, column] += rest[row, column]
+        find_slope(mean, covariance, work.slope)
         for row in range(len(mean)):
             work.mean[row] = mean[row]
-        add(work.mean, step)
-        if not flat:
-            reset(step, covariance)
-            reset(step, covariance.T)
+        move(work.mean, work.covariance, work)
 
     def smooth(
         run: int,
@@ -278,31 +278,34 @@ def way_back(kinds: tuple[str, ...]) -> Function:
                 at = reached = through
                 copy_gaussian(nodes.mean[at], nodes.covariance[at], work.mean, work.covariance)
                 if later.is_there[run]:
-                    copy_gaussian(later.mean[run], later.covariance[run], work.mean, work.covariance)
-                    go_back(nodes.mean[at], later.predicted[run], later.gain[run], later.rest[run], work)
+                    behind = later.nodes
+                    copy_gaussian(behind.mean[run], behind.covariance[run], work.mean, work.covariance)
+                    go_back(nodes.mean[at], nodes.covariance[at], behind, run, work)
             while at > row:
-                go_back(nodes.mean[at - 1], nodes.predicted[at], nodes.gain[at], nodes.rest[at], work)
+                go_back(nodes.mean[at - 1], nodes.covariance[at - 1], nodes, at, work)
                 at -= 1
             place = start[run] + row - begin
             smoothed.time_ns[place] = nodes.time_ns[row]
             copy_gaussian(work.mean, work.covariance, smoothed.mean[place], smoothed.covariance[place])
         if stop[run] > begin:
             later.is_there[run] = True
-            copy_gaussian(work.mean, work.covariance, later.mean[run], later.covariance[run])
-            predicted, gain, rest = nodes.predicted[begin], nodes.gain[begin], nodes.rest[begin]
-            copy_gaussian(predicted, gain, later.predicted[run], later.gain[run])
-            copy_gaussian(predicted, rest, later.predicted[run], later.rest[run])
+            first = later.nodes
+            copy_gaussian(work.mean, work.covariance, first.mean[run], first.covariance[run])
+            copy_gaussian(
+                nodes.predicted[begin], nodes.gain[begin], first.predicted[run], first.gain[run]
+            )
+            copy_gaussian(nodes.slope[begin], nodes.rest[begin], first.slope[run], first.rest[run])
 
     return smooth
 
 
 def no_later(runs: int, n: int, t: int) -> Later:
     """Where nothing lies behind a piece, for so many runs of states with n components; see `Later`."""
-    wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t, t), (t, t)))
-    return Later(np.zeros(runs, bool), *wide)
+    wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t,), (t, t), (t, t)))
+    return Later(np.zeros(runs, bool), Nodes(np.arange(runs), np.empty(runs, np.int64), *wide))
 
 
 def back_memory(n: int, t: int) -> BackMemory:
     """Memory for the way back of states with n components, and t in the tangent space."""
-    shapes = ((n,), (t, t), (t, t), (1, t), (t,), (t, t))
+    shapes = (n,), (t, t), (t, t), (t, t), (1, t), (n,), (t, t), (t,), (t,)
     return BackMemory(*(np.empty(shape) for shape in shapes))

@@ -13,7 +13,7 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
-from replay.inference.corrections import correcting
+from replay.inference.corrections import correcting, sloping
 from replay.inference.gaussian import (
     LOG_TWO_PI,
     Innovation,
@@ -115,7 +115,7 @@ class Workspace(NamedTuple):
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
-        step, turned: (t,), the correction of the state.
+        step, turned, slope: (t,), the correction of the state, and along what it bends.
         innovations: one for each sensor.
         samples: what `replay.inference.regression` works in, motion first, one for each of `sampled`.
     """
@@ -131,6 +131,7 @@ class Workspace(NamedTuple):
     predicted: Floats
     step: Floats
     turned: Floats
+    slope: Floats
     innovations: tuple[Innovation, ...]
     samples: tuple[Any, ...]
 
@@ -152,6 +153,7 @@ def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
         predicted=np.empty(m),
         step=np.empty(t),
         turned=np.empty(t),
+        slope=np.zeros(t),
         innovations=tuple(no_innovation(t, len(sensor.measured)) for sensor in stage.sensors)
         or (no_innovation(t, 0),),
         samples=samples or ((np.empty(0),),),
@@ -518,11 +520,9 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
     in may still count less, see `gaussian.widening`.
     """
-    m, tell, correct = (
-        len(stage.sensors[number].measured),
-        noting(stage, number),
-        correcting(stage.model),
-    )
+    model, m, tell = stage.model, len(stage.sensors[number].measured), noting(stage, number)
+    find_slope = sloping(model.kinds, model.correct)
+    correct = correcting(model.kinds, model.correct)
 
     def update(
         mean: Floats,
@@ -553,6 +553,7 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
             widen(innovation, size, factor)
             kalman_step(innovation, size, work.step)
             reduce_covariance(covariance, innovation.cross_covariance, size)
+            find_slope(mean, covariance, work.slope)
             correct(mean, covariance, work)
         note_numbers(note, squared, determinant, size, accepted, factor)
         return ALL_WELL

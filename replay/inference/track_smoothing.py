@@ -57,6 +57,7 @@ def _nodes(
         mean=mean,
         covariance=covariance,
         predicted=np.einsum("nij,nj->ni", transition, before),
+        slope=np.zeros_like(mean),
         gain=gain,
         rest=spread - gain @ cross.transpose(0, 2, 1),
     )

@@ -19,7 +19,8 @@ from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import difference
 from replay.estimators.alignment import align
-from replay.estimators.navigation import INERTIAL, NavigationParameters, correct
+from replay.estimators.navigation import INERTIAL, NavigationParameters
+from replay.estimators.turning import move, move_back
 from replay.inference.checking import check_model
 from tests.replay.inference.replays import outputs
 
@@ -184,18 +185,19 @@ def test_the_walk_is_aligned_as_the_sheet_says(walk: MemorySource):
 
 @pytest.mark.paper
 def test_the_likelihood_knows_the_lag_of_the_velocity_and_the_mounting(walk: MemorySource):
-    def likelihood(**settings: float) -> float:
+    def likelihood(since_s: float = 20.7, **settings: float) -> float:
         asked = {**SETTINGS, "gate_probability": 1.0, **settings}
         stream = outputs(INERTIAL, "ekf", [walk], **asked)["innovation"].stream
-        late = stream.publish_time_ns > walk.epoch_ns + 20.7e9
+        late = stream.publish_time_ns > walk.epoch_ns + since_s * 1e9
         return float(stream["log_likelihood"][late].sum())
 
     best = likelihood()
     assert best - likelihood(velocity_delay_s=-0.125) == pytest.approx(1683, rel=0.03)
     assert likelihood(lever_y_m=-0.05) - best == pytest.approx(17, abs=5)
     assert best - likelihood(lever_y_m=0.05) == pytest.approx(74, abs=15)
-    # without a gate it has turned around by then
-    assert best - likelihood(mounting_yaw_rad=np.pi, gate_probability=0.9999986) > 2500
+    # a heading that is off by 180 deg, as it then is, is found while the body sets off
+    assert likelihood(0.0) - likelihood(0.0, mounting_yaw_rad=np.pi) > 250
+    assert best - likelihood(mounting_yaw_rad=np.pi) < 100
 
 
 # --- simulated runs --------------------------------------------------------------------------------
@@ -228,33 +230,36 @@ def test_the_error_of_all_15_states_is_what_the_covariance_says(method: str):
     assert mean.mean() == pytest.approx(15.0, abs=1.0)
 
 
-def test_a_corrected_heading_leaves_tilt_and_speed_as_they_are():
-    """A step of 40 deg about up, and what that makes of the velocity to first order."""
+@pytest.mark.paper
+@pytest.mark.parametrize("method", ["ekf", "smoother"])
+def test_from_a_heading_off_by_20_deg_errors_are_as_those_from_one_that_is_known(method: str):
+    """Where each component is corrected by itself, the mean NEES of the filter is above 20."""
+    nees, _ = aligned_nees(method, prior={"heading_sigma_rad": np.radians(20.0)})
+    assert nees.mean() == pytest.approx(15.0, abs=1.0)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_heading_that_only_the_samples_tie_turns_all_that_they_say(back: bool):
+    """The velocity's tangent is that of all its turn: a step of 40 deg turns it, and leaves the tilt."""
     before = np.array([5.0, 6.0, 7.0, 3.0, -4.0, 1.0, *np.zeros(10)])
     before[6:10] = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_quat(scalar_first=True)
-    up, step = np.array(into_body(before[6:10], (0.0, 0.0, 1.0))), np.zeros(15)
-    turn = np.radians(40.0)
-    step[3:5], step[6:9] = turn * np.array([4.0, 3.0]), turn * up
-    after = np.array(correct(tuple(before), tuple(step)))
+    up, slope, turn = into_body(before[6:10], (0.0, 0.0, 1.0)), np.zeros(15), np.radians(40.0)
+    slope[3:5], slope[6:9] = (4.0, 3.0), up
+    function = move_back if back else move
+    after = np.array(function(tuple(before), tuple(turn * slope), tuple(slope)))
     assert_allclose(into_body(after[6:10], (0.0, 0.0, 1.0)), up, atol=1e-12)
-    assert_allclose(into_body(after[6:10], after[3:6]), into_body(before[6:10], before[3:6]), atol=1e-12)
-    turned = Rotation.from_euler("Z", turn).apply(before[3:6])
-    assert_allclose(after[3:6], turned, atol=1e-12)
+    assert_allclose(after[3:6], Rotation.from_euler("Z", turn).apply(before[3:6]), atol=1e-12)
+    assert_allclose(after[:3], before[:3])
 
 
-def test_a_velocity_turns_only_as_far_as_the_step_has_it():
-    """Where a fix has said how fast a body is, its heading may turn without its velocity."""
+def test_a_heading_that_nothing_ties_turns_alone():
+    """What fixes add to the velocity is of the plane; what they add to a bias turns against the body."""
     before = np.array([5.0, 6.0, 7.0, 3.0, -4.0, 1.0, 1.0, *np.zeros(9)])
-    step, more = np.zeros(15), np.array([-0.6, 0.8])
-    step[3:5], step[8] = more, np.radians(40.0)
-    assert_allclose(correct(tuple(before), tuple(step))[3:5], before[3:5] + more)
-    step[3:5] = 0.5 * step[8] * np.array([4.0, 3.0])
-    half = Rotation.from_euler("Z", 0.5 * step[8]).apply(before[3:6])
-    assert_allclose(correct(tuple(before), tuple(step))[3:6], half)
-
-
-@pytest.mark.paper
-def test_a_filter_survives_a_heading_that_is_off_by_20_deg():
-    """The mean NEES of 15 components is above 20 where each component is corrected by itself."""
-    nees, _ = aligned_nees("ekf", prior={"heading_sigma_rad": np.radians(20.0)})
-    assert nees.mean() < 18.0
+    slope, step, turn = np.zeros(15), np.zeros(15), np.radians(40.0)
+    slope[8], step[8], step[3:5], step[12:14] = 1.0, turn, (-0.6, 0.8), (0.1, 0.0)
+    after = np.array(move(tuple(before), tuple(step), tuple(slope)))
+    assert_allclose(after[3:5], (2.4, -3.2))
+    assert_allclose(after[13:15], 0.1 * np.array([np.cos(turn), -np.sin(turn)]))
+    back = np.array(move_back(tuple(before), tuple(step), tuple(slope)))
+    assert_allclose(back[3:5], before[3:5] + Rotation.from_euler("Z", turn).apply([-0.6, 0.8, 0.0])[:2])
+    assert_allclose(back[13:15], (0.1, 0.0))

@@ -61,9 +61,9 @@ def skipped(found: Any) -> dict[str, int]:
 @pytest.mark.paper
 @pytest.mark.parametrize("method", ["ekf", "smoother"])
 def test_after_a_gap_of_the_unit_all_but_its_biases_is_found_again(method: str):
-    """No estimate in it, the fixes in it are counted, and the position is soon known as before.
+    """No estimate in it, the fixes in it are counted, and what is known afterwards is known as before.
 
-    The filter is consistent after it; a smoother is less so, as from any heading that is hardly known.
+    Of six drives the mean NEES, of 15 components, has a standard deviation of 2.2.
     """
     sources = [drive(silent, run) for run in range(6)]
     found = outputs(INERTIAL, method, sources)
@@ -85,8 +85,7 @@ def test_after_a_gap_of_the_unit_all_but_its_biases_is_found_again(method: str):
         nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
         early.append(nees[(stamp_s > 23.0) & (stamp_s < 25.0)].mean())
         late.append(np.linalg.norm(error[stamp_s > 30.0, :3], axis=1).mean())
-    if method == "ekf":
-        assert np.mean(early) < 30.0
+    assert np.mean(early) < 22.0
     assert np.mean(late) < 0.5
 
 

@@ -10,7 +10,7 @@ import pytest
 from recorders.errors import BadInput
 from replay.inference.checking import check_model
 from replay.inference.estimators import registered_models
-from replay.inference.model import Model, Motion
+from replay.inference.model import Correction, Model, Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -115,7 +115,23 @@ LINEAR_BEARING = replace(RANGE_BEARING, measured={"range_m": "linear", "bearing_
 COMPASS = (replace(ATTITUDE.sensors[0], measure=first_of_quaternion),)
 
 
-def moved_by(state: Any, step: Any) -> Any:
+def along_heading(state: Any) -> Any:
+    return 0.0, 0.0, 1.0, 0.0, 0.0
+
+
+def moved_well(state: Any, step: Any, slope: Any) -> Any:
+    return tuple(x + d for x, d in zip(state, step, strict=True))
+
+
+def stepped(state: Any, target: Any, slope: Any) -> Any:
+    return tuple(x - y for x, y in zip(target, state, strict=True))
+
+
+def stepped_twice(state: Any, target: Any, slope: Any) -> Any:
+    return tuple(2.0 * d for d in stepped(state, target, slope))
+
+
+def moved_by(state: Any, step: Any, slope: Any) -> Any:
     x, y, heading, speed, turn = state
     return x + step[0], y + step[1], heading + step[2], speed + step[3] + step[2] * turn, turn + step[4]
 
@@ -166,8 +182,12 @@ WRONG: dict[str, tuple[Model, str]] = {
         "known are linear",
     ),
     "a correction that is none for small steps": (
-        replace(VEHICLE_A, correct=moved_by),
+        replace(VEHICLE_A, correct=Correction(along_heading, moved_by, stepped, moved_well)),
         "moved_by .* a small step of heading_rad moves other components too",
+    ),
+    "a step that is not found again": (
+        replace(VEHICLE_A, correct=Correction(along_heading, moved_well, stepped_twice, moved_well)),
+        "stepped_twice .* does not find the step of moved_well",
     ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),
