@@ -16,20 +16,10 @@ from recorders.recording import Recording
 from replay.engine.blocks import Ragged
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
+from replay.engine.given import Floats, Given, Messages, OneRun
 from replay.engine.keeping import load
-from replay.engine.plain import (
-    Estimates,
-    Floats,
-    Given,
-    Measured,
-    Messages,
-    OneRun,
-    Results,
-    Told,
-    batch,
-    each_run,
-    recursive,
-)
+from replay.engine.outputs import Estimates, Measured, Results, Told
+from replay.engine.plain import batch, each_run, recursive
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 from replay.inference.small_matrices import predict, solve, update, update_memory
