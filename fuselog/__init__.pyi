@@ -95,9 +95,9 @@ from replay.inference.model import Start as Start
 from replay.inference.model import Switching as Switching
 from replay.judging.evaluation import Errors as Errors
 from replay.judging.evaluation import Innovations as Innovations
-from replay.judging.metrics import Metric as Metric
-from replay.judging.metrics import Output as Output
-from replay.judging.metrics import metric_of_sums as metric_of_sums
+from replay.judging.measuring import Metric as Metric
+from replay.judging.measuring import Output as Output
+from replay.judging.measuring import metric_of_sums as metric_of_sums
 from replay.judging.set_errors import SetErrors as SetErrors
 from replay.timeline.canvas import Canvas as Canvas
 from replay.timeline.canvas import Scene as Scene

@@ -27,7 +27,8 @@ from replay.engine.replaying import Report, collect, replay
 from replay.engine.sources import LogSource, MemorySource, Source, memory_source
 from replay.engine.supervision import find_unsound
 from replay.judging.judge import Judge
-from replay.judging.metrics import COVERAGE, Output
+from replay.judging.measuring import Output
+from replay.judging.metrics import COVERAGE
 
 STEP_NS = 10**8
 COUNT = 200
