@@ -20,7 +20,7 @@ from replay.inference.all_methods import METHODS
 from replay.inference.binding import needs_of, serving
 from replay.inference.estimators import registered_models
 from replay.inference.model import Model
-from replay.judging.metrics import Metric
+from replay.judging.measuring import Metric
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ from recorders.parameters import merge, parse_settings
 from recorders.parsing import parse_json
 from replay.engine.sources import LogSource, Source
 from replay.judging.judge import Judge
-from replay.judging.metrics import find_metrics
+from replay.judging.measuring import find_metrics
 from replay.judging.trajectories import Comparison
 
 

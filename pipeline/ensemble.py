@@ -30,7 +30,7 @@ from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
 from replay.judging.judge import TIME_BINS, Judge
-from replay.judging.metrics import Metric, Output, find_metrics, measure, plus
+from replay.judging.measuring import Metric, Output, find_metrics, measure, plus
 from replay.judging.set_errors import SetErrors
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
 from replay.engine.estimator import configure
 from replay.engine.late import parse_late
-from replay.judging.metrics import find_metrics
+from replay.judging.measuring import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
 

@@ -34,7 +34,7 @@ from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.inference.model import Model
 from replay.judging.evaluation import Errors, innovations_of
 from replay.judging.judge import Judge, error_table, joined
-from replay.judging.metrics import find_metrics
+from replay.judging.measuring import find_metrics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

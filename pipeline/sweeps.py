@@ -21,7 +21,7 @@ from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
 from replay.engine.estimator import configure
 from replay.judging.judge import Judge
-from replay.judging.metrics import metric_key
+from replay.judging.measuring import metric_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,7 +21,7 @@ from recorders.trajectories import Trajectory, read_trajectory
 from replay.engine.sources import LogSource, Source
 from replay.judging.alignment import Align, AlignedEstimates
 from replay.judging.evaluation import split_topic
-from replay.judging.metrics import metric_key
+from replay.judging.measuring import metric_key
 from replay.judging.trajectories import (
     Association,
     Compared,

@@ -40,7 +40,7 @@ from replay.engine.estimator import Bound, bind
 from replay.engine.failures import reason_stream
 from replay.engine.sources import LogSource, MemorySource
 from replay.judging.evaluation import split_topic
-from replay.judging.metrics import metric_key
+from replay.judging.measuring import metric_key
 
 MOST_SENTENCES = 5
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first

@@ -17,7 +17,7 @@ from pipeline.runner import Runner
 from pipeline.studies.localization import summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.judging.metrics import Output
+from replay.judging.measuring import Output
 from replay.judging.tracks import KEPT_SHARE, MANY_REPORTS, kept, live_counts, reports_of, track_tables
 
 

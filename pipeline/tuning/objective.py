@@ -24,7 +24,7 @@ from replay.engine.failures import sentences_of
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source
 from replay.judging.judge import Judge
-from replay.judging.metrics import Sums, plus
+from replay.judging.measuring import Sums, plus
 from replay.judging.whiteness import whitened
 
 Floats = NDArray[np.float64]

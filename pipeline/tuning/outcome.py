@@ -25,7 +25,7 @@ from pipeline.tuning.search import Coordinates
 from replay.engine.sources import LogSource, MemorySource
 from replay.judging.evaluation import split_topic
 from replay.judging.judge import joined
-from replay.judging.metrics import metric_key
+from replay.judging.measuring import metric_key
 from replay.judging.whiteness import whitened, whiteness
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,9 @@ from recorders.log import schemas
 from recorders.models.inertial import cross, into_body, into_plane, product
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Integers
-from replay.engine.plain import Estimates, Given, Messages, OneRun, Results, batch, each_run
+from replay.engine.given import Given, Messages, OneRun
+from replay.engine.outputs import Estimates, Results
+from replay.engine.plain import batch, each_run
 from replay.estimators.inertial import triad
 from replay.estimators.orientation import FIELDS, ORIENTATION, of_inertial_samples
 

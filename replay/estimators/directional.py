@@ -22,8 +22,10 @@ from replay.distributions.wrapped_normal import WrappedNormal
 from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.estimator import Estimator
+from replay.engine.given import Given, Messages
 from replay.engine.measurements import Vectors
-from replay.engine.plain import Given, Messages, Results, recursive
+from replay.engine.outputs import Results
+from replay.engine.plain import recursive
 from replay.estimators.bingham import (
     BinghamNoise,
     Gaussian,

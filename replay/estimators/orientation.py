@@ -12,8 +12,10 @@ from recorders.log import schemas
 from recorders.parameters import Parameters
 from replay.engine.components import Components
 from replay.engine.estimator import Estimator
+from replay.engine.given import Given, Messages
 from replay.engine.measurements import Vectors
-from replay.engine.plain import Given, Messages, Results, recursive
+from replay.engine.outputs import Results
+from replay.engine.plain import recursive
 from replay.estimators.inertial import (
     InertialModel,
     InertialSamples,

@@ -21,7 +21,8 @@ from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.tangent import tangent_components
 from replay.judging.evaluation import BOUND as BOUND_OF
-from replay.judging.metrics import Metric, Output, squares_by_name
+from replay.judging.measuring import Metric, Output
+from replay.judging.metrics import squares_by_name
 from replay.judging.sums import BinnedSums
 
 SINGULAR = "the process noise is singular"

@@ -31,18 +31,8 @@ from replay.judging.evaluation import (
     unjudged,
 )
 from replay.judging.means import MeansOfAll
-from replay.judging.metrics import (
-    Measurement,
-    Metric,
-    Output,
-    Sums,
-    covered,
-    estimated_share,
-    find_metrics,
-    metric_key,
-    plus,
-    step_bounds,
-)
+from replay.judging.measuring import Measurement, Metric, Output, Sums, find_metrics, metric_key, plus
+from replay.judging.metrics import covered, estimated_share, step_bounds
 from replay.judging.set_errors import SetErrors, set_errors
 from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths

@@ -14,7 +14,7 @@ from recorders.log import Stream, schemas
 from replay.engine.arrays import Floats
 from replay.engine.failures import sentences_of
 from replay.engine.late import OLDER
-from replay.judging.metrics import Output
+from replay.judging.measuring import Output
 from replay.judging.sums import BinnedSums
 
 # Spans of time: at most so many, of a millisecond times a power of two.

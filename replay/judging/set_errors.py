@@ -15,7 +15,7 @@ from recorders.log import Stream, schemas
 from replay.engine.blocks import Ragged
 from replay.engine.components import Components
 from replay.judging.evaluation import POSITION, reference, split_topic
-from replay.judging.metrics import Sums, metric_of_sums
+from replay.judging.measuring import Sums, metric_of_sums
 from replay.judging.set_distances import gospa, ospa
 from replay.judging.truths import Truths
 

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from recorders.errors import BadInput
 from recorders.log import schemas
-from replay.judging.metrics import Metric, Output
+from replay.judging.measuring import Metric, Output
 
 Integers = NDArray[np.int64]
 IDENTITY = "identity"

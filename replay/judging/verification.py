@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recorders.log import Stream, schemas
 from recorders.log.streams import concatenate
-from replay.judging.metrics import Metric, Output
+from replay.judging.measuring import Metric, Output
 
 Floats = NDArray[np.float64]
 FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)

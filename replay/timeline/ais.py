@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
 from replay.engine.blocks import gather
-from replay.judging.metrics import Output
+from replay.judging.measuring import Output
 from replay.judging.tracks import live_counts, reports_of, track_tables
 from replay.timeline.canvas import TRUTH, Canvas, Scene, Timeline, Times, thin
 from replay.timeline.geodetic import are_near, degrees_of, map_view, usual

@@ -20,22 +20,15 @@ from replay.engine.blocks import Ragged, gather
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Batch, Estimator, Recursive
 from replay.engine.failures import Failure, failure_stream, sentences_of
-from replay.engine.plain import (
-    Estimates,
-    Floats,
-    Given,
-    Integers,
-    Messages,
-    Results,
-    batch,
-    each_run,
-    recursive,
-)
+from replay.engine.given import Floats, Given, Integers, Messages
+from replay.engine.outputs import Estimates, Results
+from replay.engine.plain import batch, each_run, recursive
 from replay.engine.replaying import Report, collect, replay
 from replay.engine.sources import LogSource, MemorySource, Source, memory_source
 from replay.engine.supervision import find_unsound
 from replay.judging.judge import Judge
-from replay.judging.metrics import COVERAGE, Output
+from replay.judging.measuring import Output
+from replay.judging.metrics import COVERAGE
 
 STEP_NS = 10**8
 COUNT = 200

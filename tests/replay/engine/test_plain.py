@@ -14,18 +14,9 @@ from recorders.recording import Recording
 from replay.engine.blocks import Block, Ragged, gather, merge_events
 from replay.engine.estimator import Estimator
 from replay.engine.failures import sentences_of
-from replay.engine.plain import (
-    Estimates,
-    Floats,
-    Given,
-    Integers,
-    Messages,
-    Results,
-    Solution,
-    batch,
-    each_run,
-    recursive,
-)
+from replay.engine.given import Floats, Given, Integers, Messages
+from replay.engine.outputs import Estimates, Results, Solution
+from replay.engine.plain import batch, each_run, recursive
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
 

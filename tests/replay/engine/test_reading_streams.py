@@ -15,7 +15,8 @@ from replay.engine.estimator import bind
 from replay.engine.failures import sentences_of
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.metrics import COVERAGE, Output
+from replay.judging.measuring import Output
+from replay.judging.metrics import COVERAGE
 
 VEHICLES = {"duration_s": 20.0}
 

@@ -24,7 +24,7 @@ from replay.estimators.biometrics import (
     user_folds,
 )
 from replay.estimators.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
-from replay.judging.metrics import find_metrics, measure
+from replay.judging.measuring import find_metrics, measure
 from replay.judging.verification import (
     Fused,
     bootstrap_users,

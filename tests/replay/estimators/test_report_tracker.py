@@ -14,7 +14,7 @@ from replay.engine.blocks import Block, gather, merge_events
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.metrics import Output, find_metrics, measure
+from replay.judging.measuring import Output, find_metrics, measure
 from replay.judging.tracks import kept, live_counts, track_table
 
 TOPIC = "/estimates/report-tracker/track"

@@ -27,7 +27,8 @@ from replay.inference.all_methods import METHODS
 from replay.inference.estimators import of_any_model
 from replay.inference.model import Motion
 from replay.inference.particles import BOOTSTRAP
-from replay.judging.metrics import PARTICLES, Output
+from replay.judging.measuring import Output
+from replay.judging.metrics import PARTICLES
 from replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE

@@ -7,7 +7,7 @@ from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import Recording
 from replay.engine.blocks import gather
 from replay.engine.sources import MemorySource, memory_source
-from replay.judging.metrics import measure
+from replay.judging.measuring import measure
 from replay.judging.set_errors import SETS, set_errors
 from replay.judging.truths import Truths
 
