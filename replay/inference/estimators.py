@@ -31,20 +31,7 @@ from replay.inference.augmentation import (
     estimated,
     with_walks,
 )
-from replay.inference.binding import (
-    Found,
-    assumed_of,
-    complaint_of,
-    elsewhere,
-    names_state,
-    nearest,
-    needs_of,
-    number_fields,
-    reading_settings,
-    roles_of,
-    settings_of,
-    topics_of,
-)
+from replay.inference.binding import Found, roles_of, topics_of
 from replay.inference.happenings import (
     World,
     as_measured,
@@ -62,6 +49,7 @@ from replay.inference.happenings import (
 )
 from replay.inference.methods import Method
 from replay.inference.model import Model, ModelParameters, Motion
+from replay.inference.needs import elsewhere, names_state, nearest, needs_of
 from replay.inference.opening import Beginning
 from replay.inference.recursion import (
     Carried,
@@ -73,6 +61,13 @@ from replay.inference.recursion import (
     recursion,
 )
 from replay.inference.rewinding import Rewinding, issued
+from replay.inference.settings import (
+    assumed_of,
+    complaint_of,
+    number_fields,
+    reading_settings,
+    settings_of,
+)
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs

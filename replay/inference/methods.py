@@ -17,7 +17,6 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
-from replay.inference.binding import trial_parameters
 from replay.inference.corrections import correcting, relinearising
 from replay.inference.gaussian import (
     kalman_step,
@@ -31,6 +30,7 @@ from replay.inference.gaussian import (
 from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.settings import trial_parameters
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,

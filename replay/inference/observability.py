@@ -24,7 +24,6 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
 from replay.engine.tangent import tangent_components
 from replay.inference.affine import carrying
-from replay.inference.binding import number_fields, reading_settings
 from replay.inference.estimators import State, modelled_by, of_any_model
 from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
 from replay.inference.generate import differencing, is_flat, tuple_of
@@ -32,6 +31,7 @@ from replay.inference.iterated import ITERATED, IteratedSmoother, Way
 from replay.inference.methods import Method, MethodParameters
 from replay.inference.model import Model
 from replay.inference.recursion import Estimates, filled, no_results, recursion
+from replay.inference.settings import number_fields, reading_settings
 from replay.inference.steps import (
     NOTHING_MEASURED,
     Note,

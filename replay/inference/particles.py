@@ -20,7 +20,6 @@ from replay.engine.blocks import Ragged
 from replay.engine.compile import compiled
 from replay.engine.philox import WORDS, Words, fill_normals, philox, run_key, unit
 from replay.engine.results import ALL_WELL, named
-from replay.inference.binding import trial_parameters
 from replay.inference.estimators import Filter, State
 from replay.inference.gaussian import (
     LOG_TWO_PI,
@@ -51,6 +50,7 @@ from replay.inference.methods import Method, MethodParameters, no_steps
 from replay.inference.model import Model, Sensor, trial_state
 from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.regression import settling
+from replay.inference.settings import trial_parameters
 from replay.inference.steps import (
     NOT_EXPLAINED,
     NOT_POSITIVE_DEFINITE,

@@ -16,7 +16,6 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.engine.tangent import tangent_components
 from replay.inference.association import ASSOCIATIONS
-from replay.inference.binding import reading_settings
 from replay.inference.gaussian import copy_gaussian
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.imm import Belief, interacting_steps
@@ -35,6 +34,7 @@ from replay.inference.scanning import (
     target_of,
     updating,
 )
+from replay.inference.settings import reading_settings
 from replay.inference.shared_bias import pool_errors
 from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion, nothing
 from replay.inference.track_management import MANAGEMENTS, Evidence
