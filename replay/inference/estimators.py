@@ -61,6 +61,7 @@ from replay.inference.recursion import (
     recursion,
 )
 from replay.inference.rewinding import Rewinding, issued
+from replay.inference.sensor_steps import slots_of
 from replay.inference.settings import (
     assumed_of,
     complaint_of,
@@ -68,7 +69,7 @@ from replay.inference.settings import (
     reading_settings,
     settings_of,
 )
-from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps, slots_of
+from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 

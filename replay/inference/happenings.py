@@ -17,8 +17,9 @@ from replay.engine.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.binding import Found
 from replay.inference.model import Control, Map, Sensor
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
+from replay.inference.sensor_steps import reading
 from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import Stage, reading
+from replay.inference.steps import Stage
 
 EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 

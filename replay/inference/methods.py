@@ -29,7 +29,17 @@ from replay.inference.gaussian import (
 )
 from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
+from replay.inference.motion_steps import linear_motion, motion_noise
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.sensor_steps import (
+    kalman_update,
+    linear_innovation,
+    linear_sensor,
+    note_numbers,
+    noting,
+    reading,
+    sensor_derivative,
+)
 from replay.inference.settings import trial_parameters
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
@@ -39,15 +49,6 @@ from replay.inference.steps import (
     Steps,
     Workspace,
     gaussian_filter,
-    kalman_update,
-    linear_innovation,
-    linear_motion,
-    linear_sensor,
-    motion_noise,
-    note_numbers,
-    noting,
-    reading,
-    sensor_derivative,
     workspace,
 )
 from replay.sampling import parse_sampling

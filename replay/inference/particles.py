@@ -48,8 +48,10 @@ from replay.inference.generate import (
 from replay.inference.happenings import joined, of_rows
 from replay.inference.methods import Method, MethodParameters, no_steps
 from replay.inference.model import Model, Sensor, trial_state
+from replay.inference.motion_steps import nothing
 from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.regression import settling
+from replay.inference.sensor_steps import note_numbers, noting, reading, sensor_noise
 from replay.inference.settings import trial_parameters
 from replay.inference.steps import (
     NOT_EXPLAINED,
@@ -60,11 +62,6 @@ from replay.inference.steps import (
     Stage,
     Steps,
     Workspace,
-    note_numbers,
-    nothing,
-    noting,
-    reading,
-    sensor_noise,
     workspace,
 )
 from replay.sampling.resampling import choose_systematically

@@ -32,8 +32,9 @@ from replay.inference.recursion import (
     filled,
     taking_in,
 )
+from replay.inference.sensor_steps import slots_of
 from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import FAILURES, Stage, Steps, slots_of
+from replay.inference.steps import FAILURES, Stage, Steps
 from replay.sampling.sets import sets_by_runs
 
 BEFORE_ALL_NS = np.iinfo(np.int64).min
