@@ -20,7 +20,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.results import ALL_WELL
 from replay.engine.tangent import TANGENT_WIDTHS, things
-from replay.inference.estimators import State
+from replay.inference.filtering import State
 from replay.inference.gaussian import cholesky, copy_gaussian
 from replay.inference.generate import retraction
 from replay.inference.imm import Mixing, Mixtures, likeliest_of, mixing, weighed_update

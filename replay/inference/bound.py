@@ -24,7 +24,7 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.components import match_components
 from replay.engine.results import named
 from replay.engine.tangent import truth_at
-from replay.inference.estimators import Filter, State
+from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import (
     cholesky,
     kalman_step,

@@ -27,7 +27,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged, join
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL, named
-from replay.inference.estimators import Filter, State
+from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import keep_measured, whiten, wrap
 from replay.inference.generate import (
     differencing,

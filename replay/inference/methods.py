@@ -105,7 +105,7 @@ class Method:
         variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
         made_for: what the method is with these parameters, where they choose among several; raises
             BadInput where they name none.
-        filtering: what goes through a log, where that is no `replay.inference.estimators.Filter`.
+        filtering: what goes through a log, where that is no `replay.inference.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
     """
 

@@ -24,7 +24,8 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
 from replay.engine.tangent import tangent_components
 from replay.inference.affine import carrying
-from replay.inference.estimators import State, modelled_by, of_any_model
+from replay.inference.estimators import modelled_by, of_any_model
+from replay.inference.filtering import State
 from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
 from replay.inference.generate import differencing, is_flat, tuple_of
 from replay.inference.iterated import ITERATED, IteratedSmoother, Way
