@@ -17,9 +17,10 @@ from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
 from replay.engine.estimator import Estimator
 from replay.inference.all_methods import METHODS
-from replay.inference.binding import needs_of, serving
+from replay.inference.binding import serving
 from replay.inference.estimators import registered_models
 from replay.inference.model import Model
+from replay.inference.needs import needs_of
 from replay.judging.measuring import Metric
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
+from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.executors import crew_of
 from pipeline.experiment import (
     Stated,
@@ -47,8 +48,7 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
 from recorders.log import Companions, Log, NotMcap, open_log
 from recorders.parameters import merge, parse_settings
-from recorders.parsing import parse_json
-from replay.engine.sources import LogSource, Source
+from replay.engine.sources import LogSource
 from replay.judging.judge import Judge
 from replay.judging.measuring import find_metrics
 from replay.judging.trajectories import Comparison
@@ -261,27 +261,6 @@ def evaluate_trajectory(
         say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
     for path in written:
         say(str(path))
-
-
-def log_of_estimates(estimates: Log) -> Path:
-    """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
-    named = estimates.run.notes.get("log") if estimates.run else None
-    if named is None:
-        raise BadInput(f"{estimates.path}: does not say which log it is of; give it with --log")
-    path = (estimates.path.parent / named).resolve()
-    if not path.exists():
-        raise BadInput(f"{estimates.path}: its log {path} is not there; give it with --log")
-    return path
-
-
-def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
-    """Parameters by label, in the order of the replay; none where the log does not say."""
-    notes = estimates.run.notes if estimates.run else {}
-    try:
-        stated = parse_json(notes.get("estimators", "{}"))
-    except ValueError:
-        return {}
-    return stated if isinstance(stated, dict) else {}
 
 
 def _print_outcome(

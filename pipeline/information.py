@@ -17,9 +17,10 @@ from recorders.registry import load
 from replay.engine.cache import cache_folder, kept_files
 from replay.engine.estimator import Bound
 from replay.inference.all_methods import METHODS
-from replay.inference.binding import names_state, nearest_parts, topics_of
+from replay.inference.binding import topics_of
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model import Model
+from replay.inference.needs import names_state, nearest_parts
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:

@@ -28,7 +28,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """
     from replay.engine import blocks, supervision
     from replay.inference import (
-        estimators,
+        filtering,
         fixed_lag,
         gauss_newton,
         imm,
@@ -41,7 +41,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     loops = (
         blocks._merge,
         supervision._over_runs,
-        estimators._compiled,
+        filtering._compiled,
         rewinding._compiled,
         gauss_newton.searching,
         smoothing.going_back,

@@ -105,23 +105,14 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
-    from pipeline.outputs import MAPPING, check_files, imported
-    from recorders.atomic import whole_file
+    from pipeline.outputs import check_files, imported
     from recorders.parameters import parse_settings
     from recorders.recording import import_log
 
     if guess:
-        from recorders.importers.tables.guessing import guess as guessed
-
         if source != "table":
             raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
-        target = out or Path("mapping.toml")
-        check_files([(target, MAPPING)], {"data": paths})
-        text = guessed(paths)
-        with whole_file(target) as file:
-            file.write_text(text, encoding="utf-8")
-        command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(target)])
-        click.echo(f"{target}: read it, then: {command}")
+        _write_guess(paths, out or Path("mapping.toml"))
         return
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
@@ -134,6 +125,20 @@ def import_(
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
+
+
+def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
+    """Write a mapping of tables to start from, and say how to go on."""
+    from pipeline.outputs import MAPPING, check_files
+    from recorders.atomic import whole_file
+    from recorders.importers.tables.guessing import guess
+
+    check_files([(mapping, MAPPING)], {"data": paths})
+    text = guess(paths)
+    with whole_file(mapping) as file:
+        file.write_text(text, encoding="utf-8")
+    command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
+    click.echo(f"{mapping}: read it, then: {command}")
 
 
 def say_written(path: Path, messages: int) -> None:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.commands import log_of_estimates, stated_estimators
 from pipeline.ensemble import Progress, judge_logs, parts_of
+from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.replays import Replay, replay
 from pipeline.results import RESULT_FILE, Result, read_result, split_metric

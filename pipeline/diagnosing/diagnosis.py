@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 
 from pipeline.charts import Axis, Chart, Panel, curve, level
-from pipeline.commands import log_of_estimates, stated_estimators
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.findings import (
     Finding,
@@ -28,6 +27,7 @@ from pipeline.diagnosing.hypotheses import Kind, hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.door import ResultFolder
 from pipeline.ensemble import judge_logs
+from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.outputs import TIMELINE, check_files, check_folder
 from pipeline.replays import Kind as EstimatorKind
 from pipeline.replays import Log, Replay, replay, settings_of, sources_of

@@ -16,7 +16,6 @@ from recorders.registry import load
 from replay.engine.arrays import Floats
 from replay.engine.channels import stated
 from replay.engine.tangent import tangent_components
-from replay.inference.binding import Recorder, number_fields, settings_type
 from replay.inference.model import (
     Model,
     ModelParameters,
@@ -26,6 +25,7 @@ from replay.inference.model import (
     switching_of,
 )
 from replay.inference.opening import unknown
+from replay.inference.settings import TracedParameters, number_fields, settings_type
 from replay.inference.steps import Stage
 from replay.inference.tracking import Newborn
 
@@ -92,17 +92,17 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
     stage = _stage_of(where, model, parameters.mode)
     values = build(model.parameters, given, where)
     names = number_fields(model.parameters)
-    recorder = Recorder({each: getattr(values, each) for each in names})
+    traced = TracedParameters({each: getattr(values, each) for each in names})
     for motion in stage.modes or (stage.motion,):
-        check_motion(where, model, motion, recorder)
+        check_motion(where, model, motion, traced)
     if stage.modes:
-        check_switching(where, model, recorder)
+        check_switching(where, model, traced)
     numbers = {}
     for each in names:
         number = getattr(values, each)
         if number is None:
             number = stated(scans, each, model.parameters, needed=False)
-        if np.isnan(number) and each in recorder.read:
+        if np.isnan(number) and each in traced.read:
             raise BadInput(
                 f"{where}: no channel of {', '.join(topic.name for topic in scans)} states {each}; give "
                 f"it with --set motion.{each}=..."

@@ -38,8 +38,8 @@ from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
 from replay.estimators.track_smoother import smoothing_tracks
-from replay.inference.binding import number_fields
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
+from replay.inference.settings import number_fields
 from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
 from replay.inference.tracks import NEVER, Tracks, no_tracks
 

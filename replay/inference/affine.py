@@ -23,6 +23,8 @@ from replay.inference.gaussian import (
     scalar_update,
 )
 from replay.inference.generate import differencing, is_flat, resetting, retraction, tuple_of
+from replay.inference.motion_steps import motion_derivative, motion_noise
+from replay.inference.sensor_steps import reading, sensor_derivative, whitening
 from replay.inference.smoothing import (
     Chain,
     ForwardMemory,
@@ -36,11 +38,6 @@ from replay.inference.steps import (
     Steps,
     Workspace,
     gaussian_filter,
-    motion_derivative,
-    motion_noise,
-    reading,
-    sensor_derivative,
-    whitening,
     workspace,
 )
 

@@ -12,7 +12,7 @@ from replay.inference.imm import INTERACTING
 from replay.inference.iterated import SMOOTHING
 from replay.inference.methods import FILTERS, Method
 from replay.inference.model import Model
-from replay.inference.particles import BOOTSTRAP
+from replay.inference.particle_filter import BOOTSTRAP
 
 METHODS: Mapping[str, Method] = {
     **FILTERS,

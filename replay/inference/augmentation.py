@@ -19,7 +19,6 @@ from replay.engine.arrays import Floats, Function
 from replay.engine.blocks import Ragged
 from replay.engine.priors import gaussians
 from replay.engine.results import gaussian_stream
-from replay.inference.binding import Recorder, number_fields, settings_type
 from replay.inference.corrections import correcting_more
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
@@ -32,6 +31,7 @@ from replay.inference.point_errors import (
     sensor_with_errors,
     with_point_errors,
 )
+from replay.inference.settings import TracedParameters, number_fields, settings_type
 from replay.inference.steps import Stage
 from replay.inference.walks import Walk, kept, spread, with_walk_parameters
 
@@ -184,8 +184,8 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     stay = [_stay(model, name, f"state[{n + index}]") for index, name in enumerate(names)]
     drifts = [spread(name) for name in names]
     given = motion.noise or _no_noise(t)
-    state, recorder = trial_state(model.kinds), _recorder(model)
-    variances = _entries(len(given(state, 1.0, recorder)))
+    state, parameters = trial_state(model.kinds), _traced(model)
+    variances = _entries(len(given(state, 1.0, parameters)))
     if not motion.noises and len(variances) != t:  # rows of a lower triangle
         for index, drift in enumerate(drifts):
             variances += ["0.0"] * (t + index) + [drift]
@@ -196,9 +196,9 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         stay = [f"{place} + noise[{motion.noises + index}]" for index, place in enumerate(stay)]
         arguments, passed = f"{arguments}, noise", f"{passed}, first_noises(noise)"
     entering = ((0.0,) * motion.noises,) if motion.noises else ()
-    recorder = _recorder(model)
-    motion.move(state, (0.0,) * model.controls, *entering, 1.0, recorder)
-    reads_none = not recorder.read & set(names)
+    parameters = _traced(model)
+    motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
+    reads_none = not parameters.read & set(names)
     lost = motion.lost and _reading(
         model,
         names,
@@ -247,8 +247,8 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     if sensor.noises:
         arguments, passed = "state, noise", "first(state), noise"
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    recorder, about = _recorder(model), (1.0,) * sensor.about_size
-    sensor.measure(trial_state(model.kinds), *entering, about, recorder)
+    parameters, about = _traced(model), (1.0,) * sensor.about_size
+    sensor.measure(trial_state(model.kinds), *entering, about, parameters)
     measured = _entries(len(sensor.measured))
     measure = _reading(model, names, sensor.measure, f"{arguments}, about", f"{passed}, about", measured)
     log_likelihood = sensor.log_likelihood and _reading(
@@ -263,7 +263,7 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
         sensor,
         measure=measure,
         log_likelihood=log_likelihood,
-        linear=sensor.linear and not recorder.read & set(names),
+        linear=sensor.linear and not parameters.read & set(names),
         jacobian=None,
         moments=None,
     )
@@ -312,5 +312,5 @@ def _entries(count: int) -> list[str]:
     return [f"found[{index}]" for index in range(count)]
 
 
-def _recorder(model: Model) -> Recorder:
-    return Recorder(dict.fromkeys(number_fields(model.parameters)))
+def _traced(model: Model) -> TracedParameters:
+    return TracedParameters(dict.fromkeys(number_fields(model.parameters)))

@@ -20,7 +20,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.results import ALL_WELL
 from replay.engine.tangent import TANGENT_WIDTHS, things
-from replay.inference.estimators import State
+from replay.inference.filtering import State
 from replay.inference.gaussian import cholesky, copy_gaussian
 from replay.inference.generate import retraction
 from replay.inference.imm import Mixing, Mixtures, likeliest_of, mixing, weighed_update
@@ -34,7 +34,8 @@ from replay.inference.methods import (
     no_steps,
 )
 from replay.inference.model import Model
-from replay.inference.steps import Gaussian, Note, Stage, Steps, slots_of
+from replay.inference.sensor_steps import slots_of
+from replay.inference.steps import Gaussian, Note, Stage, Steps
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
 AGREED = 0.1  # members become one where their means are on average so near, as a squared distance

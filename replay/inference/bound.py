@@ -24,7 +24,7 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.components import match_components
 from replay.engine.results import named
 from replay.engine.tangent import truth_at
-from replay.inference.estimators import Filter, State
+from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import (
     cholesky,
     kalman_step,
@@ -36,7 +36,9 @@ from replay.inference.gaussian import (
 )
 from replay.inference.generate import tuple_of
 from replay.inference.methods import FILTERS, Method, MethodParameters
+from replay.inference.motion_steps import motion_derivative, motion_noise
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations
+from replay.inference.sensor_steps import linear_sensor, sensor_noise
 from replay.inference.smoothing import solve_semidefinite
 from replay.inference.steps import (
     NO_TRUTH,
@@ -46,10 +48,6 @@ from replay.inference.steps import (
     Stage,
     Steps,
     Workspace,
-    linear_sensor,
-    motion_derivative,
-    motion_noise,
-    sensor_noise,
     workspace,
 )
 

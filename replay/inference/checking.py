@@ -17,7 +17,6 @@ from recorders.models.planar import wrap_angle
 from recorders.parameters import build
 from replay.engine.arrays import Floats, Function
 from replay.engine.tangent import WIDTHS, tangent_components
-from replay.inference.binding import number_fields, settings_type
 from replay.inference.generate import (
     Input,
     adding_noise,
@@ -39,6 +38,7 @@ from replay.inference.model import (
     check_switching,
     switching_of,
 )
+from replay.inference.settings import number_fields, settings_type
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1

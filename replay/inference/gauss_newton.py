@@ -20,9 +20,9 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL
 from replay.inference.affine import Trajectory, affine_steps, damped, reaching
-from replay.inference.binding import number_fields, reading_settings
 from replay.inference.generate import is_flat, resetting, retraction
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.settings import number_fields, reading_settings
 from replay.inference.smoothing import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
 from replay.inference.steps import Gaussian, Stage, Steps
 

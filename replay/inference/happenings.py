@@ -14,10 +14,12 @@ from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged, last_of_equals, ragged_rows
 from replay.engine.geodetic import GEODETIC, in_plane
 from replay.engine.measurements import Fixes, read_fixes, read_vectors, unknown
-from replay.inference.binding import Found, number_fields, reading_settings
+from replay.inference.binding import Found
 from replay.inference.model import Control, Map, Sensor
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
-from replay.inference.steps import Stage, reading
+from replay.inference.sensor_steps import reading
+from replay.inference.settings import number_fields, reading_settings
+from replay.inference.steps import Stage
 
 EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 

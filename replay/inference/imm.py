@@ -27,8 +27,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged, join
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL, named
-from replay.inference.binding import number_fields, reading_settings
-from replay.inference.estimators import Filter, State
+from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import keep_measured, whiten, wrap
 from replay.inference.generate import (
     differencing,
@@ -50,7 +49,9 @@ from replay.inference.methods import (
 )
 from replay.inference.model import Model, switching_of
 from replay.inference.recursion import Estimates, Happenings, Innovations
-from replay.inference.steps import Gaussian, Note, Stage, Steps, noting, slots_of
+from replay.inference.sensor_steps import noting, slots_of
+from replay.inference.settings import number_fields, reading_settings
+from replay.inference.steps import Gaussian, Note, Stage, Steps
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18

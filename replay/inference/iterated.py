@@ -19,7 +19,7 @@ from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Ragged, copied, ragged_rows
 from replay.inference import smoothers
 from replay.inference.affine import LOSSES, Trajectory, no_factors
-from replay.inference.estimators import State
+from replay.inference.filtering import State
 from replay.inference.gauss_newton import Ended, Plan, searching
 from replay.inference.happenings import data_columns, joined, last_of_stamps, of_rows, times_alone
 from replay.inference.methods import FILTERS, Method

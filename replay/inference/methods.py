@@ -17,7 +17,6 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.results import ALL_WELL
-from replay.inference.binding import trial_parameters
 from replay.inference.corrections import correcting, relinearising, sloping
 from replay.inference.gaussian import (
     kalman_step,
@@ -30,7 +29,18 @@ from replay.inference.gaussian import (
 )
 from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
+from replay.inference.motion_steps import linear_motion, motion_noise
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.sensor_steps import (
+    kalman_update,
+    linear_innovation,
+    linear_sensor,
+    note_numbers,
+    noting,
+    reading,
+    sensor_derivative,
+)
+from replay.inference.settings import trial_parameters
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -39,15 +49,6 @@ from replay.inference.steps import (
     Steps,
     Workspace,
     gaussian_filter,
-    kalman_update,
-    linear_innovation,
-    linear_motion,
-    linear_sensor,
-    motion_noise,
-    note_numbers,
-    noting,
-    reading,
-    sensor_derivative,
     workspace,
 )
 from replay.sampling import parse_sampling
@@ -104,7 +105,7 @@ class Method:
         variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
         made_for: what the method is with these parameters, where they choose among several; raises
             BadInput where they name none.
-        filtering: what goes through a log, where that is no `replay.inference.estimators.Filter`.
+        filtering: what goes through a log, where that is no `replay.inference.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
     """
 

@@ -24,27 +24,18 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
 from replay.engine.tangent import tangent_components
 from replay.inference.affine import carrying
-from replay.inference.binding import number_fields, reading_settings
-from replay.inference.estimators import State, modelled_by, of_any_model
+from replay.inference.estimators import modelled_by, of_any_model
+from replay.inference.filtering import State
 from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
 from replay.inference.generate import differencing, is_flat, tuple_of
 from replay.inference.iterated import ITERATED, IteratedSmoother, Way
 from replay.inference.methods import Method, MethodParameters
 from replay.inference.model import Model
+from replay.inference.motion_steps import motion_derivative
 from replay.inference.recursion import Estimates, filled, no_results, recursion
-from replay.inference.steps import (
-    NOTHING_MEASURED,
-    Note,
-    Stage,
-    Steps,
-    Workspace,
-    motion_derivative,
-    reading,
-    sensor_derivative,
-    sensor_noise,
-    slots_of,
-    workspace,
-)
+from replay.inference.sensor_steps import reading, sensor_derivative, sensor_noise, slots_of
+from replay.inference.settings import number_fields, reading_settings
+from replay.inference.steps import NOTHING_MEASURED, Note, Stage, Steps, Workspace, workspace
 
 RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors

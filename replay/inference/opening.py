@@ -21,16 +21,11 @@ from replay.engine.failures import reason_stream
 from replay.engine.geodetic import in_plane, origins_of
 from replay.engine.results import gaussian_stream, named
 from replay.engine.tangent import tangent_components, things
-from replay.inference.binding import (
-    Found,
-    complaint_of,
-    measures_state,
-    number_fields,
-    reading_settings,
-)
+from replay.inference.binding import Found, measures_state
 from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
 from replay.inference.model import Sensor, Start
 from replay.inference.recursion import CONTROL, Happenings
+from replay.inference.settings import complaint_of, number_fields, reading_settings
 from replay.inference.steps import Stage
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it

@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Function
-from replay.inference.binding import trial_parameters
 from replay.inference.corrections import correcting_more
 from replay.inference.generate import Input, derivative, function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
+from replay.inference.settings import trial_parameters
 from replay.inference.walks import kept, spread, with_walk_parameters
 
 Names = tuple[str, ...]

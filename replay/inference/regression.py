@@ -28,15 +28,9 @@ from replay.inference.generate import (
     weighted_mean_of,
 )
 from replay.inference.model import Motion, Sensor
-from replay.inference.steps import (
-    Stage,
-    Workspace,
-    motion_derivative,
-    motion_noise,
-    nothing,
-    reading,
-    sensor_noise,
-)
+from replay.inference.motion_steps import motion_derivative, motion_noise, nothing
+from replay.inference.sensor_steps import reading, sensor_noise
+from replay.inference.steps import Stage, Workspace
 from replay.sampling.sets import SampleSets
 
 MEANS = 30  # at most so many steps to an intrinsic mean

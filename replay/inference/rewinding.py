@@ -18,7 +18,6 @@ from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL, failures_of
-from replay.inference.binding import number_fields, reading_settings
 from replay.inference.generate import function_of
 from replay.inference.happenings import data_columns, happenings_of
 from replay.inference.methods import Method
@@ -33,7 +32,9 @@ from replay.inference.recursion import (
     filled,
     taking_in,
 )
-from replay.inference.steps import FAILURES, Stage, Steps, slots_of
+from replay.inference.sensor_steps import slots_of
+from replay.inference.settings import number_fields, reading_settings
+from replay.inference.steps import FAILURES, Stage, Steps
 from replay.sampling.sets import sets_by_runs
 
 BEFORE_ALL_NS = np.iinfo(np.int64).min

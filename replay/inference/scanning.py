@@ -31,8 +31,9 @@ from replay.inference.corrections import correcting, sloping
 from replay.inference.gaussian import Innovation, kalman_step, whiten, wrap
 from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
+from replay.inference.sensor_steps import sensor_derivative
 from replay.inference.shared_bias import Pool, pool_of
-from replay.inference.steps import Stage, Workspace, sensor_derivative, workspace
+from replay.inference.steps import Stage, Workspace, workspace
 from replay.inference.tracks import Tracks
 
 

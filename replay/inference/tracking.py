@@ -16,10 +16,10 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.engine.tangent import tangent_components
 from replay.inference.association import ASSOCIATIONS
-from replay.inference.binding import reading_settings
 from replay.inference.gaussian import copy_gaussian
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.imm import Belief, interacting_steps
+from replay.inference.motion_steps import linear_motion, nothing
 from replay.inference.scanning import (
     BY_SCAN,
     Memory,
@@ -35,8 +35,9 @@ from replay.inference.scanning import (
     target_of,
     updating,
 )
+from replay.inference.settings import reading_settings
 from replay.inference.shared_bias import pool_errors
-from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter, linear_motion, nothing
+from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter
 from replay.inference.track_management import MANAGEMENTS, Evidence
 from replay.inference.tracks import NEVER, Tracks, are_near, drop, expected
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from replay.engine.estimator import Bound
 from replay.engine.replaying import replay
 from replay.engine.sources import Source
-from replay.inference import estimators
+from replay.inference import filtering
 from replay.inference.recursion import Estimates, Innovations, filled
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Call(NamedTuple):
 def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
     """The calls that a replay makes of the loops; none where no filter is made of a model."""
     calls: list[Call] = []
-    compiled = estimators._compiled
+    compiled = filtering._compiled
 
     def recording(*key: Any) -> Any:
         loop, steps = compiled(*key)
@@ -56,7 +56,7 @@ def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
 
         return record, steps
 
-    with patch.object(estimators, "_compiled", recording):
+    with patch.object(filtering, "_compiled", recording):
         for _ in replay(sources, bound, block_messages=1 << 40):
             pass
     return calls

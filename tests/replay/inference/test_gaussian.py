@@ -16,6 +16,7 @@ from replay.inference.all_methods import METHODS
 from replay.inference.gaussian import cholesky
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
 from replay.inference.recursion import fault_of
+from replay.inference.sensor_steps import kalman_update
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
@@ -24,7 +25,6 @@ from replay.inference.steps import (
     Note,
     Stage,
     Workspace,
-    kalman_update,
     workspace,
 )
 from replay.sampling.samplers import unscented

@@ -18,7 +18,7 @@ from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
-from replay.inference import estimators
+from replay.inference import filtering
 from replay.inference.all_methods import METHODS
 from replay.inference.imm import Memory, changing, mixing
 from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switching
@@ -440,7 +440,7 @@ def test_rates_are_numbers_of_the_run_and_compile_nothing(uncompiled: None) -> N
     for hurries_per_s in (0.1, 2.0):
         found = outputs(SWITCHING_A, "imm", [source], hurries_per_s=hurries_per_s)
         ends.append(found["modes"]["probability"][-1, 1])
-        made.append(estimators._compiled.cache_info().misses)
+        made.append(filtering._compiled.cache_info().misses)
     assert made[0] == made[1]
     assert ends[1] > 2 * ends[0]
 
