@@ -6,6 +6,9 @@ BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # --no-compile: Python compiles the modules that are imported, which are few of them
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
+# commands are started some hundred times: what they import is compiled once, whatever is usual here
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo test test-fast fast-lane studies-lane inference-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import create_model
 from pydantic.fields import FieldInfo
-from scipy.stats import chi2
 
 from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters, build
 from recorders.registry import available, load
+from replay.distributions import chi2
 from replay.engine.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
