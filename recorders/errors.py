@@ -1,7 +1,6 @@
 """The one exception for what a user can mend, and how its sentences are worded and shown."""
 
 from collections.abc import Collection
-from difflib import get_close_matches
 
 
 class BadInput(Exception):
@@ -19,6 +18,8 @@ class UnknownName(BadInput, KeyError):
 
 def choices(name: str, known: Collection[str]) -> str:
     """The end of a sentence on an unknown name: the one that was probably meant, else all there are."""
+    from difflib import get_close_matches  # for a mistake alone, not for every start
+
     near = get_close_matches(name, known, n=1) or [each for each in known if name and name in each]
     return f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known) or 'none'}"
 

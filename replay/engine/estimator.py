@@ -17,7 +17,7 @@ from recorders.log import Clock, Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.blocks import Block, Ragged
-from replay.engine.compile import DoesNotCompile
+from replay.engine.bundling import DoesNotCompile
 from replay.engine.components import Components
 from replay.engine.sources import Source, ensemble_of
 

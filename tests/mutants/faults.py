@@ -270,7 +270,7 @@ FAULTS = [
         "tests/replay/engine/test_compile.py",
     ),
     Fault(
-        "replay/engine/compile.py",
+        "replay/engine/keeping.py",
         "{getattr(kind, 'fields', '')} ",
         "",
         "tests/replay/engine/test_compile.py",

@@ -20,8 +20,9 @@ import replay.engine.compile
 from recorders.errors import BadInput
 from recorders.importers.ros import ros1_file
 from recorders.log import loops
-from replay.engine.cache import in_turn
-from replay.engine.compile import _load, cache_folder, compile_over_runs, compiled
+from replay.engine.cache import cache_folder, in_turn
+from replay.engine.compile import compile_over_runs, compiled
+from replay.engine.keeping import load
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
 MODULE = """
@@ -91,7 +92,7 @@ TOGETHER = MODULE.replace(
 HOLDER = """
     import sys
     from pathlib import Path
-    from replay.engine.cache import in_turn
+    from replay.engine.cache import cache_folder, in_turn
 
     with in_turn(Path(sys.argv[1])):
         print("held", flush=True)
@@ -218,7 +219,7 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def found_in_the_cache() -> bool:
     """Whether a kernel, which gives the right number, is loaded rather than compiled."""
-    _load.cache_clear()
+    load.cache_clear()
     loop, found = compile_over_runs(divide, allocates=False), np.zeros(1)
     loop(1, np.array([4.0]), found)
     assert found[0] == 0.25
@@ -259,7 +260,7 @@ def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
     """A whole file that cannot be loaded all the same."""
     assert not found_in_the_cache()
     with monkeypatch.context() as broken:
-        broken.setattr("replay.engine.compile.pickle.loads", lambda _: 1 / 0)
+        broken.setattr("replay.engine.keeping.pickle.loads", lambda _: 1 / 0)
         assert not found_in_the_cache()
     assert found_in_the_cache()
 
@@ -311,7 +312,7 @@ def test_only_a_folder_of_this_user_alone_is_used(
 def test_every_kernel_of_replay_is_compiled_here():
     """A raw `njit(cache=True)` would not notice a change in another file."""
     users = {path.name: path for path in Path("replay").rglob("*.py") if "numba" in imports_of(path)}
-    assert users.keys() == {"compile.py", "jets.py"}
+    assert users.keys() == {"bundling.py", "compile.py", "inlining.py", "keeping.py", "jets.py"}
     # jets are a type of their own to numba; a kernel that uses them has a hash of that file in its key
     assert "njit" not in users["jets.py"].read_text(encoding="utf-8")
 

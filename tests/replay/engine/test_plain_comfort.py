@@ -14,8 +14,9 @@ from recorders.log import Field, RunMetadata, Schema, Stream, make_stream, schem
 from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.engine.blocks import Ragged
-from replay.engine.compile import _load, compile_over_runs
+from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Estimator
+from replay.engine.keeping import load
 from replay.engine.plain import (
     Estimates,
     Floats,
@@ -325,11 +326,11 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.compile._PATIENCE_S", 0.0)
+    monkeypatch.setattr("replay.engine.keeping._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
     for _ in range(2):
-        _load.cache_clear()
+        load.cache_clear()
         compile_over_runs(tracked)(2, *arguments)
     said = [record.getMessage() for record in caplog.records]
     assert said == [f"compiling {tracked.__module__}.tracked, once"]

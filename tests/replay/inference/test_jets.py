@@ -23,7 +23,8 @@ from recorders.models.acoustic import (
     time_difference_gradient,
 )
 from recorders.models.optical import line_of_sight_gradients
-from replay.engine.compile import _Bundle, compile_over_runs
+from replay.engine.bundling import Bundle
+from replay.engine.compile import compile_over_runs
 from replay.inference import jets
 from replay.inference.jets import jet, slope_of, value_of
 from tests.bench.reference.landmarks import drive_jacobians, range_bearing_jacobian
@@ -483,7 +484,7 @@ def test_loops_branches_and_tuples_compile_and_give_what_plain_python_gives():
 
 def test_a_kernel_names_the_source_of_what_it_imports():
     """The names in a kernel are its key: other derivatives are another kernel."""
-    bundle = _Bundle(allocates=False)
+    bundle = Bundle(allocates=False)
     bundle.add("language", language)
     source = hashlib.sha256(Path(jets.__file__).read_bytes()).hexdigest()
     assert any(source in definition for definition in bundle.definitions.values())

@@ -1,0 +1,134 @@
+"""Commands for experiments: running one, running it at many points, reporting results."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import (
+    ANY_PATH,
+    COUNT,
+    FILE,
+    FOLDER,
+    arrival_option,
+    errors_option,
+    json_option,
+    late_option,
+    parameters_option,
+    scheduler_option,
+    set_option,
+    settings_option,
+    workers_option,
+)
+
+
+@command(
+    "Run an experiment: record, replay, evaluate, draw.",
+    "fuselog run landmarks --runs 1000 --workers 4",
+    "fuselog run landmarks --set ekf.gate_probability=0.999 --set duration_s=30",
+    "fuselog run a.mcap b.mcap -e ekf -e ukf --out out/mine",
+)
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.option("--runs", type=int, help="Number of Monte Carlo runs.")
+@click.option("--seed", type=int, help="Seed of the random numbers.")
+@click.option(
+    "--logs", type=COUNT, default=20, show_default=True, help="Write the logs of the first K runs."
+)
+@arrival_option
+@late_option
+@errors_option
+@click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
+@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@workers_option
+@scheduler_option
+@parameters_option
+@json_option
+@settings_option
+@set_option
+def run(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    arrival_order: bool,
+    late: str | None,
+    **options: Any,
+) -> None:
+    """Run EXPERIMENT, a shipped name or a TOML file: record or import, replay, evaluate, draw.
+
+    Or replay logs of your own as an experiment, LOG.mcap ... with -e for each estimator.
+
+    --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
+    --set gap_limit_s=1 an entry of the experiment.
+    """
+    from pipeline.commands import run_named
+
+    stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
+    over = {key: value for key, value in stated.items() if value is not None}
+    run_named(experiment, labels, over, **options)
+
+
+@command(
+    "Run an experiment at many points of its parameters.",
+    "fuselog sweep landmarks --over ekf.sigma_range_m=0.05:0.8:log9 --runs 50",
+    "fuselog sweep landmarks --over robots=1,2 --over duration_s=10:60:6",
+)
+@click.argument("experiment", nargs=-1, required=True)
+@click.option("-e", "--estimator", "labels", multiple=True, help="For logs: an estimator (repeatable).")
+@click.option(
+    "--over",
+    "swept",
+    multiple=True,
+    required=True,
+    metavar="KEY=LOW:HIGH:N|logN or KEY=A,B,...",
+    help="A parameter and its values, evenly between two ends, or evenly in the logarithm (repeatable).",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=1),
+    help="Draw N points from the ranges instead of taking the whole grid.",
+)
+@click.option("--sampling", type=click.Choice(["sobol", "random"]), default="sobol", show_default=True)
+@click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
+@click.option("--seed", type=int, help="Seed of the random numbers.")
+@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT-sweep].")
+@workers_option
+@scheduler_option
+@json_option
+@settings_option
+@set_option
+def sweep(
+    experiment: tuple[str, ...],
+    labels: tuple[str, ...],
+    runs: int | None,
+    seed: int | None,
+    **options: Any,
+) -> None:
+    """Run EXPERIMENT, or replay logs, at all points of a grid of parameters, or at samples of it.
+
+    A table has every metric at every point, and within what nine in ten runs lie; figures show them as
+    curves, or as heat maps over two parameters. A key is as --set has it.
+    """
+    from pipeline.commands import sweep_named
+
+    over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    sweep_named(experiment, labels, over, **options)
+
+
+@command(
+    "Render results as one self-contained HTML page.",
+    "fuselog report out/landmarks -o report.html",
+)
+@click.argument("results", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
+@click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
+def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
+    """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
+    from pipeline.outputs import REPORT, check_files
+    from pipeline.report import write_report
+
+    check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
+    write_report(list(results), out, viewer=viewer)
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")

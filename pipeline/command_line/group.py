@@ -1,0 +1,31 @@
+"""The group `fuselog`: which commands there are, by what they are for."""
+
+import click
+
+from pipeline.command_line import experiments, judging, lists, logs, recording, replaying
+from pipeline.command_line.help import with_examples
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=with_examples(
+        "Record, replay, judge and look at estimators for sensor fusion.",
+        "fuselog record landmarks --seed 7 -o run.mcap",
+        "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
+        "fuselog view est.mcap",
+    ),
+)
+@click.version_option(package_name="fuselog")
+def fuselog() -> None:
+    """All commands."""
+
+
+for each in (
+    *(recording.record, recording.import_),
+    *(replaying.replay, replaying.tune, replaying.check),
+    *(judging.evaluate, judging.compare, judging.diagnose, judging.observability),
+    *(experiments.run, experiments.sweep, experiments.report),
+    *(logs.info, logs.view, logs.export, logs.cut, logs.merge, logs.constrain, logs.relabel),
+    *(lists.scenarios, lists.models, lists.estimators, lists.metrics, lists.experiments, lists.cache),
+):
+    fuselog.add_command(each)

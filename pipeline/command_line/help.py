@@ -1,0 +1,23 @@
+"""A command's help: its docstring, and below it commands to try."""
+
+import inspect
+from collections.abc import Callable
+
+import click
+
+
+def with_examples(text: str, *examples: str) -> str:
+    """A help text that ends with commands to try, which click does not wrap."""
+    return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
+
+
+def command(
+    short_help: str, *examples: str, name: str | None = None
+) -> Callable[[Callable[..., None]], click.Command]:
+    """Make a command, whose help is its docstring, or the short one, and examples of it."""
+
+    def added(function: Callable[..., None]) -> click.Command:
+        text = with_examples(function.__doc__ or short_help, *examples)
+        return click.command(name=name, short_help=short_help, help=text)(function)
+
+    return added

@@ -1,0 +1,208 @@
+"""Commands that judge estimates: against the truth, against others, and why they are inconsistent."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import (
+    ANY_PATH,
+    FILE,
+    FOLDER,
+    FORMAT,
+    Seconds,
+    TimeOffset,
+    errors_option,
+    gap_option,
+    json_option,
+    recover_option,
+    set_option,
+    settings_option,
+)
+from recorders.errors import BadInput
+
+
+@command(
+    "Judge estimates against the truth.",
+    "fuselog evaluate est.mcap",
+    "fuselog evaluate est.txt --truth gt.txt --align se3",
+)
+@click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where ESTIMATES is one as a file.")
+@click.option(
+    "--format", type=FORMAT, help="The format of trajectory files [default: found from their content]."
+)
+@click.option(
+    "--truth-format", type=FORMAT, help="The format of the true one [default: found from its content]."
+)
+@click.option(
+    "--align",
+    type=click.Choice(["none", "yaw", "se2", "se3", "sim3"]),
+    help="Bring estimates nearest to the truth first: yaw turns about the vertical and shifts, se2 too "
+    "but for the height, se3 turns and shifts, sim3 scales as well [default: none].",
+)
+@click.option("--delta", type=float, help="What way relative pose errors are over [default: 1].")
+@click.option(
+    "--delta-unit", type=click.Choice(["m", "frames", "s"]), help="Its unit [default: frames]."
+)
+@click.option(
+    "--association",
+    type=click.Choice(["nearest", "interpolated"]),
+    help="Which true pose belongs to an estimated one: the nearest in time, or one between two "
+    "[default: nearest for files, interpolated for logs].",
+)
+@click.option(
+    "--max-difference",
+    "max_difference_s",
+    type=Seconds(0),
+    help="Seconds up to which the nearest belong together [default: 0.01].",
+)
+@click.option(
+    "--time-offset",
+    "time_offset_s",
+    type=TimeOffset(),
+    metavar="SECONDS|estimate",
+    help="Add this to the stamps of the estimated trajectory, or find it [default: 0].",
+)
+@click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
+@click.option("--out", type=FOLDER, help="Write a result folder, as fuselog run does.")
+@errors_option
+@recover_option
+@gap_option
+@json_option
+def evaluate(
+    estimates: tuple[Path, ...],
+    logs: tuple[Path, ...],
+    truth: Path | None,
+    format: str | None,  # noqa: A002
+    truth_format: str | None,
+    align: str | None,
+    delta: float | None,
+    delta_unit: str | None,
+    association: str | None,
+    max_difference_s: float | None,
+    time_offset_s: float | str | None,
+    **options: Any,
+) -> None:
+    """Judge ESTIMATES logs against the truth of the logs they were replayed from.
+
+    With --truth, ESTIMATES is a trajectory file (TUM, KITTI or EuRoC) that is judged against another:
+    absolute and relative pose errors, APE and RPE, as evo has them. With --align or --delta, so are
+    estimated positions of logs; all other metrics are then of the aligned estimates.
+    """
+    from pipeline.commands import evaluate_logs, evaluate_trajectory
+
+    given = {
+        "align": align,
+        "delta": delta,
+        "delta_unit": delta_unit,
+        "association": association,
+        "max_difference_s": max_difference_s,
+        "time_offset_s": time_offset_s,
+    }
+    comparison = {name: value for name, value in given.items() if value is not None}
+    formats = {"format": format, "truth_format": truth_format}
+    if truth is not None:
+        evaluate_trajectory(list(estimates), truth, formats, comparison, logs=logs, **options)
+        return
+    if any(formats.values()):
+        raise BadInput(
+            "--format and --truth-format: are for trajectory files; give the true one, --truth"
+        )
+    evaluate_logs(list(estimates), list(logs), comparison=comparison, **options)
+
+
+@command(
+    "Compare estimators over the same runs, with a verdict on every metric.",
+    "fuselog compare out/before out/after",
+    "fuselog compare a.mcap b.mcap -e ekf -e ukf",
+)
+@click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
+@click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
+@click.option("--case", help="What trajectory files are of, such as robot2, where a log has several.")
+@click.option(
+    "--margin",
+    type=click.FloatRange(min=0),
+    default=0.02,
+    show_default=True,
+    help="The relative difference of a metric that does not matter.",
+)
+@click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
+@click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
+    """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
+
+    Or estimators over logs, LOG.mcap ... with -e for each estimator. All others are compared with the
+    first, metric by metric over the runs that both have, with intervals of 95 % by the bootstrap over
+    runs.
+    """
+    from pipeline.comparing.command import compare_sides
+
+    compare_sides(list(sides), list(labels), **options)
+
+
+@command(
+    "Say why an estimator is inconsistent.",
+    "fuselog diagnose run.mcap -e ekf",
+)
+@click.argument("log", type=ANY_PATH)
+@click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
+@click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
+@click.option("--save", type=FILE, help="A timeline (.rrd) to write, with the sentences as events.")
+@click.option("--model", help="The model to estimate, where several fit the log.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def diagnose(log: Path, **options: Any) -> None:
+    """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
+
+    LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
+    cause first: that without which the log-likelihood gains most.
+    """
+    from pipeline.diagnosing.command import diagnose_log
+
+    diagnose_log(log, **options)
+
+
+@command(
+    "Say how well the measurements of logs determine a model's state.",
+    "fuselog observability run.mcap --window 10",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--model", help="The model, where several fit the logs.")
+@click.option(
+    "--window",
+    "window_s",
+    type=Seconds(),
+    help="The length of a window; one follows another [default: the whole run].",
+)
+@click.option(
+    "--scale",
+    "scales",
+    multiple=True,
+    metavar="COMPONENT=SIGMA",
+    help="The standard deviation that counts as one, instead of the prior's (repeatable).",
+)
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
+@recover_option
+@json_option
+@set_option
+def observability(logs: tuple[Path, ...], **options: Any) -> None:
+    """Say how well the measurements of LOGS determine the state, and which direction least.
+
+    For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
+    trajectory, in units of the prior's information.
+    """
+    from pipeline.observing import show_observability
+
+    show_observability(list(logs), **options)

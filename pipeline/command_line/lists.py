@@ -1,0 +1,53 @@
+"""Commands that list what there is: scenarios, estimators, metrics, experiments, models, the cache."""
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import json_option
+
+
+def _listing(kind: str, text: str, example: str) -> click.Command:
+    @command(text, f"fuselog {kind}s", f"fuselog {kind}s {example}", name=f"{kind}s")
+    @click.argument("name", required=False)
+    @json_option
+    def listing(name: str | None, as_json: bool) -> None:
+        from pipeline import catalog
+
+        catalog.show(getattr(catalog, f"{kind}s")(), kind, name, as_json=as_json)
+
+    return listing
+
+
+scenarios = _listing(
+    "scenario", "List what can be recorded and imported, or all about NAME.", "landmarks"
+)
+estimators = _listing("estimator", "List the estimators, or all about NAME.", "ekf")
+metrics = _listing("metric", "List the metrics, or all about NAME.", "consistency")
+experiments = _listing("experiment", "List the shipped experiments, or all about NAME.", "landmarks")
+
+
+@command(
+    "List the models, and the methods that estimate each, or all about NAME.",
+    "fuselog models",
+    "fuselog models robot",
+)
+@click.argument("name", required=False)
+@json_option
+def models(name: str | None, as_json: bool) -> None:
+    """List the models and whether each method can estimate them or why not, or all about NAME."""
+    from pipeline.catalog import show_models
+
+    show_models(name, as_json=as_json)
+
+
+@command(
+    "Say what the cache of kernels and samples holds, or clear it.",
+    "fuselog cache --clear",
+)
+@click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
+@json_option
+def cache(clear: bool, as_json: bool) -> None:
+    """Say how large the cache is: compiled kernels and samples, which fuselog can make again."""
+    from pipeline.information import show_cache
+
+    show_cache(clear=clear, as_json=as_json)

@@ -1,0 +1,225 @@
+"""Commands on a log as it is: what it holds, in the viewer or other formats, cut, merged, renamed."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import (
+    ANY_PATH,
+    FILE,
+    Seconds,
+    gap_option,
+    json_option,
+    out_log_option,
+    recover_option,
+    set_option,
+)
+from pipeline.command_line.recording import say_written
+from recorders.errors import BadInput, printable
+
+if TYPE_CHECKING:
+    from pipeline.surgery import Changed
+
+
+@command(
+    "Say what a log holds.",
+    "fuselog info run.mcap",
+)
+@click.argument("log", type=ANY_PATH)
+@recover_option
+@json_option
+def info(log: Path, recover: bool, as_json: bool) -> None:
+    """Say what LOG holds: the run, its topics, schemas, message counts."""
+    from pipeline.information import show_log
+
+    show_log(log, recover=recover, as_json=as_json)
+
+
+@command(
+    "Open a log, estimates or a result in the Rerun viewer.",
+    "fuselog view est.mcap",
+    "fuselog view run.mcap --start 10 --end 20",
+    "fuselog view out/landmarks --screenshot picture.png --at 30",
+)
+@click.argument("path", type=ANY_PATH)
+@click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
+@click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
+@click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
+@click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
+@click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
+@click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
+@click.option("--focus", help="What to show first, such as robot3.")
+@recover_option
+@gap_option
+def view(path: Path, **options: Any) -> None:
+    """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
+    from pipeline.commands import view_path
+
+    view_path(path, **options)
+
+
+@command(
+    "Write a log's streams as TUM, KITTI, MOT, CSV, Parquet or Foxglove files.",
+    "fuselog export est.mcap --to tum",
+    "fuselog export run.mcap --to csv --topic /robot1/odometry -o odometry.csv",
+)
+@click.argument("path", type=ANY_PATH)
+@click.option(
+    "--to",
+    type=click.Choice(["tum", "kitti", "mot", "csv", "parquet", "foxglove"]),
+    required=True,
+    help="The format.",
+)
+@click.option(
+    "-o",
+    "--out",
+    type=ANY_PATH,
+    help="The folder to write, or with one --topic the file [default: named after PATH].",
+)
+@click.option("--topic", "topics", multiple=True, help="A topic (repeatable) [default: all that fit].")
+@recover_option
+def export(path: Path, to: Any, **options: Any) -> None:
+    """Write streams of PATH, a log or an estimates log, for other tools.
+
+    To tum and kitti go the estimates and truths that state a position, as trajectories; to mot tracks
+    and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a table; to
+    foxglove one log of the messages that Foxglove and Rerun show.
+    """
+    from pipeline.exporting import export as export_log
+
+    done = export_log(path, to=to, **options)
+    for note in done.notes:
+        click.echo(printable(f"fuselog: {note}"), err=True)
+    for topic, file in done.files.items():
+        click.echo(printable(f"{file}: {topic}"))
+
+
+@command(
+    "Write a span, some topics or fewer messages of a log.",
+    "fuselog cut run.mcap --start 10 --end 20 -o part.mcap",
+    "fuselog cut run.mcap --decimate '/robot1/odometry=5Hz' -o slow.mcap",
+)
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
+@click.option(
+    "--topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="A topic, or a pattern such as '/robot1/*' (repeatable) [default: all].",
+)
+@click.option(
+    "--decimate",
+    multiple=True,
+    metavar="TOPIC=N|TOPIC=RATEHz",
+    help="Keep every Nth stamp of a topic or pattern, or at most so many a second (repeatable).",
+)
+@recover_option
+def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
+    """Write a part of PATH, a log or an estimates log, as a log of its own.
+
+    Maps, priors and what was said at the first stamp of the log stay whole, whatever the span.
+    """
+    from pipeline.surgery import cut as cut_log
+
+    _say_changed(cut_log(path, decimate=_pairs("--decimate", decimate), **options))
+
+
+@command(
+    "Write one log of several, whose clocks may differ.",
+    "fuselog merge a.mcap b.mcap --offset b.mcap=-0.5 -o both.mcap",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@out_log_option
+@click.option(
+    "--offset",
+    "offsets",
+    multiple=True,
+    metavar="LOG=SECONDS",
+    help="Add this to all stamps of one of LOGS (repeatable) [default: 0].",
+)
+@recover_option
+def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
+    """Write one log of LOGS, which have no topic in common: fuselog relabel renames topics."""
+    from pipeline.surgery import merge as merge_logs
+
+    offsets_s = {}
+    for log, text in _pairs("--offset", offsets).items():
+        try:
+            offsets_s[log] = float(text)
+        except ValueError:
+            raise BadInput(f"--offset {log}={text}: expected LOG=SECONDS, as {log}=-0.5") from None
+    _say_changed(merge_logs(list(logs), offsets_s=offsets_s, **options))
+
+
+@command(
+    "Write a log with what its inertial unit says of standing and rolling.",
+    "fuselog constrain run.mcap -o constrained.mcap --set rolling_hz=10",
+)
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only unit].")
+@set_option
+@recover_option
+def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
+    """Write PATH with topics that say when its body stands and, with --set rolling_hz=10, that it rolls.
+
+    The model inertial takes them as it takes sensors: a body that stands has no velocity, and one that
+    rolls on wheels moves neither to the side nor up.
+    """
+    from pipeline.surgery import constrain as constrain_log
+    from recorders.parameters import parse_settings
+
+    _say_changed(constrain_log(path, settings=parse_settings(settings), **options))
+
+
+@command(
+    "Write a log with other names of topics and components.",
+    "fuselog relabel run.mcap --topic /robot1/=/left/ -o left.mcap",
+)
+@click.argument("path", type=ANY_PATH)
+@out_log_option
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Rename a topic, or as /robot1/=/robot2/ all that begin so (repeatable).",
+)
+@click.option(
+    "--component",
+    "components",
+    multiple=True,
+    metavar="OLD=NEW",
+    help="Rename a component of states, as x_m=east_m, in all topics (repeatable).",
+)
+@recover_option
+def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
+    """Write PATH, a log or an estimates log, with other names; what refers to them follows."""
+    from pipeline.surgery import relabel as relabel_log
+
+    done = relabel_log(
+        path, topics=_pairs("--topic", topics), components=_pairs("--component", components), **options
+    )
+    _say_changed(done)
+
+
+def _pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
+    """What an option gives as NAME=VALUE, each name once."""
+    pairs: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.rpartition("=")
+        if not (name and equals and value) or name in pairs:
+            raise BadInput(f"{option} {text}: expected NAME=VALUE, with every name once")
+        pairs[name] = value
+    return pairs
+
+
+def _say_changed(done: "Changed") -> None:
+    for note in done.notes:
+        click.echo(printable(f"fuselog: {note}"), err=True)
+    say_written(done.path, sum(done.messages.values()))

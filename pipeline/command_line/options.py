@@ -1,0 +1,107 @@
+"""Types of options, and the options that several commands have."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+class OutputFile(click.Path):
+    """A file to write: a new one, or a regular one that is replaced; never a device or a folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, dir_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path."""
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if path.exists() and not path.is_file():
+            self.fail(f"{path} is no regular file", param, ctx)
+        return path
+
+
+class Seconds(click.ParamType):
+    """A time in seconds that fits the stamps of a log."""
+
+    name = "seconds"
+
+    def __init__(self, minimum: float = -1e9) -> None:
+        self._minimum = minimum
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number."""
+        seconds = float(click.FLOAT.convert(value, param, ctx))
+        if not self._minimum <= seconds <= 1e9:
+            self.fail(
+                f"{seconds:g} is not between {self._minimum:.0f} and 1000000000 seconds", param, ctx
+            )
+        return seconds
+
+
+class TimeOffset(Seconds):
+    """A time in seconds, or the word that asks to find it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number or the word."""
+        return value if value == "estimate" else super().convert(value, param, ctx)
+
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+FILE = OutputFile()
+ANY_PATH = click.Path(path_type=Path)
+COUNT = click.IntRange(min=0)
+FORMAT = click.Choice(["tum", "kitti", "euroc"])
+settings_option = click.option(
+    "--settings",
+    "settings_file",
+    type=ANY_PATH,
+    metavar="FILE",
+    help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides it.",
+)
+set_option = click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
+)
+errors_option = click.option(
+    "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
+)
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), help="Share the work among N processes, each on one core."
+)
+scheduler_option = click.option(
+    "--scheduler",
+    metavar="ADDRESS|local:N",
+    help="Share the work among the workers of a Dask scheduler, or of one with N on this machine.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+parameters_option = click.option(
+    "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+)
+recover_option = click.option(
+    "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
+)
+out_log_option = click.option("-o", "--out", type=FILE, required=True, help="The log to write.")
+gap_option = click.option(
+    "--gap-limit",
+    "gap_limit_s",
+    type=Seconds(0),
+    default=0.2,
+    show_default=True,
+    help="The longest gap over which truth is interpolated.",
+)
+arrival_option = click.option(
+    "--arrival-order",
+    is_flag=True,
+    help="Process messages in the order in which they arrived (log time).",
+)
+late_option = click.option(
+    "--late",
+    metavar="drop|wait:SECONDS|rewind:SECONDS",
+    help="With --arrival-order: process measurements in the order of their stamps all the same; drop "
+    "late ones, wait SECONDS for them, or rewind by up to SECONDS to take them in.",
+)
+foxglove_option = click.option(
+    "--foxglove",
+    is_flag=True,
+    help="Also write the messages that Foxglove's viewer shows.",
+)

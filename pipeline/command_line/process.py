@@ -1,0 +1,119 @@
+"""The command line as a process: its exit code, what stops it, what it says of errors."""
+
+import io
+import logging
+import math
+import os
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+import click
+
+from pipeline.command_line.group import fuselog
+from recorders.errors import BadInput, printable
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: a user's mistake is one sentence and 2.
+
+    FUSELOG_TRACEBACK=1 shows where an error comes from, for who writes an estimator.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name may be beyond the encoding
+    logging.basicConfig(format="fuselog: %(message)s")
+    if sys.stderr.isatty():  # somebody waits
+        logging.getLogger("fuselog").setLevel(logging.INFO)
+    try:
+        with _stopped_by_signals():
+            code = fuselog(arguments, prog_name="fuselog", standalone_mode=False)
+            print(end="", flush=True)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return 2
+    except click.ClickException as error:
+        context = getattr(error, "ctx", None)
+        hint = f" (see {context.command_path} --help)" if context else ""
+        return _fail(error.format_message().rstrip(".") + hint)
+    except (click.Abort, KeyboardInterrupt) as error:
+        click.echo("fuselog: stopped", err=True)
+        cause = error.__cause__ or error  # click wraps it
+        return 128 + (cause.number if isinstance(cause, Stopped) else signal.SIGINT)
+    except BrokenPipeError:
+        _drop_output()
+        return 1
+    except (BadInput, OSError, MemoryError) as error:
+        if os.environ.get("FUSELOG_TRACEBACK"):
+            raise
+        place = "" if _drop_output() else "standard output"
+        return _fail(_sentence(error, place or f"fuselog {shlex.join(arguments or sys.argv[1:])}"))
+    return code or 0
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asked the process to end: what holds for Ctrl-C holds for it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Have signals that end the process unwind it, so that what was begun is cleared away."""
+    last_s = -math.inf
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal last_s
+        before_s, last_s = last_s, time.monotonic()
+        if last_s - before_s > 1.0:  # `timeout` sends it twice: to the process and to its group
+            raise Stopped(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = [
+        getattr(signal, name)
+        for name in ("SIGTERM", "SIGHUP")
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL
+    ]
+    for number in asked:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _sentence(error: Exception, place: str) -> str:
+    """What went wrong, and where: `place` is for errors that do not say so themselves."""
+    if isinstance(error, OSError):
+        place = os.fsdecode(error.filename) if error.filename else place
+        return f"{place}: {error.strerror or error}"
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return f"not enough memory; ask for fewer runs or less time{why}"
+    return str(error)
+
+
+def _fail(sentence: str) -> int:
+    line = printable(sentence.strip().replace("\n", " "))
+    click.echo(f"fuselog: {line}", err=True)
+    return 2
+
+
+def _drop_output() -> bool:
+    """Whether standard output takes more; where not, the interpreter must not try again at its end."""
+    try:
+        print(end="", flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True

@@ -1,0 +1,141 @@
+"""Commands that make logs: of simulated scenarios, and of real data."""
+
+import shlex
+from pathlib import Path
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import ANY_PATH, COUNT, FILE, foxglove_option, set_option
+from recorders.errors import BadInput, printable
+
+
+@command(
+    "Simulate a scenario and write its log.",
+    "fuselog record landmarks --seed 7 -o run.mcap",
+    "fuselog record landmarks --set duration_s=120 -o long.mcap",
+    "fuselog record --again run.mcap -o again.mcap",
+)
+@click.argument("scenario", required=False)
+@click.option("-o", "--out", type=FILE, help="The log to write [default: SCENARIO.mcap].")
+@click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
+@click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
+@click.option("--again", type=ANY_PATH, help="Record the run of this log again, by its own metadata.")
+@click.option(
+    "--compression",
+    type=click.Choice(["zstd", "lz4", "none"]),
+    default="zstd",
+    show_default=True,
+    help="Of the log's chunks.",
+)
+@foxglove_option
+@set_option
+def record(
+    scenario: str | None,
+    out: Path | None,
+    seed: int | None,
+    run: int | None,
+    again: Path | None,
+    compression: str,
+    foxglove: bool,
+    settings: tuple[str, ...],
+) -> None:
+    """Simulate SCENARIO, a name or a TOML file, and write its log."""
+    from pipeline.commands import companions_if
+    from pipeline.experiment import load_scenario
+    from pipeline.outputs import RECORDED, check_files
+    from recorders.log import open_log, write_log
+    from recorders.parameters import merge, parse_settings
+    from recorders.recording import record_run
+
+    if (scenario is None) == (again is None):
+        raise BadInput("give either a scenario, one that fuselog scenarios lists, or --again LOG")
+    if again is not None:
+        source = open_log(again).run
+        if source is None or source.seed is None:
+            raise BadInput(f"{again}: the log does not say how it was simulated; name a scenario")
+        name, values, label = source.scenario, source.parameters, f"{again.stem}-again"
+        seed = source.seed if seed is None else seed
+        run = source.run if run is None else run
+    else:
+        name, values, label = load_scenario(scenario or "")
+    values = merge(values, parse_settings(settings))
+    path = out or Path(f"{label}.mcap")
+    check_files([(path, RECORDED)], {"log": [] if again is None else [again]})
+    recording, metadata = record_run(name, values, seed or 0, run or 0)
+    beside = companions_if(foxglove)
+    write_log(path, recording.streams, metadata, compression=compression, companions=beside)
+    say_written(path, sum(map(len, recording.streams)))
+
+
+@command(
+    "Import real data and write their log.",
+    "fuselog import ros drive.bag -o drive.mcap",
+    "fuselog import table drive.csv --guess -o mapping.toml",
+    "fuselog import table drive.csv --mapping mapping.toml -o drive.mcap",
+    name="import",
+)
+@click.argument("source")
+@click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
+@click.option(
+    "--clock",
+    type=click.Choice(["header", "bag"]),
+    help="For ROS: what says when a message was published, its header or the bag [default: header].",
+)
+@click.option(
+    "--mapping",
+    help="What becomes of messages or columns: a TOML file, or the name of one that ships; "
+    "import table without it lists these.",
+)
+@click.option(
+    "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
+)
+@set_option
+def import_(
+    source: str,
+    paths: tuple[Path, ...],
+    out: Path | None,
+    clock: str | None,
+    mapping: str | None,
+    guess: bool,
+    settings: tuple[str, ...],
+) -> None:
+    """Import real data of kind SOURCE from PATH, as published, and write their log.
+
+    Tables (SOURCE table) may be several files and folders, which become one log.
+    """
+    from pipeline.outputs import MAPPING, check_files, imported
+    from recorders.atomic import whole_file
+    from recorders.parameters import parse_settings
+    from recorders.recording import import_log
+
+    if guess:
+        from recorders.importers.tables.guessing import guess as guessed
+
+        if source != "table":
+            raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
+        target = out or Path("mapping.toml")
+        check_files([(target, MAPPING)], {"data": paths})
+        text = guessed(paths)
+        with whole_file(target) as file:
+            file.write_text(text, encoding="utf-8")
+        command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(target)])
+        click.echo(f"{target}: read it, then: {command}")
+        return
+    if len(paths) > 1 and source != "table":
+        raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
+    target = out or Path(f"{source}.mcap")
+    check_files([(target, imported(source))], {"data": paths})
+    more = [str(path) for path in paths[1:]]
+    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
+    for subject, fact in metadata.notes.items():
+        click.echo(printable(f"{subject}: {fact}" if fact else subject))
+    say_written(target, messages)
+
+
+def say_written(path: Path, messages: int) -> None:
+    """Say what was written: the log, its messages and its size."""
+    click.echo(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")

@@ -1,0 +1,193 @@
+"""Commands that replay estimators over logs: for their estimates, their parameters, or a check."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.command_line.help import command
+from pipeline.command_line.options import (
+    ANY_PATH,
+    COUNT,
+    FILE,
+    FOLDER,
+    Seconds,
+    arrival_option,
+    foxglove_option,
+    gap_option,
+    json_option,
+    late_option,
+    parameters_option,
+    recover_option,
+    scheduler_option,
+    set_option,
+    settings_option,
+    workers_option,
+)
+
+
+@command(
+    "Replay estimators over logs and write their estimates.",
+    "fuselog replay run.mcap -e ekf -e ukf -o est.mcap",
+    "fuselog replay run.mcap -e ekf --set sigma_range_m=0.3",
+    "fuselog replay run.mcap -e ekf --arrival-order --late rewind:0.5",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option(
+    "-e", "--estimator", "names", multiple=True, required=True, help="An estimator (repeatable)."
+)
+@click.option(
+    "-o",
+    "--out",
+    type=ANY_PATH,
+    help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option(
+    "--every",
+    "every_s",
+    type=Seconds(0),
+    help="Give estimates every so many seconds, not only at measurements.",
+)
+@arrival_option
+@late_option
+@click.option("--start", "start_s", type=Seconds(), help="Begin this many seconds into the run.")
+@click.option(
+    "--start-from",
+    "origins",
+    multiple=True,
+    metavar="truth|ESTIMATES",
+    help="What filters start with at --start: the log's truth, or the estimates log of an earlier "
+    "replay (one per log).",
+)
+@click.option(
+    "--start-sigma",
+    "sigmas",
+    multiple=True,
+    metavar="COMPONENT=SIGMA",
+    help="Standard deviation of a component for --start-from truth (repeatable) [default: the prior's].",
+)
+@click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
+@click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
+@click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
+@foxglove_option
+@recover_option
+@gap_option
+@parameters_option
+@json_option
+@settings_option
+@set_option
+def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
+    """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
+
+    --set gate_probability=1 sets a parameter of all estimators that have it, --set
+    ekf.gate_probability=1 of one.
+    """
+    from pipeline.commands import replay_logs
+
+    replay_logs(list(logs), list(names), **options)
+
+
+@command(
+    "Search the parameters of an estimator that explain logs best.",
+    "fuselog tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option("--free", multiple=True, required=True, help="A parameter to search for (repeatable).")
+@click.option(
+    "--by",
+    type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
+    default="likelihood",
+    show_default=True,
+    help="What to optimise: the likelihood, NIS or NEES (nearest to their expectation), or RMSE.",
+)
+@click.option(
+    "--bound",
+    "bounds",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="The bounds of a parameter (repeatable) [default: 1e-4 to 1e4 times its start].",
+)
+@click.option(
+    "--grid",
+    type=click.IntRange(min=1),
+    default=1,
+    help="Start the search from the best of N values of each parameter between its bounds.",
+)
+@click.option(
+    "--validate",
+    "held_out",
+    multiple=True,
+    type=ANY_PATH,
+    help="A log that is held out, to judge the values by (repeatable).",
+)
+@click.option(
+    "--folds",
+    type=COUNT,
+    default=0,
+    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
+)
+@click.option(
+    "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@workers_option
+@scheduler_option
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option
+def tune(logs: tuple[Path, ...], **options: Any) -> None:
+    """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
+
+    The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
+    but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
+    folder is for --settings of fuselog replay and run.
+    """
+    from pipeline.tuning.command import tune_logs
+
+    tune_logs(list(logs), **options)
+
+
+@command(
+    "Check that estimators still give what a golden has.",
+    "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
+    "fuselog check run.mcap --against ekf.golden.xz",
+)
+@click.argument("path", type=ANY_PATH)
+@click.option("--against", "golden", type=FILE, required=True, help="The golden, a .golden.xz file.")
+@click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
+@click.option("-e", "--estimator", "labels", multiple=True, help="With --update: of what (repeatable).")
+@arrival_option
+@late_option
+@click.option(
+    "--keep",
+    "columns",
+    multiple=True,
+    metavar="PATTERN",
+    help="With --update: keep these of all 'TOPIC COLUMN' (repeatable) [default: all].",
+)
+@click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="PATTERN=RELATIVE",
+    help="With --update: how far apart, relative to its size, such a 'TOPIC COLUMN' may be (repeatable) "
+    "[default: 1e-12, 1e-6 on another CPU].",
+)
+@click.option("--junit", type=FILE, help="Write the results for continuous integration, as JUnit's XML.")
+@json_option
+@settings_option
+@set_option
+def check(path: Path, golden: Path, **options: Any) -> None:
+    """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
+
+    It exits with 1 where something is different, and prints the first difference with its stamp. An
+    intended change updates the golden in the same commit.
+    """
+    from pipeline.checking.command import check_path
+
+    if not check_path(path, golden, **options):
+        click.get_current_context().exit(1)
