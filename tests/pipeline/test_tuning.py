@@ -294,6 +294,7 @@ def test_other_things_can_be_best(
     assert f"by {by} there are no intervals, and other values may do as well" in found.notes
 
 
+@pytest.mark.paper
 def test_folds_and_a_grid(seen: list[fl.MemorySource]) -> None:
     """Each run judges what the other gives; a grid leads to where the search ends in any case."""
     free = ["sigma_range_m", "sigma_bearing_rad"]
@@ -422,6 +423,7 @@ def test_a_start_ten_times_off_leads_to_the_same_optimum(
                 assert row["low"] <= row["far"] <= row["high"] or is_said, (changed, factor, row)
 
 
+@pytest.mark.paper
 def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:
     """Values of every run and parameter, and over the runs how often their intervals hold the truth."""
     out = tmp_path / "tuning"

@@ -124,6 +124,7 @@ def test_what_can_be_estimated_is_listed() -> None:
     assert fl.models["robot"].facts["estimable"] == listed
 
 
+@pytest.mark.paper
 def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
     """And the pose is as good as its covariance says, which without them it is not."""
     runs, true = 40, {"bias_range_m": 0.2, "turn_bias_radps": 0.02}
