@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.stats import qmc
 
 from pipeline.campaigns import judge_all
 from pipeline.charts import Axis, Chart, Panel, band, curve
@@ -119,6 +118,8 @@ def points_of(
         ]
     rng = np.random.default_rng(seed)
     if sampling == "sobol":
+        from scipy.stats import qmc  # which takes long to import
+
         sampler = qmc.Sobol(len(over), rng=rng)
         uniform = sampler.random_base2(math.ceil(math.log2(samples)))[:samples]
     else:

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import chi2, kurtosis
+from scipy.stats import kurtosis
 
 from pipeline.diagnosing.hypotheses import Kind
 from recorders.log import Stream
+from replay.distributions import chi2
 from replay.judging.evaluation import split_topic
 from replay.judging.whiteness import whitened, whiteness
 

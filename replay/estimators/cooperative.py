@@ -15,12 +15,12 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.planar import drive
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Block, Ragged
 from replay.engine.channels import given_or_stated, numbered

@@ -13,13 +13,13 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.models.vehicles import noise_moments
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.blocks import Block, Ragged
 from replay.engine.channels import bindings, given_or_stated

@@ -13,12 +13,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.channels import numbered

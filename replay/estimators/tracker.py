@@ -22,11 +22,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated

@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 from recorders.errors import BadInput
 
@@ -91,6 +89,9 @@ class _Costs(NamedTuple):
 
 def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float) -> _Costs:
     """Pair as many points as there are, at the least cost."""
+    from scipy.optimize import linear_sum_assignment  # these take long to import
+    from scipy.spatial.distance import cdist
+
     if not (0.0 < cutoff < np.inf and 1.0 <= order < np.inf):
         raise BadInput(f"cutoff {cutoff:g}, order {order:g}: a positive cutoff and an order from 1 on")
     first, second = _points(estimates, "estimates"), _points(truths, "truths")

@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
@@ -289,6 +288,8 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 
     Raises BadInput where one has no stamps, or its speed never changes.
     """
+    from scipy.optimize import minimize_scalar  # which takes long to import
+
     trajectories = [estimate, truth]
     times: list[Floats] = [_stamps(each).astype(float) * 1e-9 for each in trajectories]
     step_s = max(float(np.median(np.diff(each))) if len(each) > 2 else 0.0 for each in times)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.random import Generator
-from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
@@ -49,6 +48,8 @@ def lcd_samples(
     Raises:
         BadInput: the set could not have a regular covariance, see `check_count`.
     """
+    from scipy.optimize import minimize  # which takes long to import
+
     check_count(dimension, count, symmetric)
     free = count // 2 if symmetric else count
     weights = np.full(count, 1 / count)

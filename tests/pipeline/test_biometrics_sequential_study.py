@@ -51,6 +51,7 @@ def test_matchers_that_are_never_sure_watch_nothing(drawn):
         list(watched(drawn, unsure, np.random.default_rng(2)))
 
 
+@pytest.mark.paper
 def test_simulated_scores_give_every_claim_and_need_ratios_of_all_pairs(tmp_path):
     name, experiment = load_experiment(
         "biometrics-sequential-simulated",

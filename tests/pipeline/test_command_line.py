@@ -297,6 +297,15 @@ def test_help_imports_nothing_heavy() -> None:
     assert said.splitlines()[-1] == "0"
 
 
+def test_a_command_imports_nothing_heavy_that_it_does_not_need() -> None:
+    code = (
+        "import sys; import pipeline.commands; "
+        "print(*{'matplotlib', 'rerun', 'scipy.optimize', 'shapely', 'sklearn'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == []
+
+
 @pytest.mark.paper
 @pytest.mark.usefixtures("here")
 def test_output_in_a_narrow_terminal_and_beyond_its_encoding(

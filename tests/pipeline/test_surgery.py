@@ -192,6 +192,7 @@ def test_what_is_no_column_is_counted_and_said(log: Path, fuselog: Fuselog) -> N
     assert not Path("texts.mcap").exists()
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_a_body_that_stands_does_not_drift(tmp_path: Path, fuselog: Fuselog) -> None:
     """A person waits for 20 s without fixes: the unit knows, and where they walk it says nothing."""

@@ -36,6 +36,7 @@ def test_samples_fill_the_ranges_and_follow_from_the_seed(sampling):
     assert np.log10(table["a"]).mean() == pytest.approx(1.0, abs=0.02 if sampling == "sobol" else 0.3)
 
 
+@pytest.mark.paper
 def test_a_sweep_gives_at_every_point_what_a_run_gives(tmp_path, capsys):
     swept = ["--over", "ekf.sigma_range_m=0.05,0.4", "--over", "ekf.gate_probability=0.9,1.0"]
     assert main(["sweep", "landmarks", *swept, *SHORT, "--out", str(tmp_path / "sweep"), "--json"]) == 0

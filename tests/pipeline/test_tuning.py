@@ -294,6 +294,7 @@ def test_other_things_can_be_best(
     assert f"by {by} there are no intervals, and other values may do as well" in found.notes
 
 
+@pytest.mark.paper
 def test_folds_and_a_grid(seen: list[fl.MemorySource]) -> None:
     """Each run judges what the other gives; a grid leads to where the search ends in any case."""
     free = ["sigma_range_m", "sigma_bearing_rad"]
@@ -404,16 +405,17 @@ def test_what_need_not_be_positive_is_found_too() -> None:
 def test_a_start_ten_times_off_leads_to_the_same_optimum(
     scenario: str, duration: dict[str, Any], estimator: str, free: list[str]
 ) -> None:
-    """Each parameter and all together, times and divided by ten: within a hundredth of the likelihood.
+    """All parameters together, times and divided by ten: within a hundredth of the likelihood.
 
-    What logs tell so little of that this leaves it more than its interval is said in words.
+    And each alone, of the robot. What logs tell so little of that this leaves it more than its interval
+    is said in words.
     """
     log = fl.record(scenario, seed=1, **duration)
     near = fl.tune(log, estimator, free)
     starts = near.parameters.set_index("parameter")["start"]
     bounds = {each.name: (each.low, each.high) for each in near.found.coordinates.free}
     for factor in (0.1, 10.0):
-        for changed in (free, *([name] for name in free)):
+        for changed in (free, *([name] for name in free if scenario == "landmarks")):
             far = fl.tune(log, estimator, free, set=dict(factor * starts[changed]), bounds=bounds)
             assert far.costs[1] == pytest.approx(near.costs[1], abs=0.01), (changed, factor)
             for row in near.parameters.assign(far=far.found.optimum).to_dict("records"):
@@ -421,6 +423,7 @@ def test_a_start_ten_times_off_leads_to_the_same_optimum(
                 assert row["low"] <= row["far"] <= row["high"] or is_said, (changed, factor, row)
 
 
+@pytest.mark.paper
 def test_the_experiment_of_tuned_noise(fuselog: Fuselog, tmp_path: Path) -> None:
     """Values of every run and parameter, and over the runs how often their intervals hold the truth."""
     out = tmp_path / "tuning"

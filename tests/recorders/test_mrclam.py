@@ -190,6 +190,7 @@ def test_filters_localize_the_robots_of_set_6(name: str, set_6: MemorySource):
         assert errors.without_truth >= after_its_end.sum()
 
 
+@pytest.mark.paper
 def test_dead_reckoning_drifts_where_the_landmarks_hold(set_6: MemorySource):
     """The RMSE above is the landmarks' doing: without them it is metres."""
     outputs = collect(replay([set_6], bind("dead-reckoning", [set_6], {})))

@@ -64,6 +64,7 @@ def errors_deg(model: Model, disturbance_ut: float, **values: Any) -> tuple[np.n
     return error, state, found["innovation"].stream
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_bias_and_orientation_are_found_in_motion():
     """There is an estimate at every sample; velocity and field are measured once a second."""
@@ -77,6 +78,7 @@ def test_bias_and_orientation_are_found_in_motion():
     assert np.abs(deviation / sigma).max() < 3.0
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_a_disturbed_field_is_kept_out_by_the_gate_and_turns_the_heading_without_it():
     error, _, innovation = errors_deg(ATTITUDE, 25.0)

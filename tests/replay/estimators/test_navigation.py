@@ -72,6 +72,7 @@ def test_a_body_on_a_circle_stays_on_it():
     assert_allclose(state[:6], (radius, 0.0, 0.0, 0.0, speed, 0.0), atol=1e-3)
 
 
+@pytest.mark.paper
 def test_the_model_is_what_it_says():
     check_model(INERTIAL, {"origin_latitude_deg": 40.0})
 
