@@ -115,7 +115,7 @@ def test_a_start_is_as_near_to_the_truth_as_it_says(carrier: str):
     ],
 )
 def test_what_is_not_given_of_a_start_is_found_honestly(carrier: str, given: dict[str, Any]):
-    """Of 30 starts the mean square of each component's error is no more than its variance, but by chance.
+    """Of 30 starts the mean square of a component is no more than its variance, but by chance.
 
     A person's heading swings about the course; fixes err by half a metre, and are used once more.
     """
