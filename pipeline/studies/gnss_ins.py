@@ -36,7 +36,7 @@ from pipeline.studies.outages import (
     withheld,
 )
 from recorders.errors import BadInput
-from recorders.importers.tables.mapping import read_mapping, recordings_in
+from recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
 from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.blocks import Ragged
@@ -81,7 +81,7 @@ class GnssInsOptions(Parameters):
         apart: windows share a run that are so many times `every_s` apart.
         settle_s: fixes are used from so long after the first inertial sample on.
         innovations_from_s: from when on innovations count.
-        delayed: the label of a smoother that ignores the delay of the velocity, if there is one.
+        delayed: the label of a smoother that takes back the mapping's delay of the velocity, if any.
         sheet: what claims about one recording are held to; others have none of them.
     """
 
@@ -108,7 +108,7 @@ class Innovations(NamedTuple):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: GnssInsOptions = setting.options
-    folder = recording_of(experiment, setting)
+    experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)
     # the longest come first: the first run is drawn
     windows = {
@@ -173,6 +173,20 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
         names = ", ".join(str(folder) for folder in folders)
         raise BadInput(f"{setting.data}: has several recordings; give one of {names} with --data")
     return folders[0]
+
+
+def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
+    """The experiment whose estimator `delayed` takes velocities for those of their rows' stamps."""
+    assert experiment.import_ is not None
+    values = experiment.import_.parameters
+    if options.delayed not in experiment.estimators:
+        return experiment
+    mapping = adapted(read_mapping(str(values["mapping"])), delays_s=values.get("delays_s"))
+    streams = [stream for table in mapping.tables for stream in table.streams]
+    delay_s = next((stream.delay_s for stream in streams if stream.topic == VELOCITY), 0.0)
+    delayed = {**experiment.estimators[options.delayed], "velocity_delay_s": -delay_s}
+    estimators = {**experiment.estimators, options.delayed: delayed}
+    return experiment.model_copy(update={"estimators": estimators})
 
 
 def _recording(
