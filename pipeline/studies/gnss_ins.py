@@ -40,6 +40,7 @@ from recorders.importers.tables.mapping import adapted, read_mapping, recordings
 from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.blocks import Ragged
+from replay.engine.failures import sentences_of
 from replay.engine.sources import Ensemble, MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # of three components
@@ -149,15 +150,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     end = dict(zip(last.components, last["mean"][-1].tolist(), strict=True))
     for name in [each for each in end if "_bias_" in each]:
         outcome.metrics[f"{options.filter}.end_{name}"] = end[name]
+    begun = sentences_of(replayed.outputs[f"/estimates/{options.filter}/started"].of_run(len(runs)))
+    notes = [*whole.run.notes.items(), *((sentence, "") for sentence in begun)]
     outcome.tables |= {
         "summary": summary_table(outcome.metrics),
         "outages": by_length,
         "windows": by_window,
         "errors": errors.drop(columns="nees"),
-        "notes": pd.DataFrame(whole.run.notes.items(), columns=["what", "count"]),
+        "notes": pd.DataFrame(notes, columns=["what", "count"]),
     }
     outcome.figures["outages"] = _chart(errors)
-    outcome.claims = _claims(by_length, options)
+    outcome.claims = _claims(by_length, begun[0].partition("; ")[2], options)
     if options.sheet is not None and folder.name == options.sheet.recording:
         outcome.claims += _claims_of_sheet(by_length, kinds, end, options, options.sheet)
     return outcome
@@ -248,8 +251,8 @@ def _chart(errors: pd.DataFrame) -> Chart:
     return Chart(panels=panels, columns=len(panels))
 
 
-def _claims(by_length: pd.DataFrame, options: GnssInsOptions) -> list[Claim]:
-    """What is expected of every recording."""
+def _claims(by_length: pd.DataFrame, doubt: str, options: GnssInsOptions) -> list[Claim]:
+    """What is expected of every recording, and what its start leaves in doubt."""
     over = by_length.pivot_table("over_rmse_m", "length_s", "estimator")
     end = by_length.pivot_table("end_rmse_m", "length_s", "estimator")
     nees = by_length.pivot_table("end_nees", "length_s", "estimator")[options.filter]
@@ -272,6 +275,7 @@ def _claims(by_length: pd.DataFrame, options: GnssInsOptions) -> list[Claim]:
             "mean NEES of 2 components .3 to 5, of few windows",
             listed(nees, 2, ", "),
             bool(nees.between(0.3, 5.0).all()),
+            doubt,
         ),
     ]
 

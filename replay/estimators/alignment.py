@@ -15,8 +15,15 @@ from scipy.integrate import cumulative_trapezoid
 
 from recorders.errors import BadInput
 from recorders.log import Stream
-from recorders.models.inertial import EARTH_RATE_RADPS, from_mounting, into_body, product, rotation
-from recorders.models.planar import wrap_angle
+from recorders.models.inertial import (
+    EARTH_RATE_RADPS,
+    from_mounting,
+    into_body,
+    into_plane,
+    product,
+    rotation,
+)
+from recorders.models.planar import Components, wrap_angle
 from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats, Integers
 from replay.engine.components import components_of
@@ -30,6 +37,7 @@ SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
 USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
+SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
 PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
 VELOCITY = components_of(NAVIGATION[3:6])
 _NS = 1e-9
@@ -139,18 +147,20 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
     covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
     roll, pitch = _tilt(samples, topic, parameters)
+    tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     heading, heading_sigma, bias_sigma = 0.0, np.pi, USUAL_BIAS_RADPS
     if moving is not None:
         row = int(np.argmin(np.abs(moving.time_ns - start_ns)))
         spread = moving.covariance[row]
         mean[3:6], covariance[3:6, 3:6] = moving.mps[row], _wide(parameters.start_sigma_mps, spread)
         mean[10:13], bias_sigma = _bias(samples, topic, moving, row, parameters)
-        found = _heading(samples, start_ns, moving, row, (roll, pitch), mean[10:13], parameters)
+        turning = _turned(samples, start_ns, tilted, mean[10:13])
+        found = _heading(turning, start_ns, moving, row, parameters)
         if found is not None:
             heading, heading_sigma = found[0], _given(parameters.heading_sigma_rad, found[1])
             how = "levelled, its heading the course"
+            how += _mounting(samples, turning, start_ns, moving, tilted, heading, parameters)
         how += _leap(samples, moving, row, parameters)
-    tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
     force_variance = parameters.force_bias_sigma_mps2**2 * np.eye(3)
@@ -319,8 +329,7 @@ def _bias(
             "like deg/s: import it with that unit"
         )
     since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * _NS
-    stretch = (since_s / parameters.level_s).astype(np.int64)
-    count = np.bincount(stretch)
+    _, stretch, count = np.unique(since_s // parameters.level_s, return_inverse=True, return_counts=True)
     if len(count) < 3:
         return bias, USUAL_BIAS_RADPS
     means = np.stack([np.bincount(stretch, each) for each in samples.rate[at_rest].T]) / count
@@ -350,14 +359,17 @@ def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
     )
 
 
+def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
+    """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
+    since = samples.time_ns >= start_ns
+    since_s = (samples.time_ns[since] - start_ns) * _NS
+    up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
+    rate = (samples.rate[since] - bias) @ up
+    return since_s, cumulative_trapezoid(rate, since_s, initial=0.0)
+
+
 def _heading(
-    samples: _Samples,
-    start_ns: int,
-    moving: _Moving,
-    row: int,
-    tilt: tuple[float, float],
-    bias: Floats,
-    parameters: Any,
+    turning: tuple[Floats, Floats], start_ns: int, moving: _Moving, row: int, parameters: Any
 ) -> tuple[float, float] | None:
     """The heading at the start, rad, and its standard deviation; None where nothing moves.
 
@@ -367,19 +379,50 @@ def _heading(
     fast = moving.first_above(row, parameters.course_mps)
     if fast is None:
         return None
-    roll, pitch = tilt
-    up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
-    since = samples.time_ns >= start_ns
-    since_s = (samples.time_ns[since] - start_ns) * _NS
-    turned = cumulative_trapezoid((samples.rate[since] - bias) @ up, since_s, initial=0.0)
     until_ns = moving.time_ns[fast] + round(parameters.course_s / _NS)
     rows = np.arange(fast, np.searchsorted(moving.time_ns, until_ns))
+    rows = rows[np.hypot(*moving.mps[rows, :2].T) > parameters.course_mps]
     east, north, _ = moving.mps[rows].T
-    speed = np.hypot(east, north)
-    rows, course = rows[speed > parameters.course_mps], np.arctan2(north, east)
-    heading = course[speed > parameters.course_mps] - np.interp(
-        (moving.time_ns[rows] - start_ns) * _NS, since_s, turned
-    )
+    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * _NS, *turning)
     apart = wrap_angle(heading - heading[0])
-    noise = moving.covariance[rows[0], :2, :2].trace() / 2.0 / speed[0] ** 2
+    noise = moving.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
     return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
+
+
+def _mounting(
+    samples: _Samples,
+    turning: tuple[Floats, Floats],
+    start_ns: int,
+    moving: _Moving,
+    tilted: Components,
+    heading: float,
+    parameters: Any,
+) -> str:
+    """What to say where the body accelerates in another direction than its velocity changes.
+
+    Both are compared over the intervals of the velocities, in the plane and as complex numbers.
+    """
+    since_s, turned = turning
+    fast = moving.first_above(0, parameters.course_mps)
+    end_s = (
+        since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * _NS + parameters.course_s
+    )
+    stamps_s = (moving.time_ns - start_ns) * _NS
+    rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
+    if len(rows) < 3:
+        return ""
+    ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
+    gained = cumulative_trapezoid(
+        (ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s, initial=0.0
+    )
+    felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
+    seen = np.diff(moving.mps[rows, 0] + 1j * moving.mps[rows, 1])
+    together = np.vdot(felt, seen)
+    apart = float(np.angle(together))
+    if abs(together) < ALIKE * np.linalg.norm(felt) * np.linalg.norm(seen) or abs(apart) < SIDEWAYS_RAD:
+        return ""
+    yaw = wrap_angle(parameters.mounting_yaw_rad + apart)
+    return (
+        f"; it speeds up {np.degrees(abs(apart)):.0f} deg to the {'left' if apart > 0 else 'right'} of "
+        f"where it seems to: is the unit mounted otherwise? mounting_yaw_rad={yaw:.2f} would fit"
+    )

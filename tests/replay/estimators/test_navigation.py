@@ -1,5 +1,6 @@
 """Inertial navigation: its mathematics, its start, and the targets of the reference sheet."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,17 @@ def test_a_bias_of_the_accelerometer_and_the_tilt_go_together():
     left = np.sqrt(np.diag(tilt - both @ np.linalg.solve(force, both.T)))
     assert np.abs(error[6:8]).max() > 5.0 * left.max()
     assert np.abs(error[6:8] - explained).max() < 3.0 * left.max()
+
+
+@pytest.mark.parametrize("yaw_deg", [90.0, 180.0, -90.0])
+def test_a_unit_that_is_mounted_otherwise_is_told_by_where_it_speeds_up(yaw_deg: float):
+    """And what turns it is said; of one that is mounted as stated nothing is."""
+    streams = simulated(duration_s=30.0, prior={"is_told": False})
+    assert "mounted" not in align(streams, NavigationParameters()).how
+    how = align(streams, NavigationParameters(mounting_yaw_rad=np.radians(yaw_deg))).how
+    said = re.search(r"is the unit mounted otherwise\? mounting_yaw_rad=(\S+) would fit", how)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(0.0, abs=0.05)
 
 
 def test_without_velocities_the_heading_is_unknown():
