@@ -362,10 +362,10 @@ def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
 def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
     """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
     since = samples.time_ns >= start_ns
-    since_s = (samples.time_ns[since] - start_ns) * _NS
+    since_s = np.asarray((samples.time_ns[since] - start_ns) * _NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
     rate = (samples.rate[since] - bias) @ up
-    return since_s, cumulative_trapezoid(rate, since_s, initial=0.0)
+    return since_s, np.asarray(cumulative_trapezoid(rate, since_s, initial=0.0))
 
 
 def _heading(
