@@ -153,7 +153,8 @@ def _bind_fitting(
             fitting = named_alike or fitting
     if len(fitting) > 1:
         raise BadInput(
-            f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with --model NAME"
+            f"estimator {label}: models {' and '.join(fitting)} fit this log; choose with "
+            f"{' or '.join(f'--model {name}' for name in fitting)}"
         )
     if not fitting:
         which = f"estimator {label}: model {named}" if named else f"estimator {label}"

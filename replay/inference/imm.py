@@ -206,7 +206,8 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         of_run(weighed_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
-    return Steps(memory, predict, updates, estimate, sampled)
+    resumes = all(each.resumes for each in filters)
+    return Steps(memory, predict, updates, estimate, sampled, resumes)
 
 
 def predicting(filters: Sequence[Steps]) -> Function:

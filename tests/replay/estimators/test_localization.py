@@ -492,7 +492,7 @@ def test_what_no_run_can_use_is_bad_input():
             replayed("ekf", [replace(source, streams={**source.streams, "/robot1/prior": stream})])
     odometry = source.streams["/robot1/odometry"]
     for stated, words in (
-        ({}, "does not state forward_noise_density; give it with --set"),
+        ({}, "does not state forward_noise_density, turn_noise_density; give them with --set"),
         (
             {"forward_noise_density": "nan"},
             "/robot1/odometry: parameter 'forward_noise_density' is nan; it should be a finite number",
