@@ -293,7 +293,9 @@ def recursive(
     [5.0, 3.0, 3.0]
     """
     if (follow is None) == (follow_all is None):
-        raise BadInput(f"estimator '{summary}': give follow or follow_all")
+        raise BadInput(
+            f"estimator '{summary}': neither follow nor follow_all is given; give one of them"
+        )
     for leaf, schema in outputs.items():
         _require_numbers(summary, leaf, schema)
 
@@ -665,7 +667,7 @@ class _Outputs:
             if array.shape != wanted:
                 raise BadInput(
                     f"estimator {self.name}: {part}{name} has the shape {array.shape}; "
-                    f"{wanted} is wanted"
+                    f"{wanted} is needed"
                 )
         return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
 

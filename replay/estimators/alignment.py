@@ -25,17 +25,18 @@ _NS = 1e-9
 
 
 class AlignmentParameters(ModelParameters):
-    """What is taken for rest and for a course, and how well the start is known then.
+    """How the unit is mounted and delayed, and how the state at the start is found.
 
-    The unit is levelled by its first `level_s`. The body rests until `rest_margin_s` before it first
-    moves faster than `still_mps`. Its heading is the course at the first speed above `course_mps`, less
-    what the gyro has turned until then; where there is none, the heading is unknown. Standard deviations
-    are of the first position, its velocity, one that nothing measures, the tilt, the heading and the
-    biases.
+    Tilt comes from the first `level_s` seconds. The body is assumed to rest until `rest_margin_s`
+    before it first moves faster than `still_mps`. The heading is the course at the first speed above
+    `course_mps`, less the turn of the gyro until then; without such a speed it is unknown. The standard
+    deviations of the start are `start_sigma_m` of the position, `start_sigma_mps` of a velocity that is
+    measured and `unmeasured_sigma_mps` of one that is not, `tilt_sigma_rad`, `heading_sigma_rad`, and
+    those of the biases.
 
-    The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about left, of
-    roll about forward. An axis measures 1 + its scale times what is there, and the bias. A message was
-    measured its topic's delay before its stamp.
+    The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
+    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias. A message
+    was measured its topic's delay before its stamp.
     """
 
     mounting_roll_rad: float = 0.0
@@ -104,7 +105,10 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     samples = _samples(streams["inertial"], parameters)
     begin_ns = samples.time_ns[0]
     if "fix" not in streams:
-        raise BadInput(f"no position to begin {streams['inertial'].topic} at; give a topic of fixes")
+        raise BadInput(
+            f"no position is known from which {streams['inertial'].topic} could begin; give a topic of "
+            "fixes"
+        )
     fix, moving = streams["fix"], streams.get("velocity")
     fix_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
     usable = (fix_ns >= begin_ns) & (fix_ns <= samples.time_ns[-1])
@@ -183,7 +187,7 @@ def _samples(inertial: Stream, parameters: Any) -> _Samples:
     ]
     finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
     if not finite.any():
-        raise BadInput(f"topic {inertial.topic}: no samples to begin with")
+        raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / _NS)
     force, rate = (column[finite] for column in columns)
     return _Samples(time_ns, force, rate)
@@ -231,7 +235,8 @@ def _bias(samples: _Samples, topic: str, moving: Stream, row: int, parameters: A
     largest = float(np.abs(bias).max())
     if largest > LARGEST_BIAS_RADPS:
         raise BadInput(
-            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than any gyro errs; it looks "
+            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than the error of any gyro; "
+            "it looks "
             "like deg/s: import it with that unit"
         )
     return bias
@@ -254,7 +259,7 @@ def _leap(samples: _Samples, moving: Stream, row: int, parameters: Any) -> str:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {moving.topic} sets off {later_s:.3g} s after the unit: if one clock has the "
+        f"; {moving.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
         f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
         f"inertial_delay_s={shift_s:g} moves the unit's"
     )

@@ -158,7 +158,9 @@ def test_a_raw_recording_with_another_mounting_takes_settings_alone(navigation: 
 
 def test_several_recordings_and_none(tmp_path: Path):
     name, experiment = load_experiment("gnss-ins", {}, {})
-    with pytest.raises(BadInput, match=r"no folder there has the files of the mapping \(\*\.pos"):
+    with pytest.raises(
+        BadInput, match=r"neither it nor a folder in it has the files that the mapping names \(\*\.pos"
+    ):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
