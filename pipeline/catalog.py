@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.experiment import Experiment, load_scenario, shipped
 from pipeline.terminal import print_json, print_table, say
 from recorders.errors import BadInput, choices
-from recorders.parameters import build, describe
+from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
@@ -73,7 +73,7 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         print_json([_as_json(entry) for entry in entries])
     elif name is None:
         print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
-        say(f"All about one of them: fuselog {kind}s NAME")
+        say(f"For all about one of them: fuselog {kind}s NAME")
     else:
         _print_details(entries[0])
 
@@ -186,3 +186,5 @@ def _print_details(entry: Entry) -> None:
         table = [list(each) for each in describe(entry.parameters, entry.values)]
         if table:
             print_table(["parameter", "default", "accepts"], table)
+            for place, text in explain(entry.parameters).items():
+                say(f"\n{place}\n{text}" if place else f"\n{text}")

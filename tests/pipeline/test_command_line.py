@@ -417,7 +417,7 @@ def test_two_runs_into_one_folder_do_not_mix(fuselog: Fuselog) -> None:
     with result_folder(Path("r")) as theirs:
         said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
         assert said.code == 2
-        assert "another fuselog is writing it" in said.err
+        assert "another fuselog command is writing it" in said.err
         assert theirs.exists()
 
 

@@ -117,7 +117,7 @@ def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
             "--free sigma_rnge_m: no parameter 'sigma_rnge_m'; did you mean 'sigma_range_m'",
         ),
         ("gate_probability", {}, "--free gate_probability: "),
-        ("mode", {}, "--free mode: parameter 'mode' is no number"),
+        ("mode", {}, "--free mode: parameter 'mode' is not a number"),
         ([], {}, "--free: name at least one"),
         (["sigma_range_m"] * 2, {}, "--free sigma_range_m: is named twice"),
         (
@@ -130,7 +130,7 @@ def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
         (
             "sigma_range_m",
             {"bounds": {"sigma_bearing_rad": (0.1, 1)}},
-            "--bound sigma_bearing_rad: is not",
+            "--bound sigma_bearing_rad: this parameter is not",
         ),
         (
             "sigma_range_m",
@@ -243,7 +243,8 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     refused = fuselog("replay", world / "log.mcap", "-e", "ukf", "--settings", tuned, "-o", tmp_path)
     assert (refused.code, refused.err) == (
         2,
-        f"fuselog: {tuned}: has settings of ekf, and a settings file has a table for each estimator "
+        f"fuselog: {tuned}: has settings of ekf, which is not replayed; a settings file has a table "
+        "for each estimator "
         "that is replayed: ukf\n",
     )
     tune = (
@@ -259,7 +260,7 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     for options, sentence in (
         (("--bound", "sigma_range_m=1"), "--bound sigma_range_m=1: expected NAME=LOW:HIGH"),
         (("--by", "luck"), "Invalid value for '--by'"),
-        (("--settings", world / "garbled.toml"), "is not readable as TOML"),
+        (("--settings", world / "garbled.toml"), "cannot be read as TOML"),
     ):
         refused = fuselog(*tune, *options)
         assert (refused.code, len(refused.err.splitlines())) == (2, 1)
@@ -340,7 +341,7 @@ def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
     class Own(ScalarParameters):
         """Parameters that only this function knows."""
 
-    with pytest.raises(fl.BadInput, match="level: cannot go to another process"):
+    with pytest.raises(fl.BadInput, match="level: cannot be sent to another process"):
         fl.tune(
             source(np.ones(5)),
             {"level": fl.modelled(replace(SCALAR, parameters=Own), "ekf")},
