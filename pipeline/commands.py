@@ -399,7 +399,7 @@ def run_named(
         print_parameters(result.settings["parameters"])
     print_metrics(result.metrics, result.bounds)
     print_claims(result.claims)
-    say(f"{folder}: logs, estimates, tables, figures, result.json")
+    say(f"{folder}: {', '.join(result.contents)}")
 
 
 def _stated_experiment(

@@ -75,6 +75,11 @@ class Result(Parameters):
     files: dict[str, str | None] = {}
     bounds: dict[str, Bounds] = {}
 
+    @property
+    def contents(self) -> list[str]:
+        """The folders and files at the top of the result's folder."""
+        return [*dict.fromkeys(Path(name).parts[0] for name in self.files), RESULT_FILE]
+
 
 def split_metric(key: str) -> tuple[str, str, str]:
     """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`.
