@@ -89,7 +89,7 @@ def tune_logs(
     for sentence in found.notes:
         say(sentence)
     for each in found.replays:
-        print_metrics(plain(each.judge.metrics), each.judge.bounds)
+        print_metrics(plain(each.judge.metrics), each.judge.bounds, each.judge.runs_table)
     say(f"{out / SETTINGS}: for --settings; {out}: tables, figures, timeline, result.json")
 
 

@@ -279,6 +279,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     ),
     "report result-older": ("result-older/result.json", "an older fuselog", "write it again"),
     "report result-damaged": ("result-damaged", "run it again"),
+    "diagnose log.mcap other.mcap -e ekf": ("2 logs", "one log is diagnosed", "to fuselog tune"),
     # where to write
     "record landmarks --out folder": ("'folder' is a directory",),
     "record landmarks --out /dev/null": ("/dev/null", "no regular file"),

@@ -210,6 +210,7 @@ def test_the_worked_example_of_the_page(
     for (_, expected), (_, values) in zip(shown, printed, strict=True):
         assert [*map(float, values.split())] == pytest.approx([*map(float, expected.split())], rel=2e-3)
     assert re.search("logs held out: .*: better", told[2].out)
+    assert "(of 1 log, gate open; in the tables: the mean per log, with the gate)" in told[2].out
     result = read_result(Path("out/tune"))
     for label in ("tuned", "tuned-held-out"):
         assert result.metrics[f"{label}.nis_per_component.robot1"] == pytest.approx(1.0, abs=0.1)
