@@ -6,7 +6,10 @@ BIN := .venv/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 # --no-compile: Python compiles the modules that are imported, which are few of them
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
-.PHONY: demo test test-fast fast-lane studies-lane inference-lane papers-lane lint wheel mutants bench faults docs docs-claims format clean
+# commands are started some hundred times: what they import is compiled once, whatever is usual here
+export PYTHONDONTWRITEBYTECODE :=
+
+.PHONY: demo test test-fast fast-lane estimators-lane inference-lane pipeline-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -18,23 +21,24 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-# the fast tests, the long reproductions of papers and the linters, side by side
+# all tests, in three lanes of like length, and the linters, side by side; what is about one family is in
+# one lane, so that what its kernels share is compiled once
 test: .venv/with-test
-	$(MAKE) -j5 papers-lane fast-lane studies-lane inference-lane lint
+	$(MAKE) -j4 estimators-lane inference-lane pipeline-lane lint
 
 test-fast: lint fast-lane
 
 fast-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper"
 
-studies-lane: .venv/with-test
-	$(BIN)/pytest -m paper tests/pipeline
+estimators-lane: .venv/with-test
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py
 
 inference-lane: .venv/with-test
-	$(BIN)/pytest -m paper tests/replay/inference
+	$(BIN)/pytest tests/replay --ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
 
-papers-lane: .venv/with-test
-	$(BIN)/pytest -m paper --ignore=tests/pipeline --ignore=tests/replay/inference
+pipeline-lane: .venv/with-test
+	$(BIN)/pytest --ignore=tests/replay
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.experiment import Experiment, load_scenario, shipped
 from pipeline.terminal import print_json, print_table, say
 from recorders.errors import BadInput, choices
-from recorders.parameters import build, describe
+from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
@@ -78,7 +78,7 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         print_json([_as_json(entry) for entry in entries])
     elif name is None:
         print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
-        say(f"All about one of them: fuselog {kind}s NAME")
+        say(f"For all about one of them: fuselog {kind}s NAME")
     else:
         _print_details(entries[0])
 
@@ -196,6 +196,8 @@ def _print_details(entry: Entry) -> None:
         ]
         if table:
             print_table(["parameter", "default", "accepts"], table)
+            for place, text in explain(entry.parameters).items():
+                say(f"\n{place}\n{text}" if place else f"\n{text}")
 
 
 def _default(value: object, *, is_stated: bool) -> object:

@@ -14,5 +14,5 @@ def logs_in(path: Path) -> list[Path]:
         return [path]
     files = [each for each in sorted(path.glob("*.mcap")) if not each.match("*.estimates.mcap")]
     if not files:
-        raise BadInput(f"{path}: holds no logs to replay; give a log, or a folder with some")
+        raise BadInput(f"{path}: has no logs to replay; give a log, or a folder or result with some")
     return files

@@ -187,11 +187,12 @@ def _require_ours(found: Path, place: Path) -> None:
         result = read_result(found)
     except BadInput:
         raise BadInput(
-            f"{place}: exists and is no fuselog result; give another folder with --out"
+            f"{place}: exists and is not a result of fuselog; give another folder with --out"
         ) from None
     if _sealed(result) != result:
         raise BadInput(
-            f"{place / RESULT_FILE}: was changed, or an older fuselog wrote it; give another --out"
+            f"{place / RESULT_FILE}: was changed since fuselog wrote it, or an older version wrote it; "
+            "give another --out"
         )
     expected = {Path(name): digest for name, digest in result.files.items()}
     parents = {parent for name in expected for parent in name.parents}
@@ -347,11 +348,11 @@ def read_result(folder: Path) -> Result:
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
-        raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
+        raise BadInput(f"{folder}: has no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
-        raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+        raise BadInput(f"{path}: is not a result of fuselog run; run the experiment again")
     check_format(path, values.get("format", 1), FORMAT)
     return build(Result, values, str(path))
 

@@ -85,10 +85,10 @@ def runs_of(path: Path) -> Runs:
     else:
         files = logs_in(path)
     if not files:
-        raise BadInput(f"{path}: holds no logs to replay; give a log, or a result that keeps some")
+        raise BadInput(f"{path}: has no logs to replay; give a log, or a result that keeps its logs")
     runs = {file.name: LogSource(open_log(file)) for file in files}
     if len(runs) < len(files):
-        raise BadInput(f"{path}: two of its logs have one name; check them one by one")
+        raise BadInput(f"{path}: two of its logs have the same name; check them one by one")
     return runs
 
 
@@ -112,7 +112,7 @@ def update(
         stated = read_result(path).settings
     chosen = estimators or stated.get("estimators", {})
     if not chosen:
-        raise BadInput(f"{path}: say what its golden is of, such as -e ekf")
+        raise BadInput(f"{path}: name the estimators that the golden is to have, such as -e ekf")
     kept = None if before is None else before["tolerances"]
     golden = make(
         runs_of(path),

@@ -6,10 +6,9 @@ from functools import partial
 from os import cpu_count
 from typing import NamedTuple
 
-from scipy.stats import chi2
-
 from pipeline.diagnosing.hypotheses import Hypothesis
 from pipeline.diagnosing.likelihood import Gains, Likelihood, Peak, Trial, interval, peak
+from replay.distributions import chi2
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out

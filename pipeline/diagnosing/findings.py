@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import chi2, kurtosis
+from scipy.stats import kurtosis
 
 from pipeline.diagnosing.hypotheses import Kind
 from recorders.log import Stream
+from replay.distributions import chi2
 from replay.judging.evaluation import split_topic
 from replay.judging.whiteness import whitened, whiteness
 
@@ -89,7 +90,7 @@ def of_innovations(
                 topic,
                 f"{case}: the gate keeps out all {end - begin} measurements from "
                 f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}: the filter "
-                "has lost its way, and what would bring it back is kept out; --set gate_probability=1, "
+                "has drifted away, and what would correct it is kept out; --set gate_probability=1, "
                 "or gate_reopens_s=1",
                 int(times_ns[begin]),
             )

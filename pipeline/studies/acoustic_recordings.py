@@ -9,7 +9,6 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 from pydantic import Field, PositiveFloat, PositiveInt
-from scipy.stats import chi2
 
 from pipeline.charts import Axis, Chart, Panel, curve
 from pipeline.claims import Claim, judged
@@ -20,6 +19,7 @@ from pipeline.runner import Runner
 from pipeline.studies.repetitions import share_holds
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Floats
 from replay.engine.sources import MemorySource
 from replay.judging.evaluation import Errors, chi_square_interval
@@ -118,7 +118,9 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
                 )
             )
     if not tables:
-        raise BadInput("the log has no topic of differences (fuselog.ArrivalDifference)")
+        raise BadInput(
+            "the log has no arrival differences (fuselog.ArrivalDifference); give recordings of sounds"
+        )
     return pd.concat(tables, ignore_index=True)
 
 

@@ -36,10 +36,11 @@ from pipeline.studies.outages import (
     withheld,
 )
 from recorders.errors import BadInput
-from recorders.importers.tables.mapping import read_mapping, recordings_in
+from recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
 from recorders.parameters import Parameters
 from recorders.recording import import_run
 from replay.engine.blocks import Ragged
+from replay.engine.failures import sentences_of
 from replay.engine.sources import Ensemble, MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # of three components
@@ -81,7 +82,7 @@ class GnssInsOptions(Parameters):
         apart: windows share a run that are so many times `every_s` apart.
         settle_s: fixes are used from so long after the first inertial sample on.
         innovations_from_s: from when on innovations count.
-        delayed: the label of a smoother that ignores the delay of the velocity, if there is one.
+        delayed: the label of a smoother that takes back the mapping's delay of the velocity, if any.
         sheet: what claims about one recording are held to; others have none of them.
     """
 
@@ -108,7 +109,7 @@ class Innovations(NamedTuple):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: GnssInsOptions = setting.options
-    folder = recording_of(experiment, setting)
+    experiment, folder = ignoring_delay(experiment, options), recording_of(experiment, setting)
     whole, rows = _recording(experiment, folder, options)
     # the longest come first: the first run is drawn
     windows = {
@@ -123,7 +124,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     ]
     if not runs:
         raise BadInput(
-            f"{folder}: no window of {listed(options.lengths_s, 0, ', ')} s has a truth all over; "
+            f"{folder}: no window of {listed(options.lengths_s, 0, ', ')} s has a truth throughout; "
             "options.first_s, options.every_s and options.lengths_s move them"
         )
     runner = Runner(experiment, setting)
@@ -149,15 +150,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     end = dict(zip(last.components, last["mean"][-1].tolist(), strict=True))
     for name in [each for each in end if "_bias_" in each]:
         outcome.metrics[f"{options.filter}.end_{name}"] = end[name]
+    begun = sentences_of(replayed.outputs[f"/estimates/{options.filter}/started"].of_run(len(runs)))
+    notes = [*whole.run.notes.items(), *((sentence, "") for sentence in begun)]
     outcome.tables |= {
         "summary": summary_table(outcome.metrics),
         "outages": by_length,
         "windows": by_window,
         "errors": errors.drop(columns="nees"),
-        "notes": pd.DataFrame(whole.run.notes.items(), columns=["what", "count"]),
+        "notes": pd.DataFrame(notes, columns=["what", "count"]),
     }
     outcome.figures["outages"] = _chart(errors)
-    outcome.claims = _claims(by_length, options)
+    outcome.claims = _claims(by_length, begun[0].partition("; ")[2], options)
     if options.sheet is not None and folder.name == options.sheet.recording:
         outcome.claims += _claims_of_sheet(by_length, kinds, end, options, options.sheet)
     return outcome
@@ -173,6 +176,20 @@ def recording_of(experiment: Experiment, setting: Setting) -> Path:
         names = ", ".join(str(folder) for folder in folders)
         raise BadInput(f"{setting.data}: has several recordings; give one of {names} with --data")
     return folders[0]
+
+
+def ignoring_delay(experiment: Experiment, options: GnssInsOptions) -> Experiment:
+    """The experiment whose estimator `delayed` takes velocities for those of their rows' stamps."""
+    assert experiment.import_ is not None
+    values = experiment.import_.parameters
+    if options.delayed not in experiment.estimators:
+        return experiment
+    mapping = adapted(read_mapping(str(values["mapping"])), delays_s=values.get("delays_s"))
+    streams = [stream for table in mapping.tables for stream in table.streams]
+    delay_s = next((stream.delay_s for stream in streams if stream.topic == VELOCITY), 0.0)
+    delayed = {**experiment.estimators[options.delayed], "velocity_delay_s": -delay_s}
+    estimators = {**experiment.estimators, options.delayed: delayed}
+    return experiment.model_copy(update={"estimators": estimators})
 
 
 def _recording(
@@ -234,8 +251,8 @@ def _chart(errors: pd.DataFrame) -> Chart:
     return Chart(panels=panels, columns=len(panels))
 
 
-def _claims(by_length: pd.DataFrame, options: GnssInsOptions) -> list[Claim]:
-    """What is expected of every recording."""
+def _claims(by_length: pd.DataFrame, doubt: str, options: GnssInsOptions) -> list[Claim]:
+    """What is expected of every recording, and what its start leaves in doubt."""
     over = by_length.pivot_table("over_rmse_m", "length_s", "estimator")
     end = by_length.pivot_table("end_rmse_m", "length_s", "estimator")
     nees = by_length.pivot_table("end_nees", "length_s", "estimator")[options.filter]
@@ -258,6 +275,7 @@ def _claims(by_length: pd.DataFrame, options: GnssInsOptions) -> list[Claim]:
             "mean NEES of 2 components .3 to 5, of few windows",
             listed(nees, 2, ", "),
             bool(nees.between(0.3, 5.0).all()),
+            doubt,
         ),
     ]
 

@@ -14,7 +14,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from pydantic import Field, PositiveInt
 from scipy.spatial.distance import pdist
-from scipy.stats import chi2
 
 from pipeline.claims import Claim, judged
 from pipeline.experiment import Experiment, Setting, Study
@@ -22,6 +21,7 @@ from pipeline.results import Outcome
 from recorders.log import LogWriter, RunMetadata, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import SIMULATION_EPOCH_NS
+from replay.distributions import chi2
 from replay.engine.blocks import Ragged, gather
 from replay.engine.sources import MemorySource
 from replay.sampling import Samples, lcd_distance, lcd_samples, moment_corrected, parse_sampling

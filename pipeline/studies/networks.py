@@ -71,7 +71,7 @@ def _after(errors: Errors, settle_s: float) -> Errors:
     kept = errors.elapsed_s > settle_s + 1e-9
     if not kept.any():
         raise BadInput(
-            f"{errors.estimator} {errors.case} estimates nothing after settle_s = {settle_s:g} s; "
+            f"{errors.estimator} {errors.case} has no estimates after settle_s = {settle_s:g} s; "
             "record more steps"
         )
     columns = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")

@@ -42,6 +42,7 @@ POSE, POSE_TANGENT = 10, 9
 POSE_KINDS = ("linear",) * 6 + ("quaternion",) * 4
 # So much of the logarithm of the generalised variance may be left to gain.
 _CI_TOLERANCE = 1e-3
+FARTHEST_S = 5.0  # as wide a search for an offset goes on
 ONE, MEAN, INTERSECTION = "one", "mean", "intersection"
 KNOWN, ESTIMATED, IGNORED = "known", "estimated", "ignored"
 PRIOR_SIGMA = np.concatenate(
@@ -68,7 +69,8 @@ class QuadInertialOptions(Parameters):
         filter, smoother: the labels of the estimators.
         offsets_s: what is to be added to the stamps of the units, by the recording's folder; of others
             it is what has the greatest likelihood.
-        search_s: the least and the greatest offset that are tried, and the step.
+        search_s: the least and the greatest offset that are tried at first, and the step; where one of
+            them is best, others beyond it are.
         truth_sigma_m: of the truth's positions where they stand for fixes in that search.
         scored_from_s: from when on errors count.
         sheet: rows of an independent implementation, for one unit.
@@ -165,7 +167,10 @@ def flight_of(name: str, source: MemorySource) -> Flight:
     """A recording of the mapping `quadrotor`; raises BadInput where it has no units, or no truth."""
     topics = sorted(topic for topic in source.topics if re.fullmatch(r"/imu\w+/inertial", topic))
     if not topics or not {"/truth", "/fix"} <= source.topics.keys():
-        raise BadInput(f"{name}: needs /truth, /fix and units such as /imu1/inertial")
+        raise BadInput(
+            f"{name}: lacks /truth, /fix or inertial units such as /imu1/inertial; give a log that has "
+            "them"
+        )
     truth = source["/truth"]
     time_ns, place = truth.publish_time_ns, truth["state"][:, :3]
     velocity = np.gradient(place, (time_ns - time_ns[0]) * 1e-9, axis=0)
@@ -234,24 +239,39 @@ def _offsets(
 
     The positions are those of the truth, at all its times, or the fixes.
     """
-    low, high, step = options.search_s
+    return {
+        flight.name: _offset(
+            flight,
+            _truth_as_fixes(flight, options.truth_sigma_m) if of_truth else flight.fix,
+            estimator,
+            options.search_s,
+        )
+        for flight in flights
+    }
+
+
+def _offset(
+    flight: Flight,
+    fix: Stream,
+    estimator: Mapping[str, Mapping[str, Any]],
+    search_s: tuple[float, float, float],
+) -> float:
+    """The offset of the first unit that explains fixes best; sought further out where that is an end."""
+    (low, high, step), [label] = search_s, estimator
     tried = np.arange(low, high + 0.5 * step, step)
-    found = {}
-    for flight in flights:
-        fix = _truth_as_fixes(flight, options.truth_sigma_m) if of_truth else flight.fix
-        # the same fixes for all offsets: likelihoods of other data cannot be compared
-        unit_ns = flight.units[0].publish_time_ns
-        begin_ns, end_ns = unit_ns[0] + round(1e9 * max(high, 0)), unit_ns[-1] + round(1e9 * min(low, 0))
-        fix = fix.take((fix.publish_time_ns >= begin_ns) & (fix.publish_time_ns <= end_ns))
-        sources = Ensemble(log_of(flight, flight.units[0], offset_s, fix) for offset_s in tried)
-        [label] = estimator
-        outputs = replay_in_memory(sources, {label: {**estimator[label], "every_s": None}})
-        innovation = outputs[f"/estimates/{label}/innovation"]
-        likelihood = [
-            float(innovation.of_run(run)["log_likelihood"].sum()) for run in range(len(sources))
-        ]
-        found[flight.name] = _highest(tried, np.array(likelihood))
-    return found
+    # the same fixes for all offsets: likelihoods of other data cannot be compared
+    unit_ns = flight.units[0].publish_time_ns
+    begin_ns, end_ns = unit_ns[0] + round(1e9 * max(high, 0)), unit_ns[-1] + round(1e9 * min(low, 0))
+    inside = fix.take((fix.publish_time_ns >= begin_ns) & (fix.publish_time_ns <= end_ns))
+    sources = Ensemble(log_of(flight, flight.units[0], offset_s, inside) for offset_s in tried)
+    outputs = replay_in_memory(sources, {label: {**estimator[label], "every_s": None}})
+    innovation = outputs[f"/estimates/{label}/innovation"]
+    likelihood = [float(innovation.of_run(run)["log_likelihood"].sum()) for run in range(len(sources))]
+    best, width = int(np.argmax(likelihood)), high - low
+    if best in (0, len(tried) - 1) and width < FARTHEST_S:
+        further = (low - width, high, step) if best == 0 else (low, high + width, step)
+        return _offset(flight, fix, estimator, further)
+    return _highest(tried, np.array(likelihood))
 
 
 def _highest(places: Floats, values: Floats) -> float:

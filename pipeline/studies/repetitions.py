@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from pipeline.charts import Axis, Series, curve
 from pipeline.ensemble import Replayed
@@ -26,7 +25,9 @@ EFFICIENT = "95 % if efficient"
 def require_spread(solutions: int) -> None:
     """Raise BadInput where `solutions` of one experiment have no standard error."""
     if solutions < 2:
-        raise BadInput("one run has no standard error to judge claims by; give --runs 2 or more")
+        raise BadInput(
+            "one run gives no standard error, by which claims are judged; give --runs 2 or more"
+        )
 
 
 def errors_named(replayed: Replayed, estimator: str) -> Errors:
@@ -58,7 +59,7 @@ def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interva
     count, mean = len(values), float(np.mean(values))
     if count < 2:
         return Interval(mean, np.nan, np.nan)
-    half = student.ppf(0.5 + probability / 2, count - 1) * np.std(values, ddof=1) / np.sqrt(count)
+    half = stdtrit(count - 1, 0.5 + probability / 2) * np.std(values, ddof=1) / np.sqrt(count)
     return Interval(mean, mean - float(half), mean + float(half))
 
 
@@ -87,7 +88,7 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
     """
     mean = np.nanmean(squared, axis=0)
     error = np.nanstd(squared, axis=0) * np.sqrt(1.0 / runs + 1.0 / len(squared))
-    allowed = float(norm.ppf(1.0 - 0.025 / len(printed)))
+    allowed = float(ndtri(1.0 - 0.025 / len(printed)))
     return float(np.max(np.abs(printed**2 - mean) / error)), allowed
 
 

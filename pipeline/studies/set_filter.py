@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
 
 from pipeline.charts import Axis, Chart, Panel, curve
 from pipeline.claims import Claim, judged
@@ -18,6 +17,7 @@ from pipeline.results import MetricValue, Outcome
 from pipeline.runner import Runner
 from pipeline.studies.error_bounds import BoundOptions, state_bounds
 from pipeline.studies.repetitions import Interval, mean_interval
+from replay.distributions import chi2
 from replay.estimators.set_filter import (
     CONTRADICTS_ITSELF,
     CONTRADICTS_PAST,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pipeline.tuning.search import UNIT, Coordinates, Cost, Free
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
 LARGEST_CONDITION = 1e3
 INVOLVED = 0.3  # of a direction of length one
-QUANTILE = float(norm.ppf(0.975))
+QUANTILE = float(ndtri(0.975))
 PROFILE_POINTS = 9
 PROFILE_ERRORS = 3.0  # standard errors to either side
 MEANINGLESS = 100.0  # a factor that leaves nothing known
@@ -80,13 +80,13 @@ def _in_words(direction: Floats, value: float, names: Sequence[str]) -> str:
     if not others:
         factor = np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0))
         known = f"within a factor of {factor:.2g} (95 %)" if factor < MEANINGLESS else "not at all"
-        return f"{names[first]}: the logs tell it {known}"
+        return f"{names[first]}: the logs determine it {known}"
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
         for place in others
     ]
     return (
-        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly tell them apart; "
+        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly distinguish them; "
         f"a larger {names[first]} with {' and '.join(turned)} explains them almost as well"
     )
 

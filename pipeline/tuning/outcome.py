@@ -217,7 +217,7 @@ class Tuning:
         if found.was_stopped:
             yield (
                 f"stopped after {found.evaluations} evaluations: these are the best values so far, "
-                "and nothing is known of how well the logs tell them"
+                "and how well the logs determine them is not known"
             )
         elif not found.has_converged:
             yield "the search was ended before it converged; start from these values once more"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import nnls
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 Floats = NDArray[np.float64]
 Weighting = Literal["phat", "none"]
@@ -125,7 +125,7 @@ def arrivals(
     first, second, third = triples.T
     open_s = delays[first, second] + delays[second, third] + delays[third, first]
     # six shares in three delays; the median of the square of a Gaussian is .455 of its variance
-    of_peaks_s2 = np.median(open_s**2) / (6.0 * chi2.median(1))
+    of_peaks_s2 = np.median(open_s**2) / (12.0 * gammaincinv(0.5, 0.5))
     belongs = np.zeros((len(pairs), count))
     np.put_along_axis(belongs, pairs, 1.0, axis=1)
     of_noise_s2, _ = nnls(belongs, noise_s2[tuple(pairs.T)])

@@ -17,6 +17,14 @@ class _InlinedLibrary(JITCodeLibrary):
     it, which takes a quarter.
     """
 
+    def _optimize_functions(self, module: Any) -> None:
+        """Make the code small for what links it; what takes longer is done where it ends up."""
+        module.data_layout = self._codegen._data_layout
+        passes, builder = self._codegen._function_pass_manager(opt=1)
+        for function in module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
     def _optimize_final_module(self) -> None:
         pass
 

@@ -13,11 +13,11 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from threading import Timer
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numba
-from numba.core import types
+from numba.core import errors, types
 from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
@@ -28,6 +28,10 @@ from replay.engine.cache import cache_folder, in_turn, is_private, read_checked,
 _LOG = logging.getLogger("fuselog")
 # What compiles in less time is not told of.
 _PATIENCE_S = 1.0
+# In place of the colours in which numba sets its error messages.
+_COLOURLESS = SimpleNamespace(
+    **dict.fromkeys(("code", "errmsg", "filename", "highlight", "indicate", "reset"), str)
+)
 
 
 @lru_cache(maxsize=64)
@@ -121,19 +125,24 @@ def _loaded(path: Path, target: Any) -> CompileResult | None:
 
 @contextmanager
 def _compiling(title: str) -> Iterator[None]:
-    """Say that a kernel is compiled, where that takes long, and collect no garbage meanwhile.
+    """Say that a kernel is compiled, where that takes long, and do meanwhile what makes that shorter.
 
     A compiler makes very many objects and little garbage; looking for that takes a seventh of its time.
+    numba makes an error of every type that does not fit and tries the next; colours of these, which are
+    there where colorama is installed, take a thirtieth.
     """
     patience = Timer(_PATIENCE_S, _LOG.info, (f"compiling {title}, once",))
     patience.daemon = True
     collecting = gc.isenabled()
+    colours = errors._termcolor_inst  # type: ignore[attr-defined]
     gc.disable()
+    errors._termcolor_inst = _COLOURLESS  # type: ignore[attr-defined]
     patience.start()
     try:
         yield
     finally:
         patience.cancel()
+        errors._termcolor_inst = colours  # type: ignore[attr-defined]
         if collecting:
             gc.enable()
 

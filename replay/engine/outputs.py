@@ -213,7 +213,7 @@ class Outputs:
             if array.shape != wanted:
                 raise BadInput(
                     f"estimator {self.name}: {part}{name} has the shape {array.shape}; "
-                    f"{wanted} is wanted"
+                    f"{wanted} is needed"
                 )
         return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
 

@@ -2,7 +2,8 @@
 
 Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
 section 5.6: roll and pitch from the specific force, of which gravity is all while nothing accelerates;
-the gyro's bias from what it says at rest; the heading from the first course that is worth one.
+the gyro's bias from what it says at rest; the heading from the first course that is worth one. How well
+each is known the same samples say, unless it is given.
 """
 
 from collections.abc import Mapping
@@ -10,32 +11,54 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
+from scipy.integrate import cumulative_trapezoid
 
 from recorders.errors import BadInput
 from recorders.log import Stream
-from recorders.models.inertial import from_mounting, into_body, product, rotation
+from recorders.models.inertial import (
+    EARTH_RATE_RADPS,
+    from_mounting,
+    into_body,
+    into_plane,
+    product,
+    rotation,
+)
+from recorders.models.planar import Components, wrap_angle
+from recorders.models.states import NAVIGATION
 from replay.engine.arrays import Floats, Integers
+from replay.engine.components import components_of
+from replay.engine.measurements import SPACE, read_fixes
 from replay.inference.model import ModelParameters, Started
+from replay.inference.opening import WIDER
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
 SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
+USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
+USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
+SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
+PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
+VELOCITY = components_of(NAVIGATION[3:6])
 _NS = 1e-9
 
 
 class AlignmentParameters(ModelParameters):
-    """What is taken for rest and for a course, and how well the start is known then.
+    """How the unit is mounted and delayed, and how the state at the start is found.
 
-    The unit is levelled by its first `level_s`. The body rests until `rest_margin_s` before it first
-    moves faster than `still_mps`. Its heading is the course at the first speed above `course_mps`, less
-    what the gyro has turned until then; where there is none, the heading is unknown. Standard deviations
-    are of the first position, its velocity, one that nothing measures, the tilt, the heading and the
-    biases.
+    Tilt comes from the first `level_s` seconds. The body is assumed to rest until `rest_margin_s`
+    before it first moves faster than `still_mps`. The heading is the course at the first speed above
+    `course_mps`, less the turn of the gyro until then; without such a speed it is unknown. The standard
+    deviations of the start are `start_sigma_m` of the position, `start_sigma_mps` of a velocity that is
+    measured and `unmeasured_sigma_mps` of one that is not, `tilt_sigma_rad`, `heading_sigma_rad`, and
+    those of the biases. Those that are not given come from the data: position and velocity start so
+    uncertain that their first messages, used like any other, decide; the tilt is as uncertain as the
+    accelerometer's bias and the motion make it; the gyro's bias as its mean over the rest; the heading
+    as much as the course of the first `course_s` differs from the turn of the gyro.
 
-    The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about left, of
-    roll about forward. An axis measures 1 + its scale times what is there, and the bias. A message was
-    measured its topic's delay before its stamp.
+    The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
+    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias. A message
+    was measured its topic's delay before its stamp.
     """
 
     mounting_roll_rad: float = 0.0
@@ -54,12 +77,13 @@ class AlignmentParameters(ModelParameters):
     still_mps: PositiveFloat = 0.2
     rest_margin_s: NonNegativeFloat = 1.0
     course_mps: PositiveFloat = 1.0
-    start_sigma_m: PositiveFloat = 0.05
-    start_sigma_mps: PositiveFloat = 0.1
+    course_s: PositiveFloat = 10.0
+    start_sigma_m: PositiveFloat | None = None
+    start_sigma_mps: PositiveFloat | None = None
     unmeasured_sigma_mps: PositiveFloat = 10.0
-    tilt_sigma_rad: PositiveFloat = 0.05
-    heading_sigma_rad: PositiveFloat = 0.35
-    gyro_bias_sigma_radps: PositiveFloat = 0.0035
+    tilt_sigma_rad: PositiveFloat | None = None
+    heading_sigma_rad: PositiveFloat | None = None
+    gyro_bias_sigma_radps: PositiveFloat | None = None
     force_bias_sigma_mps2: PositiveFloat = 0.3
 
 
@@ -69,6 +93,20 @@ class _Samples(NamedTuple):
     time_ns: Integers
     force: Floats
     rate: Floats
+
+
+class _Moving(NamedTuple):
+    """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
+
+    topic: str
+    time_ns: Integers
+    mps: Floats
+    covariance: Floats
+
+    def first_above(self, row: int, limit_mps: float) -> int | None:
+        """The first row from this one on with a greater horizontal speed."""
+        faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
+        return row + int(faster[0]) if len(faster) else None
 
 
 def mounted(sample: Any, parameters: Any) -> Any:
@@ -101,50 +139,45 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     Raises BadInput where there is no such fix, no gravity to level by, or numbers of another unit.
     """
-    samples = _samples(streams["inertial"], parameters)
-    begin_ns = samples.time_ns[0]
+    samples, topic = _samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
-        raise BadInput(f"no position to begin {streams['inertial'].topic} at; give a topic of fixes")
-    fix, moving = streams["fix"], streams.get("velocity")
-    fix_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
-    usable = (fix_ns >= begin_ns) & (fix_ns <= samples.time_ns[-1])
-    if not usable.any():
-        later_s = (fix_ns[0] - begin_ns) * _NS if len(fix) else np.nan
-        raise BadInput(
-            f"no message of {fix.topic} within the span of {streams['inertial'].topic}, and it begins "
-            f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
-        )
-    first = int(np.flatnonzero(usable)[0])
-    tilt = _tilt(samples, streams["inertial"].topic, parameters)
-    mean = np.concatenate([fix["position_m"][first], np.zeros(3), [1.0, 0.0, 0.0, 0.0], np.zeros(6)])
-    sigma = np.repeat(
-        [
-            parameters.start_sigma_m,
-            parameters.unmeasured_sigma_mps,
-            parameters.tilt_sigma_rad,
-            parameters.gyro_bias_sigma_radps,
-            parameters.force_bias_sigma_mps2,
-        ],
-        3,
-    )
-    heading_sigma, heading, how = np.pi, 0.0, "levelled, its heading unknown"
-    if moving is not None and len(moving):
-        velocity_ns = moving.publish_time_ns - round(parameters.velocity_delay_s / _NS)
-        row = int(np.argmin(np.abs(velocity_ns - fix_ns[first])))
-        mean[3:6], sigma[3:6] = moving["velocity_mps"][row], parameters.start_sigma_mps
-        mean[10:13] = _bias(samples, streams["inertial"].topic, moving, row, parameters)
-        found = _heading(samples, int(fix_ns[first]), moving, row, tilt, mean[10:13], parameters)
-        if found is not None:
-            heading_sigma, heading = parameters.heading_sigma_rad, found
-            how = "levelled, its heading the course"
-        how += _leap(samples, moving, row, parameters)
-    roll, pitch = tilt
+        raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
+    start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
+    moving, how = _moving(streams, parameters), "levelled, its heading unknown"
+    mean, covariance = np.zeros(16), np.zeros((15, 15))
+    mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
+    covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
+    roll, pitch = _tilt(samples, topic, parameters)
     tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
+    heading, heading_sigma, bias_sigma = 0.0, np.pi, USUAL_BIAS_RADPS
+    if moving is not None:
+        row = int(np.argmin(np.abs(moving.time_ns - start_ns)))
+        spread = moving.covariance[row]
+        mean[3:6], covariance[3:6, 3:6] = moving.mps[row], _wide(parameters.start_sigma_mps, spread)
+        mean[10:13], bias_sigma = _bias(samples, topic, moving, row, parameters)
+        turning = _turned(samples, start_ns, tilted, mean[10:13])
+        found = _heading(turning, start_ns, moving, row, parameters)
+        if found is not None:
+            heading, heading_sigma = found[0], _given(parameters.heading_sigma_rad, found[1])
+            how = "levelled, its heading the course"
+            how += _mounting(samples, turning, start_ns, moving, tilted, heading, parameters)
+        how += _leap(samples, moving, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
-    covariance, up = np.diag(sigma**2), np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
-    more = heading_sigma**2 - parameters.tilt_sigma_rad**2
-    covariance[6:9, 6:9] += more * np.outer(up, up)
-    return Started(int(fix_ns[first]), mean, covariance, how)
+    up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
+    force_variance = parameters.force_bias_sigma_mps2**2 * np.eye(3)
+    covariance[9:12, 9:12] = _given(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
+    covariance[12:15, 12:15] = force_variance
+    tilt_sigma = _given(parameters.tilt_sigma_rad, None)
+    if tilt_sigma is not None:
+        covariance[6:9, 6:9] = tilt_sigma**2 * (np.eye(3) - np.outer(up, up))
+    else:  # a bias is levelled away: the body leans by as much as it is of gravity
+        lean = np.cross(up, np.eye(3)).T / STANDARD_GRAVITY_MPS2
+        moved = _unsteadiness(samples, moving, parameters) ** 2 * np.eye(3)
+        covariance[6:9, 6:9] = lean @ (force_variance + moved) @ lean.T
+        covariance[6:9, 12:15] = lean @ force_variance
+        covariance[12:15, 6:9] = covariance[6:9, 12:15].T
+    covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
+    return Started(start_ns, mean, covariance, how)
 
 
 def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
@@ -164,8 +197,8 @@ def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
         _tilt(samples, topic, parameters)
     except BadInput as error:
         return [str(error)]
-    moving = streams.get("velocity")
-    if moving is not None and len(moving):
+    moving = _moving(streams, parameters)
+    if moving is not None:
         try:
             _bias(samples, topic, moving, 0, parameters)
         except BadInput as error:
@@ -183,10 +216,57 @@ def _samples(inertial: Stream, parameters: Any) -> _Samples:
     ]
     finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
     if not finite.any():
-        raise BadInput(f"topic {inertial.topic}: no samples to begin with")
+        raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / _NS)
     force, rate = (column[finite] for column in columns)
     return _Samples(time_ns, force, rate)
+
+
+def _given(sigma: float | None, otherwise: Any) -> Any:
+    """A parameter that may not be given, which is None, or NaN among the numbers that a filter has."""
+    return otherwise if sigma is None or np.isnan(sigma) else sigma
+
+
+def _wide(sigma: float | None, covariance: Floats) -> Floats:
+    """The covariance (3, 3) of a start at a message of this one, which is used once more."""
+    given = _given(sigma, None)
+    return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
+
+
+def _first_place(
+    fix: Stream, samples: _Samples, topic: str, parameters: Any
+) -> tuple[int, Floats, Floats]:
+    """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
+
+    One in the plane has the height of the origin. Raises BadInput where there is none.
+    """
+    sigma = _given(parameters.sigma_fix_m, USUAL_SIGMA_M)
+    places = read_fixes(fix, "position_m", "covariance_m2", SPACE, sigma)
+    time_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
+    within = (time_ns >= samples.time_ns[0]) & (time_ns <= samples.time_ns[-1])
+    usable = np.flatnonzero(within & np.isfinite(places.value[:, :2]).all(axis=1))
+    if not len(usable):
+        later_s = (time_ns[0] - samples.time_ns[0]) * _NS if len(fix) else np.nan
+        raise BadInput(
+            f"no message of {fix.topic} within the span of {topic}, and it begins "
+            f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
+        )
+    first = usable[0]
+    return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
+
+
+def _moving(streams: Mapping[str, Stream], parameters: Any) -> _Moving | None:
+    """The velocities that are finite; None where there are none."""
+    stream = streams.get("velocity")
+    if stream is None:
+        return None
+    sigma = _given(parameters.sigma_velocity_mps, USUAL_SIGMA_MPS)
+    found = read_fixes(stream, "velocity_mps", "covariance_m2ps2", VELOCITY, sigma)
+    finite = np.isfinite(found.value).all(axis=1)
+    if not finite.any():
+        return None
+    time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / _NS)
+    return _Moving(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
 
 
 def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]:
@@ -211,35 +291,57 @@ def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
 
-def _first_above(moving: Stream, row: int, limit_mps: float) -> int | None:
-    """The first row from this one on with a greater horizontal speed."""
-    speed = np.hypot(*moving["velocity_mps"][row:].T[:2])
-    faster = np.flatnonzero(speed > limit_mps)
-    return row + int(faster[0]) if len(faster) else None
+def _unsteadiness(samples: _Samples, moving: _Moving | None, parameters: Any) -> float:
+    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
+
+    It is as much as they differ among themselves, and as the velocity changes meanwhile.
+    """
+    begin_ns = samples.time_ns[0]
+    until_ns = begin_ns + round(parameters.level_s / _NS)
+    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
+    changed = np.zeros(3)
+    if moving is not None:
+        ends = np.interp([begin_ns, until_ns], moving.time_ns, np.arange(len(moving.time_ns)))
+        first, last = np.rint(ends).astype(int)
+        changed = (moving.mps[last] - moving.mps[first]) / parameters.level_s
+    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
+    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
 
 
-def _bias(samples: _Samples, topic: str, moving: Stream, row: int, parameters: Any) -> Floats:
-    """The mean turn rate (3,) at rest; zeros where there was none.
+def _bias(
+    samples: _Samples, topic: str, moving: _Moving, row: int, parameters: Any
+) -> tuple[Floats, float]:
+    """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
+
+    The means of single stretches of `level_s` differ by noise and unrest; the earth turns too.
 
     Raises BadInput where it is more than a gyro errs.
     """
-    moved = _first_above(moving, row, parameters.still_mps)
-    end_ns = samples.time_ns[-1] if moved is None else moving.publish_time_ns[moved]
-    margin_s = parameters.rest_margin_s + parameters.velocity_delay_s
-    at_rest = samples.time_ns < end_ns - round(margin_s / _NS)
-    bias = samples.rate[at_rest].mean(axis=0) if at_rest.any() else np.zeros(3)
+    moved = moving.first_above(row, parameters.still_mps)
+    end_ns = samples.time_ns[-1] if moved is None else moving.time_ns[moved]
+    at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / _NS)
+    if not at_rest.any():
+        return np.zeros(3), USUAL_BIAS_RADPS
+    bias = samples.rate[at_rest].mean(axis=0)
     largest = float(np.abs(bias).max())
     if largest > LARGEST_BIAS_RADPS:
         raise BadInput(
-            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than any gyro errs; it looks "
+            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than the error of any gyro; "
+            "it looks "
             "like deg/s: import it with that unit"
         )
-    return bias
+    since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * _NS
+    _, stretch, count = np.unique(since_s // parameters.level_s, return_inverse=True, return_counts=True)
+    if len(count) < 3:
+        return bias, USUAL_BIAS_RADPS
+    means = np.stack([np.bincount(stretch, each) for each in samples.rate[at_rest].T]) / count
+    sigma = means.var(axis=1, ddof=1).mean() / len(count)
+    return bias, float(np.sqrt(sigma + EARTH_RATE_RADPS**2))
 
 
-def _leap(samples: _Samples, moving: Stream, row: int, parameters: Any) -> str:
+def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
     """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
-    moved = _first_above(moving, row, parameters.still_mps)
+    moved = moving.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / _NS)
     if moved is None:
         return ""
@@ -248,35 +350,81 @@ def _leap(samples: _Samples, moving: Stream, row: int, parameters: Any) -> str:
     sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
     if not len(sets_off):
         return ""
-    moved_ns = moving.publish_time_ns[moved] - round(parameters.velocity_delay_s / _NS)
-    later_s = float(moved_ns - samples.time_ns[sets_off[0]]) * _NS
+    later_s = float(moving.time_ns[moved] - samples.time_ns[sets_off[0]]) * _NS
     if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {moving.topic} sets off {later_s:.3g} s after the unit: if one clock has the "
+        f"; {moving.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
         f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
         f"inertial_delay_s={shift_s:g} moves the unit's"
     )
 
 
+def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
+    """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
+    since = samples.time_ns >= start_ns
+    since_s = np.asarray((samples.time_ns[since] - start_ns) * _NS, float)
+    up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
+    rate = (samples.rate[since] - bias) @ up
+    return since_s, np.asarray(cumulative_trapezoid(rate, since_s, initial=0.0))
+
+
 def _heading(
-    samples: _Samples,
-    start_ns: int,
-    moving: Stream,
-    row: int,
-    tilt: tuple[float, float],
-    bias: Floats,
-    parameters: Any,
-) -> float | None:
-    """The heading at the start, rad: the first course, less what the body turned about up until then."""
-    fast = _first_above(moving, row, parameters.course_mps)
+    turning: tuple[Floats, Floats], start_ns: int, moving: _Moving, row: int, parameters: Any
+) -> tuple[float, float] | None:
+    """The heading at the start, rad, and its standard deviation; None where nothing moves.
+
+    It is the first course, less what the body turned about up until then. A body that looks where it
+    goes has the same of all later courses; how much they differ is how far it may be off.
+    """
+    fast = moving.first_above(row, parameters.course_mps)
     if fast is None:
         return None
-    end_ns = moving.publish_time_ns[fast] - round(parameters.velocity_delay_s / _NS)
-    since = (samples.time_ns >= start_ns) & (samples.time_ns <= end_ns)
-    roll, pitch = tilt
-    up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
-    turned = np.trapezoid((samples.rate[since] - bias) @ up, (samples.time_ns[since] - start_ns) * _NS)
-    east, north, _ = moving["velocity_mps"][fast]
-    return float(np.arctan2(north, east) - turned)
+    until_ns = moving.time_ns[fast] + round(parameters.course_s / _NS)
+    rows = np.arange(fast, np.searchsorted(moving.time_ns, until_ns))
+    rows = rows[np.hypot(*moving.mps[rows, :2].T) > parameters.course_mps]
+    east, north, _ = moving.mps[rows].T
+    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * _NS, *turning)
+    apart = wrap_angle(heading - heading[0])
+    noise = moving.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
+    return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
+
+
+def _mounting(
+    samples: _Samples,
+    turning: tuple[Floats, Floats],
+    start_ns: int,
+    moving: _Moving,
+    tilted: Components,
+    heading: float,
+    parameters: Any,
+) -> str:
+    """What to say where the body accelerates in another direction than its velocity changes.
+
+    Both are compared over the intervals of the velocities, in the plane and as complex numbers.
+    """
+    since_s, turned = turning
+    fast = moving.first_above(0, parameters.course_mps)
+    end_s = (
+        since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * _NS + parameters.course_s
+    )
+    stamps_s = (moving.time_ns - start_ns) * _NS
+    rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
+    if len(rows) < 3:
+        return ""
+    ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
+    gained = cumulative_trapezoid(
+        (ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s, initial=0.0
+    )
+    felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
+    seen = np.diff(moving.mps[rows, 0] + 1j * moving.mps[rows, 1])
+    together = np.vdot(felt, seen)
+    apart = float(np.angle(together))
+    if abs(together) < ALIKE * np.linalg.norm(felt) * np.linalg.norm(seen) or abs(apart) < SIDEWAYS_RAD:
+        return ""
+    yaw = wrap_angle(parameters.mounting_yaw_rad + apart)
+    return (
+        f"; it speeds up {np.degrees(abs(apart)):.0f} deg to the {'left' if apart > 0 else 'right'} of "
+        f"where it seems to: is the unit mounted otherwise? mounting_yaw_rad={yaw:.2f} would fit"
+    )

@@ -13,12 +13,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.constant_velocity import noise_moments
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Ragged
 from replay.engine.channels import numbered
@@ -55,15 +55,16 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """The fusion rule, and how exactly its weights are optimised.
+    """The fusion rule, what nodes send, and a node that sends false estimates.
 
-    "alone" fuses nothing, "centralised" is one filter with all sensors and no links, "own-again" is a
-    trap: it fuses the own x* and then uses its measurement a second time.
+    The rule "alone" fuses nothing, "centralised" is one filter with all sensors and no links, and
+    "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses its measurement a
+    second time. `tolerance` is how exactly weights are optimised.
 
-    A node sends at most once in `send_interval_s`, and nothing before its x* differs from what its last
-    message says of now by a Kullback-Leibler divergence of `send_divergence` nats. What it hears it
-    fuses if its prediction agrees with it: honest estimates, however correlated, pass that gate with at
-    least `gate_probability`.
+    A node sends at most once in `send_interval_s`, and only when its estimate differs from its last
+    message by a Kullback-Leibler divergence of `send_divergence` nats. A received estimate is fused if
+    it agrees with the node's own: honest estimates, however correlated, pass that gate with at least
+    `gate_probability`. The node `liar` adds `lie_m` to its estimates after `lie_after_s`.
     """
 
     rule: Rule = "ci-trace"
@@ -340,7 +341,7 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
     name, liar = parameters.rule, parameters.liar
     if liar is not None and liar not in sensors:
         raise BadInput(
-            f"liar = {liar} is none of the nodes {', '.join(map(str, sensors))}; name one of them"
+            f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; name one of them"
         )
     rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
     return Fusion(
@@ -445,11 +446,16 @@ def _schedule(
     ends = {}
     for end in ("sender_id", "receiver_id"):
         if not np.isin(links[end], numbers).all():
-            raise BadInput(f"topic /links: {end} names a node without a topic /nodeN/sensor")
+            raise BadInput(
+                f"topic /links: {end} names a node that has no topic /nodeN/sensor; record the topic, "
+                "or leave out the link"
+            )
         ends[end] = np.searchsorted(numbers, links[end])
     sent_ns, arrival_ns = links.stream.publish_time_ns, links["arrival_time_ns"]
     if np.any(arrival_ns < sent_ns):
-        raise BadInput("topic /links: a message arrives before it was sent; mend the link's clocks")
+        raise BadInput(
+            "topic /links: a message arrives before it was sent; correct the clocks of the link"
+        )
     arrived = links["lost"] == 0
     if centralised or name == ALONE:
         arrived = np.zeros(len(links), bool)
@@ -524,14 +530,17 @@ def _sensing(
             ) from None
         if part["value"].size != len(part) * len(seen):
             raise BadInput(
-                f"topic {topic.name}: its values do not have the {len(seen)} components named"
+                f"topic {topic.name}: its values do not have the {len(seen)} components that its "
+                "channel names; name as many as there are"
             )
         value = np.full((len(part), len(components)), np.nan)
         value[:, seen] = part["value"].reshape(len(part), len(seen))
         values.append(value)
         index.append(np.full(len(part), number))
     if not np.all(np.nan_to_num(variance, nan=1.0) > 0):
-        raise BadInput("a sensor's sigma is not positive; a perfect sensor makes covariances singular")
+        raise BadInput(
+            "a sensor's sigma is not positive, which makes covariances singular; give one above zero"
+        )
     return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
 
 
@@ -562,7 +571,7 @@ def state_of(prior: Topic) -> list[str]:
 
 
 NETWORK = Estimator(
-    "nodes that follow one thing and fuse what they send each other, by any fusion rule",
+    "nodes that track one target and fuse the estimates they send each other, by any fusion rule",
     "/prior, /links and, per node, /nodeN/sensor",
     NetworkParameters,
     _bind,

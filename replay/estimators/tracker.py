@@ -22,11 +22,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
@@ -63,28 +63,30 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 class TrackerParameters(Parameters):
     """How targets move, how tracks begin and end, and what sensors are like.
 
-    What is None is what the channel of a sensor's scans states; given here, it holds for all sensors.
-    `sensors` are those to use, such as ["radar", "lidar"]; where it is empty all are.
+    What is none is what the channel of a sensor's scans states; a value given here holds for all
+    sensors. `sensors` are those to use, such as ["radar", "lidar"]; if it is empty, all are used.
 
-    `model` is a registered one with a position, whose numbers `motion` gives by name; a model with modes
-    has all of them, or the one that `mode` names. Without it targets keep their velocity.
+    `model` is a registered model with a position, whose parameters `motion` gives by name. A model with
+    modes uses all of them, or the one that `mode` names. Without a model targets keep their velocity,
+    but for an acceleration of density `acceleration_density` (m^2/s^3).
 
-    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks;
-    or, where there are `undetected_per_m2` targets that were never detected, with any that may be one of
-    these, by how probable that is. What becomes of them `management` says: "existence" goes by the
-    probability of their targets'; "hits" by `hits_needed` in the first `chances`; "score" by the
-    log-likelihood ratio of target and clutter, tested so that `false_confirmation` and
-    `missed_confirmation` are the probabilities of errors. With hits or score, a track's existence is
-    `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
-    `confirming_existence` on until it falls below `keeping_existence`, and ends below
-    `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
+    A track begins with a detection outside all gates that is `birth_distance_m` from all confirmed
+    tracks. With `undetected_per_m2`, the density of targets that were never detected, it begins with
+    any detection that may be one of these, by how probable that is.
 
-    With `registration_sigma_m` or `_rad`, a sensor has a constant error in all it measures, which the
-    tracks estimate together; with `correlated_sigma_m` or `_rad` one of its own for every track, which
-    is another one after `correlation_s`. Both are components of the tracks' states.
+    `management` decides which tracks are confirmed. "existence" uses the probability that the target
+    exists: a track is confirmed from `confirming_existence` on until it falls below
+    `keeping_existence`, and ends below `ending_existence`. "hits" needs `hits_needed` detections in the
+    first `chances`. "score" tests the log-likelihood ratio of target and clutter, so that
+    `false_confirmation` and `missed_confirmation` are the probabilities of its errors. With hits or
+    score the existence is `birth_existence` until a track is confirmed, and then 1. If management is
+    none, jipda and pmbm use existence, the others hits.
 
-    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
-    detections that its track ever had.
+    With `registration_sigma_m` or `_rad` a sensor has a constant error in all that it measures, which
+    all tracks estimate together. With `correlated_sigma_m` or `_rad` it has another error for every
+    track, which lasts for about `correlation_s`. Both are components of the tracks' states.
+
+    With `smoothed` the tracks are estimated again at the end of the run from all their detections.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
@@ -152,10 +154,12 @@ class TrackerParameters(Parameters):
         goes_by_existence = association in EXISTING
         given = values.get("management")
         if goes_by_existence and given not in (None, "existence"):
-            raise ValueError(f"{association} goes by existence; management = {given} goes with jpda")
+            raise ValueError(
+                f"{association} needs management = existence; management = {given} is for jpda"
+            )
         management = given or ("existence" if goes_by_existence else "hits")
         if values.get("undetected_per_m2") and management != "existence":
-            raise ValueError("undetected_per_m2 goes with management = existence")
+            raise ValueError("undetected_per_m2 needs management = existence")
         likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
         return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
@@ -189,13 +193,14 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
         ):
             raise BadInput(
-                f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
-                "not there; record the sensor's own position"
+                f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
+                "which is "
+                "missing; record the position of the sensor"
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
-            "only bearings: they begin no tracks, since they do not say how far a target is; take a "
-            "sensor of places, or of ranges with bearings, with them"
+            "bearings alone begin no tracks, since they do not measure how far a target is; add a "
+            "sensor of positions, or of ranges with bearings"
         )
     return found
 
@@ -208,7 +213,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
         if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
             raise BadInput(
                 f"topic {seen.name}: detections without scans; record {prefix}/scan "
-                f"({schemas.SCAN.full_name}), which says how many each scan has, also where that is none"
+                f"({schemas.SCAN.full_name}), which states how many each scan has, even if none"
             )
 
 
@@ -564,13 +569,17 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     if not parameters.smoothed:
         return [tracking]
     if settings.errors.names:
-        raise BadInput(f"estimator {name}: errors of sensors are not smoothed; leave out one of both")
+        raise BadInput(
+            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
+            "of sensors"
+        )
     return [smoothing_tracks(tracking, targets)]
 
 
 TRACKER = Estimator(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (places) or .../range_bearing, or .../bearing beside those",
+    "per sensor .../scan and .../detection (positions) or .../range_bearing, or .../bearing beside "
+    "those",
     TrackerParameters,
     _bind,
     variant="association",

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
+from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 
 MISSED = -1

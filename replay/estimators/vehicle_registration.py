@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from recorders.errors import BadInput
+from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Integers
 
 MOST_VEHICLES = 8

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from recorders.models.vehicles import into_frame, noise_moments, turn
+from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 from replay.estimators.vehicle_association import Hypotheses
 

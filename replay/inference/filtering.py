@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from recorders.log import Topic, schemas
+from replay.distributions import chi2
 from replay.engine.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.failures import reason_stream

@@ -58,9 +58,10 @@ LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many t
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
-    """The filter that every mode has; `smoothed_modes` asks for the modes' probabilities given all data.
+    """The filter of every mode.
 
-    These come at the end of a run, on a topic of their own; the state is not smoothed.
+    With `smoothed_modes` the probabilities of the modes given all data are written too, at the end of
+    the run and on a topic of their own; the state is not smoothed.
     """
 
     filter: str = "ekf"
@@ -206,7 +207,8 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         of_run(weighed_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
-    return Steps(memory, predict, updates, estimate, sampled)
+    resumes = all(each.resumes for each in filters)
+    return Steps(memory, predict, updates, estimate, sampled, resumes)
 
 
 def predicting(filters: Sequence[Steps]) -> Function:

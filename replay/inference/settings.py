@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from recorders.errors import BadInput
 from recorders.log import Topic
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
@@ -93,14 +94,30 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     settings = np.array(
         [
             [
-                stated([*first, *everything], name, model.parameters, needed=name in read)
+                stated([*first, *everything], name, model.parameters, needed=False)
                 if given[name] is None
                 else float(given[name])
                 for name in names
             ]
-            for first, read in zip(own, needed, strict=True)
+            for first in own
         ]
     )
+    lacking = [
+        (row, name)
+        for row, read in enumerate(needed)
+        for column, name in enumerate(names)
+        if name in read and np.isnan(settings[row, column])
+    ]
+    if lacking:
+        row, _ = lacking[0]
+        missing = list(dict.fromkeys(name for _, name in lacking))
+        usual = model.start.parameters if model.start is not None else {}
+        better = ", or numbers that you know better" if usual else ""
+        mend = " ".join(f"--set {name}={usual.get(name, '...')}" for name in missing)
+        raise BadInput(
+            f"topic {[*own[row], *everything][0].name} does not state {', '.join(missing)}; give "
+            f"{'it' if len(missing) == 1 else 'them'} with {mend}{better}"
+        )
     if stage.modes:
         switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
     return settings

@@ -5,7 +5,8 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Na
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+
+from replay.distributions import chi2
 
 Array = NDArray[np.float64]
 
@@ -21,7 +22,7 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
     Zero where rounding makes the determinant of a singular one negative.
     """
     squared = np.maximum(np.linalg.det(covariance), 0.0)
-    return np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)
+    return np.pi * chi2.ppf(probability, 2) * np.sqrt(squared)
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:

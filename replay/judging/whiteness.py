@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from recorders.log import Stream
+from replay.distributions import chi2
 
 Floats = NDArray[np.float64]
 LAGS = 20

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.random import Generator
-from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
@@ -49,6 +48,8 @@ def lcd_samples(
     Raises:
         BadInput: the set could not have a regular covariance, see `check_count`.
     """
+    from scipy.optimize import minimize  # which takes long to import
+
     check_count(dimension, count, symmetric)
     free = count // 2 if symmetric else count
     weights = np.full(count, 1 / count)
@@ -78,7 +79,7 @@ def check_count(dimension: int, count: int, symmetric: bool) -> None:
     """Raise BadInput where `count` samples in `dimension` dimensions cannot have covariance I."""
     least = 2 * dimension if symmetric else dimension + 1
     if dimension < 1:
-        raise BadInput(f"a sample set needs a dimension of 1 or more, got {dimension}")
+        raise BadInput(f"a sample set needs a dimension of 1 or more, found {dimension}")
     if count < least:
         kind = "symmetric samples" if symmetric else "samples"
         raise BadInput(
@@ -96,5 +97,5 @@ def moment_corrected(points: Array) -> Array:
     centred = points - points.mean(axis=0)
     variances, axes = np.linalg.eigh(centred.T @ centred / len(points))
     if not variances[0] > 1e-12 * variances[-1]:
-        raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions")
+        raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions; give more")
     return centred @ (axes / np.sqrt(variances)) @ axes.T

@@ -13,10 +13,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from recorders.log import Stream, schemas
 from recorders.models.optical import bias_components, direction
+from replay.distributions import chi2
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import TRUTH, WRONG, Canvas, Colour, Scene, Timeline, Times, beside, nice
 from replay.timeline.events import above_events, draw_events

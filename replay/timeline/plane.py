@@ -13,9 +13,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.stats import chi2
 
 from recorders.log import schemas
+from replay.distributions import chi2
 from replay.engine.measurements import PLANE
 from replay.judging.evaluation import Floats
 from replay.timeline.canvas import (

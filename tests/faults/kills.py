@@ -108,11 +108,10 @@ def _disturbed(
 def _undisturbed(command: str, start: Path) -> Whole:
     folder = start.with_name(command)
     shutil.copytree(start, folder)
-    for _ in range(2):  # the first fills the caches of compiled code
-        begin = time.monotonic()
-        process = _fuselog(*COMMANDS[command], folder)
-        said = process.communicate()[1]
-        assert process.returncode == 0, said
+    begin = time.monotonic()
+    process = _fuselog(*COMMANDS[command], folder)
+    said = process.communicate()[1]
+    assert process.returncode == 0, said
     return Whole(folder, _state(folder), time.monotonic() - begin)
 
 

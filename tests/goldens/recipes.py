@@ -144,6 +144,16 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
             "dropout_probability": 0.2,
         },
     ),
+    # of the modes alone, one; both are in `modes`
+    "crossing": Recipe(
+        "crossing",
+        estimators={
+            label: values
+            for label, values in load_experiment("crossing", {}, {})[1].estimators.items()
+            if label != "manoeuvre"
+        },
+        alone=True,
+    ),
     # scans that come late, and vessels that go side by side
     "autoferry": Recipe("autoferry", part="scenario22"),
     # rukf-10 fails

@@ -308,8 +308,8 @@ FAULTS = [
     ),
     Fault(
         "replay/judging/consistency.py",
-        "np.pi * stats.chi2.ppf(probability, 2) * np.sqrt(squared)",
-        "np.pi * stats.chi2.ppf(probability, 2) * squared",
+        "np.pi * chi2.ppf(probability, 2) * np.sqrt(squared)",
+        "np.pi * chi2.ppf(probability, 2) * squared",
         "tests/replay/judging/test_consistency.py",
     ),
     Fault(

@@ -297,6 +297,15 @@ def test_help_imports_nothing_heavy() -> None:
     assert said.splitlines()[-1] == "0"
 
 
+def test_a_command_imports_nothing_heavy_that_it_does_not_need() -> None:
+    code = (
+        "import sys; import pipeline.commands; "
+        "print(*{'matplotlib', 'rerun', 'scipy.optimize', 'shapely', 'sklearn'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == []
+
+
 @pytest.mark.paper
 @pytest.mark.usefixtures("here")
 def test_output_in_a_narrow_terminal_and_beyond_its_encoding(
@@ -408,7 +417,7 @@ def test_two_runs_into_one_folder_do_not_mix(fuselog: Fuselog) -> None:
     with result_folder(Path("r")) as theirs:
         said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
         assert said.code == 2
-        assert "another fuselog is writing it" in said.err
+        assert "another fuselog command is writing it" in said.err
         assert theirs.exists()
 
 

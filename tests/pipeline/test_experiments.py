@@ -82,7 +82,7 @@ def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fu
     again = pd.read_parquet(tmp_path / "again/tables/errors/ekf-robot1.parquet")
     pd.testing.assert_frame_equal(again, errors[errors["run"] == 0].reset_index(drop=True))
     said = fuselog(*judged)
-    assert (said.code, "--errors: goes into a result folder" in said.err) == (2, True)
+    assert (said.code, "--errors: errors are written into a result folder" in said.err) == (2, True)
 
 
 def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
@@ -426,12 +426,12 @@ def test_logs_are_replayed_as_an_experiment(drives: Path, tmp_path: Path, fuselo
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["drive-1.mcap"], "say what to replay it with, such as -e ekf"),
+        (["drive-1.mcap"], "name the estimators to replay it with, such as -e ekf"),
         (["drive-1.mcap", "landmarks", "-e", "ekf"], "give logs alone"),
         (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give logs alone"),
-        (["drive-9.mcap", "-e", "ekf"], "no log is called drive-9.mcap"),
+        (["drive-9.mcap", "-e", "ekf"], "no log has the name drive-9.mcap"),
         (["landmarks", "-e", "ekf"], "one experiment runs at a time"),
-        (["drives.toml", "--data", "nowhere"], "no log is called nowhere"),
+        (["drives.toml", "--data", "nowhere"], "no log has the name nowhere"),
         (["drives.toml", "--runs", "3"], "as many runs as there are"),
         (["drive-1.mcap", "-e", "ekf", "--set", "ekf.gate=1"], "no parameter 'gate'"),
     ],

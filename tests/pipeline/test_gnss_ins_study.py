@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.results import Result
+from pipeline.studies.gnss_ins import GnssInsOptions, ignoring_delay
 from pipeline.studies.outages import (
     Rows,
     coasted,
@@ -156,9 +157,22 @@ def test_a_raw_recording_with_another_mounting_takes_settings_alone(navigation: 
     assert len(found.claims) == 3  # none of the walk's own
 
 
+@pytest.mark.parametrize(("delays_s", "taken_back"), [({}, -0.125), ({"/velocity": 0.1}, -0.1)])
+def test_the_smoother_that_ignores_a_delay_takes_back_that_of_the_recording(
+    delays_s: dict[str, float], taken_back: float
+):
+    _, experiment = load_experiment("gnss-ins", {"delays_s": delays_s}, {})
+    options = GnssInsOptions(delayed="smoother-at-stamps")
+    changed = ignoring_delay(experiment, options).estimators
+    assert changed["smoother-at-stamps"]["velocity_delay_s"] == taken_back
+    assert changed["smoother"] == experiment.estimators["smoother"]
+
+
 def test_several_recordings_and_none(tmp_path: Path):
     name, experiment = load_experiment("gnss-ins", {}, {})
-    with pytest.raises(BadInput, match=r"no folder there has the files of the mapping \(\*\.pos"):
+    with pytest.raises(
+        BadInput, match=r"neither it nor a folder in it has the files that the mapping names \(\*\.pos"
+    ):
         run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()

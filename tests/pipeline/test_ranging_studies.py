@@ -36,7 +36,7 @@ def test_published_errors_are_found_again_to_four_digits(navigation: Path, case:
         assert space is None or found[1] == pytest.approx(space, abs=5e-5)
     assert printed(folder)["LS_2d"] == pytest.approx(published["LS"][0], abs=5e-5)
     elsewhere = Window.model_validate({"begin": {"x_above_m": 1e3}})
-    with pytest.raises(BadInput, match="does not go through the window; set options"):
+    with pytest.raises(BadInput, match="does not cross the window; set options"):
         scored_truth(of, elsewhere, 0.5)
 
 
@@ -92,3 +92,18 @@ def test_the_sheets_table_of_positions_outdoors(navigation: Path, tmp_path: Path
         for label, limit in asked[case.split("_")[1][0]].items():
             assert found[label] <= limit
         assert result.metrics[f"not-robust.position_rmse_m.{case}"] > 1.0
+
+
+@pytest.mark.paper
+def test_a_path_without_a_window_is_not_held_to_errors_of_a_part_of_it(
+    navigation: Path, tmp_path: Path
+) -> None:
+    """What part of another path printed errors are of is unknown; published tracks are judged."""
+    place = tmp_path / "LOS" / "Trajectory_C" / "Case_1"
+    shutil.copytree(navigation / "uwb_outdoor" / "LOS" / "Trajectory_B" / "Case_3", place)
+    name, experiment = load_experiment("uwb-outdoor", {}, {})
+    alone = experiment.model_copy(update={"estimators": {"ekf": experiment.estimators["ekf"]}})
+    result = run_experiment(name, alone, tmp_path / "out", data=tmp_path, logs=0)
+    assert [claim.claim.partition(": ")[2] for claim in result.claims] == [
+        "robust filters of ranges alone are better than the published tracks"
+    ]

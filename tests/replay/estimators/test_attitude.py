@@ -64,6 +64,7 @@ def errors_deg(model: Model, disturbance_ut: float, **values: Any) -> tuple[np.n
     return error, state, found["innovation"].stream
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_bias_and_orientation_are_found_in_motion():
     """There is an estimate at every sample; velocity and field are measured once a second."""
@@ -77,6 +78,7 @@ def test_bias_and_orientation_are_found_in_motion():
     assert np.abs(deviation / sigma).max() < 3.0
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_a_disturbed_field_is_kept_out_by_the_gate_and_turns_the_heading_without_it():
     error, _, innovation = errors_deg(ATTITUDE, 25.0)
@@ -92,7 +94,7 @@ def test_a_disturbed_field_is_kept_out_by_the_gate_and_turns_the_heading_without
     ("field", "message"),
     [
         (np.full(3, np.nan), "no magnetic field in its first 1 s"),
-        (np.array([0.0, 0.0, 40.0]), "parallel at the start, which tells no heading"),
+        (np.array([0.0, 0.0, 40.0]), "parallel at the start, which determines no heading"),
     ],
 )
 def test_a_start_without_heading_is_refused(field, message):

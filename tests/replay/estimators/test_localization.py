@@ -492,7 +492,7 @@ def test_what_no_run_can_use_is_bad_input():
             replayed("ekf", [replace(source, streams={**source.streams, "/robot1/prior": stream})])
     odometry = source.streams["/robot1/odometry"]
     for stated, words in (
-        ({}, "does not state forward_noise_density; give it with --set"),
+        ({}, "does not state forward_noise_density, turn_noise_density; give them with --set"),
         (
             {"forward_noise_density": "nan"},
             "/robot1/odometry: parameter 'forward_noise_density' is nan; it should be a finite number",
@@ -514,5 +514,5 @@ def test_what_no_run_can_use_is_bad_input():
         foreign = replace(source.streams[topic], schema=schemas.SCAN)
         with pytest.raises(BadInput, match=f"{said} .*which is fuselog.Scan here"):
             replayed("ekf", [replace(source, streams={**source.streams, topic: foreign})])
-    with pytest.raises(BadInput, match="leaves no spread"):
+    with pytest.raises(BadInput, match="gives no covariance"):
         unscented(3, -3.0)

@@ -86,6 +86,7 @@ def test_who_flies_straight_side_by_side_cannot_tell_the_roll_that_all_have():
         assert spectrum(recorded(bias_sigma_rad=0.0, **telling))[0][-1] > 100.0 * values[-1]
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_a_field_of_another_width_is_named():
     """The model asks for a quaternion in space."""
     source = recorded()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from recorders.errors import BadInput
 from recorders.log import Stream
@@ -20,6 +21,7 @@ from replay.engine.tangent import difference
 from replay.estimators.alignment import align
 from replay.estimators.navigation import INERTIAL, NavigationParameters
 from tests.replay.inference.replays import bound, outputs
+from tests.replay.inference.test_imm import twins
 
 
 def drive(change: Any, run: int = 0, **values: Any) -> MemorySource:
@@ -192,3 +194,17 @@ def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, go
     else:
         assert failures == ["what drives the motion is silent for too long"]
         assert last_s == pytest.approx(20.0)
+
+
+@pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
+def test_modes_go_on_after_a_gap_of_the_unit_as_one_filter_does():
+    """Of three equal modes, which mix while nothing is known, the estimates are those of one."""
+    slow = {"unit": {"rate_hz": 5.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
+    source = drive(silent, duration_s=24.0, **slow)
+    alone = outputs(INERTIAL, "ekf", [source])
+    together = outputs(twins(INERTIAL), "imm", [source])
+    assert len(together["failure"].stream) == 0
+    assert len(together["skipped"]) == len(alone["skipped"]) > 0
+    for field, column in alone["state"].stream.columns.items():
+        assert_allclose(together["state"][field], column, rtol=1e-7, atol=1e-9, err_msg=field)

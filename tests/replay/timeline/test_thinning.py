@@ -102,7 +102,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
             yield item
             end = time.monotonic() + 5.0
             while len(seen) == 2 and not drawn() and time.monotonic() < end:
-                time.sleep(0.1)
+                time.sleep(0.5)  # reading takes long
             seen.append(drawn() if len(seen) in (2, 3) else 0)
 
     with listen(tmp_path, "--save", str(live)) as receiver:
@@ -119,5 +119,5 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
         assert 0 < seen[2] < 30_000
         end = time.monotonic() + 10.0
         while drawn() < 20_000 and time.monotonic() < end:
-            time.sleep(0.1)
+            time.sleep(0.5)  # reading takes long
         assert drawn() >= 20_000

@@ -1,0 +1,25 @@
+"""The chi-squared distribution, by the names and with the numbers of `scipy.stats.chi2`.
+
+Importing scipy.stats takes a quarter of the time that a short command of the command line does.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc, chdtri, gammaincinv
+
+
+def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
+    """What is exceeded with one minus this probability, by that many degrees of freedom."""
+    return 2.0 * gammaincinv(np.divide(degrees, 2.0), probability)
+
+
+def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
+    """What is exceeded with this probability."""
+    return chdtri(degrees, probability)
+
+
+def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
+    """The probability with which a value, which is not negative, is exceeded."""
+    return chdtrc(degrees, value)
