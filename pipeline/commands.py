@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.executors import crew_of
@@ -21,6 +23,7 @@ from pipeline.experiment import (
 )
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import (
+    RUNS,
     ErrorTables,
     in_order,
     plain,
@@ -105,8 +108,12 @@ def replay_logs(
     ).check()
     _state_losses(source.log for source in sources)
     if tells_parameters and not as_json:
-        print_parameters(done.parameters)
-    told = {"seconds": dict(done.seconds), "parameters": done.parameters}
+        print_parameters(done.parameters, done.stated)
+    told = {
+        "seconds": dict(done.seconds),
+        "parameters": done.parameters,
+        "parameters_of_log": done.stated,
+    }
     _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
 
 
@@ -304,7 +311,7 @@ def _print_outcome(
         }
         print_json(outcome | dict(told or {}))
         return
-    print_metrics(values, judge.bounds)
+    print_metrics(values, judge.bounds, judge.runs_table)
     for sentence in judge.losses:
         say(sentence)
     if told:
@@ -414,9 +421,11 @@ def run_named(
         return
     if tells_parameters:
         print_parameters(result.settings["parameters"])
-    print_metrics(result.metrics, result.bounds)
+        say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
+    runs = folder / RUNS
+    print_metrics(result.metrics, result.bounds, pd.read_parquet(runs) if runs.is_file() else None)
     print_claims(result.claims)
-    say(f"{folder}: logs, estimates, tables, figures, result.json")
+    say(f"{folder}: {', '.join(result.contents)}")
 
 
 def _stated_experiment(

@@ -128,7 +128,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         if len(table) <= LONGEST_TABLE and name != "summary"
     }
     lead = [*_first_run(folder, viewer=viewer), *figures[:1]]
-    metrics = metric_tables(result.metrics, result.bounds)
+    metrics = metric_tables(result.metrics, result.bounds, tables.get("runs"))
     return Section(name, result, verdict(result), lead, metrics, short, figures[1:])
 
 

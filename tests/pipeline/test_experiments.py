@@ -449,3 +449,22 @@ def test_bad_input_to_a_run_of_logs_is_one_sentence(
     assert said.code == 2
     assert sentence in said.err
     assert sorted(drives.iterdir()) == before
+
+
+def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed(
+    fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """By hand: 2.776 standard errors to either side, Student's quantile of five runs."""
+    out = tmp_path / "five"
+    run = ("run", "landmarks", "--set", "duration_s=2", "--logs", "0", "--out", out)
+    printed = fuselog(*run, "--runs", "5").out
+    found = pd.read_parquet(out / "tables" / "runs.parquet").groupby("estimator")["nees"]
+    for mean, error in zip(found.mean(), found.sem(), strict=True):
+        low, high = mean - 2.7764 * error, mean + 2.7764 * error
+        expected = f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim 3"
+        assert expected in printed
+    fuselog("report", out, "-o", tmp_path / "five.html")
+    assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
+    assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, result.json"
+    assert {path.name for path in out.iterdir()} == {"figures", "tables", "timeline.rrd", "result.json"}
+    assert "nees_mean_over_runs" not in fuselog(*run, "--runs", "4").out
