@@ -128,8 +128,8 @@ def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Float
         if before is None and (last < 0).any():
             raise BadInput(
                 f"topic {scans.stream.topic}: a scan is before the first message of "
-                f"{fixes.stream.topic}, "
-                "so that the position of its sensor is unknown; begin later, with --start"
+                f"{fixes.stream.topic}, so that the position of its sensor is unknown; begin later, "
+                "with --start"
             )
         found[rows] = place[order][np.maximum(last, 0)]
     return found

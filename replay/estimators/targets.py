@@ -149,7 +149,6 @@ def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats
         elif np.isnan(sigma[row]):
             raise BadInput(
                 f"{where}: a detection does not measure {name}, and the model does not say how "
-                "uncertain "
-                "it is at first; give it a start with its sigma"
+                "uncertain it is at first; give it a start with its sigma"
             )
     return mean, sigma

@@ -20,33 +20,27 @@ from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
+from recorders.log import Topic, schemas
 from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
-from replay.engine.failures import reason_stream
-from replay.engine.results import innovation_stream, named
 from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
+from replay.estimators.track_outputs import track_outputs
 from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
 from replay.inference.settings import number_fields
 from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
-from replay.inference.tracks import NEVER, Tracks, no_tracks
+from replay.inference.tracks import Tracks, no_tracks
 
-UNUSED = (
-    "there is no room for more tracks; give --set most_tracks=...",
-    "the scan came after a younger one; give --late rewind:SECONDS",
-)
 # What sets apart the two that go by existence and have the associations of jpda.
 EXISTING: dict[str, dict[str, float]] = {
     "jipda": {},
@@ -278,6 +272,10 @@ class Setup(NamedTuple):
         """The tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
+    def outputs(self, scans: Scans, told: Told, *, repeated: int = 0) -> list[Ragged]:
+        """The streams of what is said of these scans; see `track_outputs`."""
+        return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
+
 
 class State(NamedTuple):
     """What is carried from block to block: the last own positions, and the tracks.
@@ -300,7 +298,7 @@ def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list
     before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
     scans, fixes = _scans(before, block, setup)
     after, said = setup.track(before.tracks, scans)
-    outputs = [_outputs(setup, batch, told) for batch, told in said]
+    outputs = [setup.outputs(batch, told) for batch, told in said]
     return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
 
 
@@ -378,158 +376,16 @@ def _take(
     pending = in_time(pending, arrived)
     if repeated:
         head, said = setup.track(base, pending)
-        outputs = [_outputs(setup, *of_last(*said[-1]), repeated=repeated)]
+        outputs = [setup.outputs(*of_last(*said[-1]), repeated=repeated)]
     else:
         head, said = setup.track(head, arrived)
-        outputs = [_outputs(setup, batch, told) for batch, told in said]
+        outputs = [setup.outputs(batch, told) for batch, told in said]
     rows = np.arange(len(pending.time_ns))
     settled = pending.time_ns < pending.time_ns[-1] - back_ns
     if settled.any():
         base, _ = setup.track(base, take_scans(pending, rows[settled]))
         pending = take_scans(pending, rows[~settled])
     return Rewinding(base, pending, head), outputs
-
-
-def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[Ragged]:
-    """Of every scan how many tracks there are, which, what was associated, and what was not done.
-
-    `repeated` is how many scans after a late one, the last of which these are of, were used again.
-    """
-    topic, found, model = f"/estimates/{setup.name}", setup.found, setup.tracker.stage.model
-    used = np.flatnonzero(told.confirmed != NEVER)
-    counts, time_ns = told.confirmed[used], scans.time_ns[used]
-    offsets = np.searchsorted(used, scans.offsets)
-    metadata = named(model.state)
-
-    def filled(column: NDArray, which: int) -> NDArray:
-        ends = told.end[:, which]
-        return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
-
-    ends = np.concatenate([[0], np.cumsum(told.end, axis=0)[:, 0]])
-    track_ns, rows = np.repeat(time_ns, counts), len(filled(told.number, 0))
-    pair = filled(told.pair, 1)
-    scan = pair[:, 1]
-    pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
-    sensors = ",".join(found.sensors)
-    approximated = np.flatnonzero(told.approximated)
-    late = told.confirmed == NEVER
-    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
-    streams = (
-        (
-            make_stream(
-                f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=metadata, elements=counts
-            ),
-            offsets,
-        ),
-        (
-            make_stream(
-                f"{topic}/track",
-                schemas.TRACK_ESTIMATE,
-                track_ns,
-                metadata=metadata,
-                track_id=filled(told.number, 0),
-                mean=filled(told.mean, 0),
-                covariance=filled(told.covariance, 0).reshape(rows, model.tangent**2),
-            ),
-            ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/existence",
-                schemas.EXISTENCE,
-                track_ns,
-                existence=filled(told.existence, 0),
-            ),
-            ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/association",
-                schemas.ASSOCIATION,
-                scans.time_ns[scan],
-                metadata={"sensors": sensors},
-                track_id=pair[:, 0],
-                sensor_id=scans.sensor[scan],
-                scan_id=scans.number[scan],
-                detection=pair[:, 2],
-                probability=filled(told.associated, 1),
-            ),
-            pair_ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/approximation",
-                schemas.APPROXIMATION,
-                scans.time_ns[approximated],
-                tracks=told.approximated[approximated],
-            ),
-            np.searchsorted(approximated, scans.offsets),
-        ),
-        (
-            reason_stream(
-                f"{topic}/unused",
-                schemas.SKIPPED,
-                scans.time_ns[unused],
-                np.where(late[unused], 1, 0),
-                UNUSED,
-            ),
-            np.searchsorted(unused, scans.offsets),
-        ),
-        (
-            make_stream(
-                f"{topic}/rewound",
-                schemas.REWOUND,
-                scans.time_ns[: min(repeated, 1)],
-                repeated=[repeated] * min(repeated, 1),
-            ),
-            np.minimum(scans.offsets, repeated),
-        ),
-    )
-    outputs = [Ragged(stream, bounds) for stream, bounds in streams]
-    if setup.tracker.stage.modes:
-        modes = make_stream(
-            f"{topic}/modes",
-            schemas.MODE_PROBABILITIES,
-            track_ns,
-            metadata=named(dict.fromkeys(model.modes or (), "linear")),
-            probability=filled(told.probability, 0),
-        )
-        outputs.append(Ragged(modes, ends))
-    of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
-    return [*outputs, *_innovations(setup, scans, pair_ends, *of_pairs)]
-
-
-def _innovations(
-    setup: Setup,
-    scans: Scans,
-    ends: Integers,
-    pair: Integers,
-    probability: Floats,
-    white: Floats,
-    factor: Floats,
-) -> Iterator[Ragged]:
-    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
-    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
-    track, scan = pair[order, 0], pair[order, 1]
-    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
-    likeliest = np.sort(order[is_first])
-    for sensor, (kind, topic) in enumerate(zip(setup.found.kinds, setup.found.scans, strict=True)):
-        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
-        measured = KINDS[kind].measured
-        size = len(measured)
-        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
-        stream = innovation_stream(
-            f"/estimates/{setup.name}{topic.removesuffix('/scan')}/innovation",
-            scans.time_ns[pair[rows, 1]],
-            measured,
-            "",
-            target_id=pair[rows, 0],
-            accepted=np.ones(len(rows), np.int64),
-            innovation=np.einsum("nij,nj->ni", root, whitened),
-            covariance=root @ root.transpose(0, 2, 1),
-            squared=(whitened**2).sum(axis=1),
-        )
-        yield Ragged(stream, np.searchsorted(rows, ends))
 
 
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:

@@ -144,8 +144,7 @@ def associate(
         if len(estimate) != len(truth):
             raise BadInput(
                 f"{(estimate if times is None else truth).name}: has no stamps, so that poses are "
-                "paired "
-                f"by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
+                f"paired by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
                 f"{len(truth)}: give both with stamps"
             )
         return estimate, truth

@@ -126,8 +126,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     if not columns or (not used and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
-            "mapping "
-            "by hand, as docs/your-log.md says"
+            "mapping by hand, as docs/your-log.md says"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):

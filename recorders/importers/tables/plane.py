@@ -54,8 +54,7 @@ def _onto_map(projection: str) -> Any:
     except ImportError:
         raise BadInput(
             f"projection {projection}: needs pyproj; pip install 'fuselog[maps]', or leave the "
-            "projection out to "
-            "use the tangent plane"
+            "projection out to use the tangent plane"
         ) from None
     try:
         crs = CRS.from_user_input(projection)
