@@ -208,10 +208,10 @@ class Replay:
         """
         charts = error_charts(self.judge)
         if not charts:
-            raise BadInput("nothing to draw: no estimates with truth")
+            raise BadInput("nothing to draw: no estimate has a truth")
         case = next(iter(charts)) if case is None else case
         if case not in charts:
-            raise BadInput(f"nothing called '{case}' was judged; {choices(case, charts)}")
+            raise BadInput(f"nothing with the name '{case}' was judged; {choices(case, charts)}")
         return draw(charts[case])
 
     def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:
@@ -325,7 +325,9 @@ def settings_of(
             chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
             kind = chosen[label].get("kind", "")
             if isinstance(kind, Model):
-                raise BadInput(f'estimator {label} is a model; add a method: modelled(model, "ekf")')
+                raise BadInput(
+                    f'estimator {label} is a model without a method; give modelled(model, "ekf")'
+                )
             if not isinstance(kind, str | Estimator):
                 raise BadInput(
                     f"estimator {label} is {type(kind).__name__}; make an estimator of it with "

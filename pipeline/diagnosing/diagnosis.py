@@ -250,13 +250,13 @@ def diagnose(
     settings = merge(own, set or {})
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
-        raise BadInput(f"{done.failures[0]}; mend that first")
+        raise BadInput(f"{done.failures[0]}; solve that first")
     innovations, estimates = (
         _outputs(done, schema) for schema in (schemas.INNOVATION, schemas.GAUSSIAN_ESTIMATE)
     )
     if not innovations:
         raise BadInput(
-            f"{source.name}: {label} gives no innovations, by which it could be diagnosed; give a "
+            f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
             "filter of the same model, such as -e ekf"
         )
     bound = bind(label, [source], {"kind": label, **settings})
@@ -276,7 +276,8 @@ def diagnose(
         tried, least = len(alternatives), least_gain(len(alternatives))
     else:
         notes.append(
-            f"{label} states no likelihood of its innovations: faults are named by what is unusual alone"
+            f"{label} states no likelihood of its innovations: faults are named by unusual "
+            "measurements alone"
         )
     sentences = [_sentence(each) for each in causes]
     has_outliers = any(each.kind == "outliers" for each in sentences)
@@ -313,7 +314,7 @@ def _asked(
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
         return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
     if estimator is None:
-        raise BadInput(f"{source.name}: holds no estimates; name the estimator to diagnose with -e")
+        raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
@@ -341,7 +342,7 @@ def _first_part(
         for topic in streamed:
             streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
         notes.append(
-            f"causes were looked for in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
+            f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
             f"{MOST_MESSAGES} of {len(stamps_ns)} messages; all else is of the whole log. For another "
             "part: fuselog cut"
         )

@@ -80,13 +80,13 @@ def _in_words(direction: Floats, value: float, names: Sequence[str]) -> str:
     if not others:
         factor = np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0))
         known = f"within a factor of {factor:.2g} (95 %)" if factor < MEANINGLESS else "not at all"
-        return f"{names[first]}: the logs tell it {known}"
+        return f"{names[first]}: the logs determine it {known}"
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
         for place in others
     ]
     return (
-        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly tell them apart; "
+        f"{', '.join(names[place] for place in (first, *others))}: the logs hardly distinguish them; "
         f"a larger {names[first]} with {' and '.join(turned)} explains them almost as well"
     )
 

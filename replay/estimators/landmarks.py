@@ -25,9 +25,11 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """Noise densities are per square root of a second; None takes what the log's channels state.
+    """Errors of the odometry.
 
-    The robot drives `forward_scale` times what the odometry says, and turns faster by `turn_bias_radps`.
+    Noise densities are per square root of a second: forward in m, turn in rad. The robot drives
+    `forward_scale` times what the odometry reports, and turns faster than reported by
+    `turn_bias_radps`.
     """
 
     forward_noise_density: NonNegativeFloat | None = None
@@ -37,7 +39,7 @@ class DeadReckoningParameters(ModelParameters):
 
 
 class LocalizationParameters(DeadReckoningParameters):
-    """Sensor noise and bias, and how improbable a measurement must be to be kept out.
+    """Noise and bias of the sensors.
 
     Poses and headings that do not state their covariance have `sigma_fix_m` and `sigma_heading_rad`.
     """

@@ -75,18 +75,18 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
         own = point_errors(where, model, asks)
         if not own and asks not in model.estimable:
             known = choices(asks, model.estimable)
-            raise BadInput(f"{where}: is no parameter that this model lets be estimated; {known}")
+            raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
-            raise BadInput(f"{where}: stands there twice; name it once")
+            raise BadInput(f"{where}: is named twice; name it once")
         sigma, drift, time_s = (given.get(asks) for given in options.values())
         if sigma is None:
             raise BadInput(
-                f"{where}: how well is it known beforehand? give its standard deviation, "
+                f"{where}: its uncertainty at the start is missing; give its standard deviation, "
                 f"estimate_sigma.{asks}=..."
             )
         if time_s is not None and model.estimable.get(asks) == "angle":
             raise BadInput(
-                f"{where}: is an angle, which has no mean to come back to; give "
+                f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
             )
         walk = Walk(sigma, drift or 0.0, time_s or np.inf)
@@ -161,7 +161,10 @@ def begin(
     )
     for name, mean in zip(added.names, means, strict=True):
         if not np.isfinite(mean):
-            raise BadInput(f"estimator {label}: estimate = {name}: give its likely value, {name}=...")
+            raise BadInput(
+                f"estimator {label}: estimate = {name}: its value at the start is missing; give "
+                f"{name}=..."
+            )
     variances = np.array([walk.sigma**2 for walk in added.walks])
 
     def extended(prior: Ragged) -> Ragged:

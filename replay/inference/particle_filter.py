@@ -38,10 +38,11 @@ MOST_PARTICLES = 1_000_000
 
 
 class ParticleParameters(MethodParameters):
-    """How many particles there are, and the seed, which is mixed with each run's own first measurement.
+    """The number of particles, and when they are resampled.
 
-    They are resampled where the effective number of them, 1 / sum w^2, is below that share of all. With
-    `cloud` every estimate comes with all particles, as a density.
+    That is where their effective number, 1 / sum w^2, is below the share `resample_below` of all. With
+    `cloud` every estimate comes with all its particles. Random numbers depend on `seed` and on the
+    run's first measurement.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000

@@ -276,11 +276,14 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda _: fl.import_("mrclam", "nope"), "nope: no such file or folder"),
         (lambda _: fl.run("landmark"), "did you mean 'landmarks'"),
         (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: no such entry"),
-        (lambda _: fl.write("a.mcap", [1]), "a.mcap: give streams"),
+        (lambda _: fl.write("a.mcap", [1]), "a.mcap: there is nothing to write; give streams"),
         (lambda _: fl.estimators["ekff"], "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(object(), "ekff"), "no method 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(robot(), "ekf:9"), "method ekf has no variants; give 'ekf' without ':9'"),
-        (lambda _: fl.modelled(robot(), "smoother:ekg"), "method smoother:ekg: 'ekg' is no filter that"),
+        (
+            lambda _: fl.modelled(robot(), "smoother:ekg"),
+            "method smoother:ekg: 'ekg' is not a filter that",
+        ),
         (lambda _: fl.modelled(robot(), "lrkf:s2kf"), "sampling 's2kf': count: is missing"),
         (
             lambda _: fl.modelled(robot(), "particles:0"),
@@ -307,7 +310,7 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda runs: fl.replay(runs, "ekf", start_s=float("nan")), "start_s is nan"),
         (
             lambda runs: fl.replay(runs, "ekf", start_s=9.0),
-            "nothing in this span; the log goes from 0 to 4 s",
+            "no messages in this span; the log goes from 0 to 4 s",
         ),
         (lambda runs: fl.replay(runs, "ekf", start_s=1.0), "--start-from truth"),
     ],
@@ -390,7 +393,7 @@ def test_a_figure_shows_a_case() -> None:
     done = fl.replay(fl.record("landmarks", robots=2, **SHORT), "ekf")
     assert done.figure("robot2").get_suptitle().startswith("robot2, 1 run")
     assert done.figure().get_suptitle().startswith("robot1, 1 run")
-    with pytest.raises(fl.BadInput, match="nothing called 'robot3' was judged"):
+    with pytest.raises(fl.BadInput, match="nothing with the name 'robot3' was judged"):
         done.figure("robot3")
 
 

@@ -1,5 +1,6 @@
 """Tables from the command line and from Python: guessed, imported, replayed."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
+from recorders.importers.tables.guessing import guess
 
 COUNT = 50
 
@@ -44,9 +46,9 @@ def test_a_guessed_mapping_works_as_it_is(
     assert 'units.turn_rate_radps = "deg/s"   # the largest is 2' in text
     assert "# not taken:" in text
     assert "photo.jpg" in text
-    assert "readme.md: has no times" in text
+    assert "readme.md: has no column of times" in text
     again = fuselog("import", "table", str(drive), "--guess", "-o", str(mapping))
-    assert (again.code, "give another name, or remove it yourself" in again.err) == (2, True)
+    assert (again.code, "give another name, or remove the file yourself" in again.err) == (2, True)
     assert fuselog("import", "table", str(drive), "--mapping", str(mapping), "-o", str(out)).code == 0
     log = fl.open(out)
     assert set(log) == {"/imu/inertial", "/gnss/fix", "/gnss/values"}
@@ -82,3 +84,94 @@ def test_several_tables_become_one_log(fuselog: Callable[..., Any], drive: Path,
     assert not (tmp_path / "words.toml").exists()
     two = fuselog("import", "ros", *files, "-o", str(out))
     assert (two.code, "ros data are one file or folder" in two.err) == (2, True)
+
+
+# Headers as their makers write them, numbers of two rows, and what comes of the first row.
+GUESSED: dict[str, tuple[str, list[float], dict[str, dict[str, Any]]]] = {
+    "wheels": (
+        "t,speed,yaw_rate",
+        [1.5, 12],
+        {"/odometry Odometry": {"forward_mps": 1.5, "turn_radps": np.radians(12)}},
+    ),
+    "car bus": (  # 25 m/s times 3 rad/s would be seven times the acceleration of free fall
+        "timestamp,vehicle_speed_kmh,gyro_z",
+        [90, 3],
+        {"/odometry Odometry": {"forward_mps": 25, "turn_radps": np.radians(3)}},
+    ),
+    "rostopic echo -p": (
+        "%time,field.twist.twist.linear.x,field.twist.twist.angular.z",
+        [0.5, 0.25],
+        {"/odometry Odometry": {"forward_mps": 0.5, "turn_radps": 0.25}},
+    ),
+    "MRCLAM odometry": (
+        "Time [s],forward velocity [m/s],angular velocity [rad/s]",
+        [0.1, -0.2],
+        {"/odometry Odometry": {"forward_mps": 0.1, "turn_radps": -0.2}},
+    ),
+    "MRCLAM measurements": (
+        "Time [s],Subject #,range [m],bearing [rad]",
+        [63, 2.5, -0.4],
+        {"/range_bearing RangeBearing": {"target_id": 63, "range_m": 2.5, "bearing_rad": -0.4}},
+    ),
+    "MRCLAM truth": (
+        "Time [s],x [m],y [m],orientation [rad]",
+        [1, 2, 0.5],
+        {"/truth TruthState": {"state": [1, 2, 0.5]}},
+    ),
+    "drone": (
+        "timestamp,lat,lon,alt,ax,ay,az,gx,gy,gz,qw,qx,qy,qz",
+        [47, 8.5, 400, 0, 0, 1, 0, 0, 20, 1, 0, 0, 0],
+        {
+            "/fix GeodeticFix": {"latitude_deg": 47, "longitude_deg": 8.5, "altitude_m": 400},
+            "/inertial InertialSample": {
+                "specific_force_mps2": [0, 0, 9.80665],
+                "turn_rate_radps": [0, 0, np.radians(20)],
+            },
+            "/orientation Orientation": {"quaternion": [1, 0, 0, 0]},
+        },
+    ),
+    "u-blox": (  # latitude and longitude in units of 1e-7 deg
+        "timestamp,lat,lon",
+        [47e7, 8.5e7],
+        {"/fix GeodeticFix": {"latitude_deg": 47, "longitude_deg": 8.5}},
+    ),
+    "nothing": (
+        "t,temperature,pressure",
+        [20, 1013],
+        {"/values VectorMeasurement": {"value": [20, 1013]}},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GUESSED)
+def test_names_of_columns_say_which_message_they_are(tmp_path: Path, name: str) -> None:
+    """Each guess states its reason, and its mapping imports the table as it is, in fuselog's units."""
+    header, numbers, wanted = GUESSED[name]
+    table, mapping = tmp_path / "own.csv", tmp_path / "own.toml"
+    rows = [",".join(map(str, [1_700_000_000 + second, *numbers])) for second in range(2)]
+    table.write_text("\n".join([header, *rows]))
+    text = guess([table])
+    mapping.write_text(text)
+    log = fl.import_("table", table, mapping=str(mapping))
+    assert set(log) == {each.split()[0] for each in wanted}
+    for stream, fields in wanted.items():
+        topic, becomes = stream.split()
+        assert re.search(rf"^# {becomes}: .*names?\b", text, re.MULTILINE)
+        for field, value in fields.items():
+            assert_allclose(log[topic][field][0], value, err_msg=f"{topic} {field}")
+
+
+def test_a_heading_is_guessed_by_the_path(tmp_path: Path) -> None:
+    """A heading that the path shows to be clockwise from north is turned to fuselog's, from east."""
+    direction = np.linspace(0, 3, 40)
+    east, north = np.cumsum(np.cos(direction)), np.cumsum(np.sin(direction))
+    columns = [1_700_000_000 + np.arange(40), east, north, np.degrees(np.pi / 2 - direction) % 360]
+    table, mapping = tmp_path / "nav.csv", tmp_path / "nav.toml"
+    np.savetxt(
+        table, np.stack(columns, 1), "%.9f", ",", header="t,easting,northing,heading", comments=""
+    )
+    mapping.write_text(guess([table]))
+    truth = fl.import_("table", table, mapping=str(mapping))["/truth"]
+    assert truth.metadata["components"] == "x_m,y_m,heading_rad"
+    turned = np.angle(np.exp(1j * (truth["state"][:, 2] - direction)))
+    assert_allclose(turned, 0, atol=1e-6)

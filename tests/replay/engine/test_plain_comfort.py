@@ -307,7 +307,7 @@ def test_all_runs_at_once_are_one_call() -> None:
     out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
     assert seen == [2]
     assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(BadInput, match="give follow or follow_all"):
+    with pytest.raises(BadInput, match="neither follow nor follow_all is given"):
         recursive("none", **given)
 
 

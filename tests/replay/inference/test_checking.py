@@ -179,7 +179,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a kind that does not exist": (
         replace(VEHICLE_A, state={**vehicle_a.STATE, "x_m": "metres"}),
-        "known are linear",
+        "give linear",
     ),
     "a correction that is none for small steps": (
         replace(VEHICLE_A, correct=Correction(along_heading, moved_by, stepped, moved_well)),
