@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline import door
@@ -138,12 +139,19 @@ class Replay:
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
         said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.unjudged]
-        return "\n".join([*said, *self.failures, *self.losses, self.metrics.to_string(index=False)])
+        return "\n".join(
+            [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
+        )
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric, in the order of the estimators: estimator, quantity, case, value."""
-        return summary_table(in_order(self.judge.metrics, self.settings))
+        """A row per metric, in the order of the estimators: estimator, quantity, case, value, low, high.
+
+        From `low` to `high` lie 95 % of all values of a consistent estimator; NaN where that is not known.
+        """
+        metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
+        intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
+        return summary_table(metrics).assign(low=intervals[:, 0], high=intervals[:, 1])
 
     @property
     def runs(self) -> pd.DataFrame:
@@ -305,6 +313,11 @@ def settings_of(
         if not isinstance(each, str | Mapping):
             raise BadInput(
                 f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
+            )
+        if isinstance(each, Mapping) and "kind" in each:
+            raise BadInput(
+                f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
+                '{"mine": {...}}'
             )
         for label, what in ({each: {}} if isinstance(each, str) else each).items():
             if label in chosen:

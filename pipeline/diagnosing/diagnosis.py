@@ -231,15 +231,21 @@ def diagnose(
         set: parameters of the estimator.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
-    Raises BadInput where the estimator does not fit the log, fails, or gives no innovations.
+    Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
+    no innovations.
 
     >>> from pipeline.door import record
     >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')
     """
-    [source] = sources_of(log)
-    source, chosen = _asked(source, estimator)
+    sources = sources_of(log)
+    if len(sources) > 1:
+        raise BadInput(
+            f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
+            "The table `runs` of a replay shows which run is worst, and tune takes several logs"
+        )
+    source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, set or {})
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)

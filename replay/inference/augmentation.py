@@ -55,8 +55,10 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """What is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where the model does not let one of it, one stands twice, or has no sigma.
+    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
+    one that is asked for, one stands twice, or has no sigma.
     """
+    check_estimable(f"estimator {label}", model)
     asked = parameters.estimate or []
     options = {
         "estimate_sigma": parameters.estimate_sigma or {},
@@ -93,6 +95,23 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
         else:
             named[asks] = walk
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
+
+
+def check_estimable(where: str, model: Model) -> None:
+    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
+    if not isinstance(model.estimable, Mapping):
+        raise BadInput(
+            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
+            'to kind, such as {"length_m": "linear"}'
+        )
+    known = number_fields(model.parameters)
+    for name, kind in model.estimable.items():
+        if name not in known:
+            raise BadInput(
+                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+            )
+        if kind not in ("linear", "angle"):
+            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:

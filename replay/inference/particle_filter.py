@@ -11,6 +11,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Integers
 from replay.engine.blocks import Ragged
 from replay.engine.compile import compiled
+from replay.engine.failures import reason_stream
 from replay.engine.philox import WORDS, fill_normals, run_key
 from replay.engine.results import ALL_WELL, named
 from replay.inference.filtering import Filter, State
@@ -132,7 +133,28 @@ class ParticleFilter(Filter):
         is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(happenings.offsets))
         waiting = None if is_ready.all() else of_rows(happenings, ~is_ready)
         ready = happenings if is_ready.all() else of_rows(happenings, is_ready)
-        return super().follow(after._replace(kept=waiting), ready)
+        after, made = super().follow(after._replace(kept=waiting), ready)
+        return after, [*made, *self.cautions(happenings.time_ns, first, len(place) - 1)]
+
+    def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
+        """On the topic `started` of runs that begin at these rows: which parameters cannot change."""
+        options = self.parameters
+        moving = {*(options.estimate_time_s or ())}
+        moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
+        constant = [name for name in options.estimate or () if name not in moving]
+        if not constant or not first:
+            return []
+        stream = reason_stream(
+            f"/estimates/{self.name}/started",
+            schemas.STARTED,
+            time_ns[[*first.values()]],
+            np.zeros(len(first), np.int64),
+            [
+                f"{', '.join(constant)} is constant, and particles have only the values that were drawn "
+                "at the start; give estimate_drift, or take a Gaussian filter such as ekf"
+            ],
+        )
+        return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
     def finish(self, state: State) -> list[Ragged]:
         """What waited for a control or a measurement that did not come; then the prior seeds the run."""

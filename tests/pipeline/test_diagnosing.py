@@ -304,6 +304,8 @@ def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySour
         fl.diagnose(run)
     with pytest.raises(fl.BadInput, match="one estimator is diagnosed at a time"):
         fl.diagnose(run, {"ekf": {}, "ukf": {}})
+    with pytest.raises(fl.BadInput, match="2 logs: one log is diagnosed at a time; give one, such as"):
+        fl.diagnose([run, run], "ekf")  # type: ignore[arg-type]
     log = tmp_path / "run.mcap"
     fl.write(log, run)
 

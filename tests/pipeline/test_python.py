@@ -205,6 +205,10 @@ def test_a_replay_says_what_the_command_says(
             case = done.metrics["case"].map(lambda name: f".{name}" if name else "")
             keys = done.metrics["estimator"] + "." + done.metrics["quantity"] + case
             assert dict(zip(keys, done.metrics["value"], strict=True)) == told["metrics"]
+            stated = done.metrics.assign(key=keys).dropna(subset=["low", "high"])
+            intervals = stated[["low", "high"]].to_numpy().tolist()
+            assert dict(zip(stated["key"], intervals, strict=True)) == told["bounds"]
+            assert {"nees", "nis_per_component"} <= set(stated["quantity"])
             for run, estimates in enumerate(done.estimates):
                 there = fl.open(f"{run}.estimates.mcap")
                 assert set(there) == set(estimates)
@@ -292,6 +296,10 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda runs: fl.replay(runs, "ekff"), "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda runs: fl.replay(runs, {"ekf": {"sigma": 1}}), "estimator ekf: no parameter 'sigma'"),
         (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),
+        (
+            lambda runs: fl.replay(runs, {"kind": fl.modelled(robot(), "ekf"), "sigma_range_m": 0.1}),
+            'kind, sigma_range_m: these look like settings of one estimator; give them a label: {"mine": ',
+        ),
         (lambda runs: fl.replay(runs, [print]), "an estimator is builtin_function_or_method"),
         (lambda runs: fl.replay(runs, ["ekf", {"ekf": {}}]), "estimator ekf is given twice"),
         (lambda runs: fl.replay(runs, []), "no estimators to replay"),

@@ -189,6 +189,18 @@ WRONG: dict[str, tuple[Model, str]] = {
         replace(VEHICLE_A, correct=Correction(along_heading, moved_well, stepped_twice, moved_well)),
         "stepped_twice .* does not find the step of moved_well",
     ),
+    "estimable without kinds": (
+        replace(VEHICLE_A, estimable=("sigma_speed_mps",)),
+        "estimable is a tuple; it is a mapping from parameter to kind, such as",
+    ),
+    "an estimable that is no parameter": (
+        replace(VEHICLE_A, estimable={"sigma_sped_mps": "linear"}),
+        "'sigma_sped_mps' is no parameter of the model; did you mean 'sigma_speed_mps'",
+    ),
+    "an estimable orientation": (
+        replace(VEHICLE_A, estimable={"sigma_speed_mps": "axis"}),
+        "sigma_speed_mps is of kind 'axis'; known are linear and angle",
+    ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),
         "as_if_linear .*heading_rad is of kind angle",
