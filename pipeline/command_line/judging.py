@@ -30,7 +30,11 @@ from recorders.errors import BadInput
 )
 @click.argument("estimates", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--log", "logs", multiple=True, type=ANY_PATH, help="The log with the truth, per run.")
-@click.option("--truth", type=ANY_PATH, help="The true trajectory, where ESTIMATES is one as a file.")
+@click.option(
+    "--truth",
+    type=ANY_PATH,
+    help="The file of the true trajectory, where ESTIMATES is a trajectory file.",
+)
 @click.option(
     "--format", type=FORMAT, help="The format of trajectory files [default: found from their content]."
 )
@@ -43,9 +47,13 @@ from recorders.errors import BadInput
     help="Bring estimates nearest to the truth first: yaw turns about the vertical and shifts, se2 too "
     "but for the height, se3 turns and shifts, sim3 scales as well [default: none].",
 )
-@click.option("--delta", type=float, help="What way relative pose errors are over [default: 1].")
 @click.option(
-    "--delta-unit", type=click.Choice(["m", "frames", "s"]), help="Its unit [default: frames]."
+    "--delta", type=float, help="The distance over which relative pose errors are taken [default: 1]."
+)
+@click.option(
+    "--delta-unit",
+    type=click.Choice(["m", "frames", "s"]),
+    help="The unit of --delta [default: frames].",
 )
 @click.option(
     "--association",
@@ -57,7 +65,7 @@ from recorders.errors import BadInput
     "--max-difference",
     "max_difference_s",
     type=Seconds(0),
-    help="Seconds up to which the nearest belong together [default: 0.01].",
+    help="The largest time in seconds between a pose and its nearest true one [default: 0.01].",
 )
 @click.option(
     "--time-offset",
@@ -122,13 +130,15 @@ def evaluate(
 @click.argument("sides", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "labels", multiple=True, help="Which estimators (repeatable).")
 @click.option("--truth", type=ANY_PATH, help="The true trajectory, where SIDES are trajectory files.")
-@click.option("--case", help="What trajectory files are of, such as robot2, where a log has several.")
+@click.option(
+    "--case", help="Which truth trajectory files are judged by, such as robot2, where a log has several."
+)
 @click.option(
     "--margin",
     type=click.FloatRange(min=0),
     default=0.02,
     show_default=True,
-    help="The relative difference of a metric that does not matter.",
+    help="The relative difference of a metric that counts as none.",
 )
 @click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
 @click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")

@@ -47,7 +47,7 @@ def models(name: str | None, as_json: bool) -> None:
 @click.option("--clear", is_flag=True, help="Remove what fuselog wrote there, and nothing else.")
 @json_option
 def cache(clear: bool, as_json: bool) -> None:
-    """Say how large the cache is: compiled kernels and samples, which fuselog can make again."""
+    """Say how large the cache of compiled kernels and samples is; fuselog can make these again."""
     from pipeline.information import show_cache
 
     show_cache(clear=clear, as_json=as_json)

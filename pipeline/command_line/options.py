@@ -17,7 +17,7 @@ class OutputFile(click.Path):
         """The path."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.exists() and not path.is_file():
-            self.fail(f"{path} is no regular file", param, ctx)
+            self.fail(f"{path} is not a regular file", param, ctx)
         return path
 
 

@@ -85,8 +85,8 @@ def record(
 )
 @click.option(
     "--mapping",
-    help="What becomes of messages or columns: a TOML file, or the name of one that ships; "
-    "import table without it lists these.",
+    help="The mapping of messages or columns: a TOML file, or the name of one that ships; "
+    "without it, import table lists these.",
 )
 @click.option(
     "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."

@@ -161,7 +161,13 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 @click.argument("path", type=ANY_PATH)
 @click.option("--against", "golden", type=FILE, required=True, help="The golden, a .golden.xz file.")
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
-@click.option("-e", "--estimator", "labels", multiple=True, help="With --update: of what (repeatable).")
+@click.option(
+    "-e",
+    "--estimator",
+    "labels",
+    multiple=True,
+    help="With --update: an estimator of the golden (repeatable).",
+)
 @arrival_option
 @late_option
 @click.option(

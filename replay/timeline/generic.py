@@ -80,8 +80,7 @@ def draw(canvas: Canvas, scene: Scene) -> Board:
         held = ", ".join(f"{each.name} ({each.encoding})" for each in scene.source.topics.values())
         raise BadInput(
             f"{scene.source.name}: has nothing to draw, no protobuf messages with numeric fields; its "
-            "topics are "
-            f"{held or 'no topics'}"
+            f"topics are {held or 'none'}"
         )
     turn_up(canvas)
     return draw_cases(scene, partial(_draw_case, canvas, scene))

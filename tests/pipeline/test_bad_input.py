@@ -285,7 +285,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "diagnose log.mcap other.mcap -e ekf": ("2 logs", "one log is diagnosed", "to fuselog tune"),
     # where to write
     "record landmarks --out folder": ("'folder' is a directory",),
-    "record landmarks --out /dev/null": ("/dev/null", "no regular file"),
+    "record landmarks --out /dev/null": ("/dev/null", "not a regular file"),
     "record landmarks --out /proc/x.mcap": ("/proc/x.mcap", "cannot be written"),
     "record landmarks --out text.mcap/x.mcap": ("text.mcap/x.mcap", "cannot be written"),
     "replay log.mcap -e ekf --out log.mcap": ("log.mcap", "would replace the log"),

@@ -530,7 +530,7 @@ def test_a_log_with_nothing_to_draw_says_so(tmp_path: Path) -> None:
         )
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    with pytest.raises(BadInput, match=r"nothing to draw: .* it holds /said \(json\)"):
+    with pytest.raises(BadInput, match=r"nothing to draw, .* its topics are /said \(json\)"):
         show(LogSource(open_log(path)), {}, [], save=tmp_path / "said.rrd")
     assert not (tmp_path / "said.rrd").exists()
 
