@@ -150,7 +150,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     end = dict(zip(last.components, last["mean"][-1].tolist(), strict=True))
     for name in [each for each in end if "_bias_" in each]:
         outcome.metrics[f"{options.filter}.end_{name}"] = end[name]
-    begun = sentences_of(replayed.outputs[f"/estimates/{options.filter}/started"].of_run(len(runs)))
+    started = replayed.outputs.get(f"/estimates/{options.filter}/started")  # none of a log with a prior
+    begun = [] if started is None else sentences_of(started.of_run(len(runs)))
     notes = [*whole.run.notes.items(), *((sentence, "") for sentence in begun)]
     outcome.tables |= {
         "summary": summary_table(outcome.metrics),
@@ -160,7 +161,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         "notes": pd.DataFrame(notes, columns=["what", "count"]),
     }
     outcome.figures["outages"] = _chart(errors)
-    outcome.claims = _claims(by_length, begun[0].partition("; ")[2], options)
+    outcome.claims = _claims(by_length, "".join(begun[:1]).partition("; ")[2], options)
     if options.sheet is not None and folder.name == options.sheet.recording:
         outcome.claims += _claims_of_sheet(by_length, kinds, end, options, options.sheet)
     return outcome

@@ -164,18 +164,10 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
         how += _leap(samples, moving, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
-    force_variance = parameters.force_bias_sigma_mps2**2 * np.eye(3)
     covariance[9:12, 9:12] = _given(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
-    covariance[12:15, 12:15] = force_variance
-    tilt_sigma = _given(parameters.tilt_sigma_rad, None)
-    if tilt_sigma is not None:
-        covariance[6:9, 6:9] = tilt_sigma**2 * (np.eye(3) - np.outer(up, up))
-    else:  # a bias is levelled away: the body leans by as much as it is of gravity
-        lean = np.cross(up, np.eye(3)).T / STANDARD_GRAVITY_MPS2
-        moved = _unsteadiness(samples, moving, parameters) ** 2 * np.eye(3)
-        covariance[6:9, 6:9] = lean @ (force_variance + moved) @ lean.T
-        covariance[6:9, 12:15] = lean @ force_variance
-        covariance[12:15, 6:9] = covariance[6:9, 12:15].T
+    unsteadiness_mps2 = _unsteadiness(samples, moving, parameters)
+    tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
+    covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
     covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
     return Started(start_ns, mean, covariance, how)
 
@@ -231,6 +223,25 @@ def _wide(sigma: float | None, covariance: Floats) -> Floats:
     """The covariance (3, 3) of a start at a message of this one, which is used once more."""
     given = _given(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
+
+
+def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
+    """Of the tilt and the accelerometer's bias (6, 6), in the body's axes, where `up` is up.
+
+    Where the tilt's is not given they go together: a bias is levelled away, and the body leans by as
+    much as the bias is of gravity.
+    """
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
+    tilt_sigma = _given(parameters.tilt_sigma_rad, None)
+    if tilt_sigma is not None:
+        covariance[:3, :3] = tilt_sigma**2 * (np.eye(3) - np.outer(up, up))
+        return covariance
+    lean = np.cross(up, np.eye(3)).T / STANDARD_GRAVITY_MPS2
+    covariance[:3, :3] = lean @ (force + unsteadiness_mps2**2 * np.eye(3)) @ lean.T
+    covariance[:3, 3:] = lean @ force
+    covariance[3:, :3] = covariance[:3, 3:].T
+    return covariance
 
 
 def _first_place(
