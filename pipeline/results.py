@@ -165,7 +165,9 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
             mean = float(nees.mean())
             low, high = t.interval(0.95, len(nees) - 1, loc=mean, scale=sem(nees))
             components = rows.filter(regex="^rmse_").notna().any().sum()
-            said[estimator, case] = f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
+            said[str(estimator), str(case)] = (
+                f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
+            )
     return said
 
 

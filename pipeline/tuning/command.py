@@ -72,6 +72,8 @@ def tune_logs(
     if as_json:
         print_json(
             {
+                "logs": [str(path) for path in logs],
+                "held_out": [str(path) for path in held_out],
                 "parameters": parameters,
                 "correlation": found.correlation.replace({np.nan: None}).to_dict(),
                 "notes": found.notes,
