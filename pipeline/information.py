@@ -20,7 +20,7 @@ from replay.inference.all_methods import METHODS
 from replay.inference.binding import topics_of
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model import Model
-from replay.inference.needs import names_state, nearest_parts
+from replay.inference.needs import OWN_MODEL, names_state, nearest, nearest_parts
 
 
 def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
@@ -95,9 +95,13 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
 
 
 def _say_what_fits(path: Path, log: Log) -> None:
-    """Print which models fit the log and how, and what it lacks for the others."""
+    """Print which models fit the log and how, and what it lacks for the others; or that none fits."""
+    fitting_models = fitting_of(log.topics)
+    if not any(fitting.methods for fitting in fitting_models.values()):
+        say(f"No registered model fits it: {nearest(registered_models(), log.topics)}; {OWN_MODEL}")
+        return
     say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
-    for name, fitting in fitting_of(log.topics).items():
+    for name, fitting in fitting_models.items():
         if fitting.methods:
             say(f"  {name}: -e {' '.join(fitting.methods)}; from {', '.join(fitting.topics)}")
         else:

@@ -147,7 +147,7 @@ class Replay:
     def metrics(self) -> pd.DataFrame:
         """A row per metric, in the order of the estimators: estimator, quantity, case, value, low, high.
 
-        From `low` to `high` lie 95 % of all values of a consistent estimator; NaN where unknown.
+        From `low` to `high` lie 95 % of the values of a consistent estimator; NaN where that is unknown.
         """
         metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
         intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)

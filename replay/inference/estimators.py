@@ -28,7 +28,7 @@ from replay.inference.binding import Found, roles_of, topics_of
 from replay.inference.filtering import Filter, samplers_of
 from replay.inference.methods import Method
 from replay.inference.model import Model, ModelParameters, Motion
-from replay.inference.needs import elsewhere, names_state, nearest, needs_of
+from replay.inference.needs import OWN_MODEL, elsewhere, names_state, nearest, needs_of
 from replay.inference.opening import Beginning
 from replay.inference.rewinding import Rewinding
 from replay.inference.settings import (
@@ -158,9 +158,10 @@ def _bind_fitting(
         )
     if not fitting:
         which = f"estimator {label}: model {named}" if named else f"estimator {label}"
+        own = "" if named else f"; {OWN_MODEL}"
         raise BadInput(
             f"{which} does not fit this log: {nearest(models, topics)}; "
-            f"the log has {', '.join(topics) or 'no topics'}"
+            f"the log has {', '.join(topics) or 'no topics'}{own}"
         )
     (name,) = fitting
     lacking = _made_for(f"estimator {label}", method, values).lacks(models[name])

@@ -10,6 +10,12 @@ from replay.inference.model import (
     Model,
 )
 
+# What to do with a log that no registered model fits; docs/your-model.md
+OWN_MODEL = (
+    'use a model of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model '
+    "in the documentation"
+)
+
 
 def needs_of(model: Model) -> str:
     """What a log has to have for a model, in words; of one that can start without, what it may have."""
@@ -26,7 +32,8 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
     tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
-        return f"it has nothing that {' or '.join(models)} needs"
+        which = f"{name} needs" if len(models) == 1 else "a registered model needs"
+        return f"it has nothing that {which}"
     missing = "; ".join(part.words for part in parts if not part.is_here)
     return f"model {name} comes nearest and lacks {missing}"
 

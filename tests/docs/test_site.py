@@ -7,6 +7,10 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from mkdocs.config import load_config
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from pipeline.experiment import shipped
 from tests.docs import gallery, hooks, notebooks, reference
@@ -23,6 +27,12 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pages = {path.relative_to(tmp_path).with_suffix("").as_posix() for path in tmp_path.rglob("*.html")}
     sources = {*(ROOT / "docs").rglob("*.md"), *notebooks.NOTEBOOKS}
     assert pages >= {path.relative_to(ROOT / "docs").with_suffix("").as_posix() for path in sources}
+    for notebook in notebooks.NOTEBOOKS:
+        page = tmp_path / "notebooks" / f"{notebook.stem}.html"
+        links = re.findall(r'<a\b[^>]*\bhref="?([^"#> ]+)', page.read_text(encoding="utf-8"))
+        local = {link for link in links if not re.match(r"\w+:|/", link)}
+        assert local
+        assert {link for link in local if not (page.parent / link).exists()} == set()
     commands = (tmp_path / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "fuselog replay run.mcap -e ekf" in re.sub(r"<[^>]+>", "", commands)
 
@@ -38,6 +48,24 @@ def test_what_a_page_must_not_have() -> None:
     hooks.on_post_page(
         '<a href="https://rerun.io">, <img alt="a robot" src="a.png">', page="", config={}
     )
+
+
+def test_links_of_notebooks_lead_to_pages() -> None:
+    """As they stand they lead to the sources; one to a page that is not there stops the build."""
+    config = load_config(str(ROOT / "mkdocs.yml"))
+    names = ["your-model.md", "notebooks/own-model.ipynb"]
+    files = Files(
+        [File(name, config.docs_dir, config.site_dir, use_directory_urls=False) for name in names]
+    )
+    notebook = files.get_file_from_path(names[1])
+    assert notebook is not None
+    page = Page(None, notebook, config)
+    kept = '<a href="https://rerun.io/a.md"> <a href="#top">'
+    source = f'<a href="../your-model.md#methods"> {kept}'
+    pointed = hooks.on_page_content(source, page, config, files)
+    assert pointed == f'<a href="../your-model.html#methods"> {kept}'
+    with pytest.raises(PluginError, match=r"own-model.ipynb: links to ../my-model.md, which is no page"):
+        hooks.on_page_content('<a href="../my-model.md">', page, config, files)
 
 
 def test_the_gallery_has_every_experiment() -> None:

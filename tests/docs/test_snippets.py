@@ -1,13 +1,18 @@
 """Python in the pages: that of every page is run, here what no other test runs."""
 
 import ast
+import inspect
 import re
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 import fuselog as fl
+from replay.judging.measuring import find_metrics
 from tests.docs.test_worked_pages import WORKED
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -25,6 +30,31 @@ def python_of(name: str) -> list[str]:
 def test_the_python_of_every_page_is_run() -> None:
     pages = [path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md")]
     assert {name for name in pages if python_of(name)} <= WORKED_THROUGH | BY_OTHERS | HERE
+
+
+def test_every_metric_has_a_meaning() -> None:
+    """What metrics return, by their sources, is on the page Judge."""
+    page = (DOCS / "judge.md").read_text(encoding="utf-8")
+    modules = {metric.finish.__module__ for metric in find_metrics().values()}
+    named = {name for module in modules for name in _quantities_of(import_module(module))}
+    assert {"estimates_without_nees", "gospa_m", "switches", "eer_percent", "over_ensemble"} <= named
+    assert {name for name in named if f"`{name}`" not in page} == set()
+
+
+def _quantities_of(module: ModuleType) -> Iterator[str]:
+    """The constant names in all functions of a module that return numbers by name."""
+    for function in ast.walk(ast.parse(inspect.getsource(module))):
+        if not (isinstance(function, ast.FunctionDef) and function.returns is not None):
+            continue
+        if ast.unparse(function.returns) != "dict[str, float]":
+            continue
+        for node in ast.walk(function):
+            if isinstance(node, ast.Dict):
+                keys = [key for key in node.keys if key is not None]
+            else:
+                stored = isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
+                keys = [node.slice] if stored else []
+            yield from (key.value for key in keys if isinstance(key, ast.Constant))
 
 
 def test_the_sweep_of_many_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fuselog as fl
 from pipeline.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 
@@ -175,6 +176,20 @@ def test_estimates_beside_a_log_and_in_a_folder_find_it_again(world: Path, fusel
     assert fuselog("replay", "a/log.mcap", "-e", "ekf", "--out", "a/b").code == 0
     Path("a").rename("ä ☃")
     assert fuselog("evaluate", "ä ☃/b/log.estimates.mcap").code == 0
+
+
+def test_info_says_that_no_model_fits(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It lists no models that do not fit, and says how one of one's own is used."""
+    monkeypatch.chdir(tmp_path)
+    seen = {"metadata": {"components": "bob_m"}, "value": [[0.5]]}
+    fl.write("own.mcap", [fl.make_stream("/p/camera", fl.schemas.VECTOR_MEASUREMENT, [10**9], **seen)])
+    said = fuselog("info", "own.mcap").out.splitlines()[-1]
+    assert said == (
+        "No registered model fits it: it has nothing that a registered model needs; use a model of your "
+        'own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model in the documentation'
+    )
 
 
 def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:

@@ -298,8 +298,7 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),
         (
             lambda runs: fl.replay(runs, {"kind": fl.modelled(robot(), "ekf"), "sigma_range_m": 0.1}),
-            "kind, sigma_range_m: these look like settings of one estimator; give them a label: "
-            '{"mine": ',
+            'kind, sigma_range_m: these look like settings of one estimator; give them a label: {"mine"',
         ),
         (lambda runs: fl.replay(runs, [print]), "an estimator is builtin_function_or_method"),
         (lambda runs: fl.replay(runs, ["ekf", {"ekf": {}}]), "estimator ekf is given twice"),

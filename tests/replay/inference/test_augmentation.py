@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_equal
 from scipy.stats import chi2
 
 import fuselog as fl
@@ -189,6 +189,25 @@ def test_particles_say_that_a_parameter_is_constant() -> None:
         "one robot1: forward_scale ",
     ]
     assert all("give estimate_drift, or take a Gaussian filter" in mend for _, _, mend in said)
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_a_truth_may_have_the_parameter_too() -> None:
+    """Then its error is judged where it is estimated; an estimate without it is judged as before."""
+    log, own = fl.record("landmarks", duration_s=0.5), {"ekf": {}, "more": {"kind": "ekf", **ESTIMATE}}
+    truth = log["/robot1/truth"]
+    kinds = {"components": "x_m,y_m,heading_rad,bias_range_m", "kinds": "linear,linear,angle,linear"}
+    wider = np.pad(truth["state"][:, :3], ((0, 0), (0, 1)))
+    stamps_ns = truth.publish_time_ns
+    more = make_stream(truth.topic, schemas.TRUTH_STATE, stamps_ns, metadata=kinds, state=wider)
+    judged = [
+        fl.replay(replace(log, streams={**log.streams, truth.topic: each}), own).judge.metrics
+        for each in (truth, more)
+    ]
+    known = [metrics["more.bias_range_rmse_m.robot1"] for metrics in judged]
+    assert np.isfinite(known).tolist() == [False, True]
+    alone = [{k: v for k, v in metrics.items() if k.startswith("ekf.")} for metrics in judged]
+    assert_equal(*alone)
 
 
 # A time offset: what the sensor says is of the state of so much earlier

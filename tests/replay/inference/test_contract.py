@@ -206,10 +206,11 @@ def test_a_sensor_that_fits_no_topic(registered: dict[str, Model]) -> None:
 
 
 def test_the_sentence_of_a_log_that_no_model_fits() -> None:
-    """It names the file, what every model needs and what the log has."""
+    """It names the file and what the log has, and says how a model of one's own is used."""
     with pytest.raises(BadInput) as caught:
         bind("ekf", [changed("/prior", None)], {})
-    for words in ("vehicle-a", "does not fit this log", "robot", "/sighting"):
+    own = 'use a model of your own from Python, fl.modelled(MODEL, "ekf"), or register it'
+    for words in ("vehicle-a", "does not fit this log", "registered model", "/sighting", own):
         assert words in str(caught.value)
 
 
