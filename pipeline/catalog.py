@@ -183,6 +183,6 @@ def _print_details(entry: Entry) -> None:
     for key, fact in entry.facts.items():
         say(f"{key}: {fact}")
     if entry.parameters:
-        table = [list(each) for each in describe(entry.parameters, entry.values)]
-        if table:
-            print_table(["parameter", "default", "accepts"], table)
+        described = describe(entry.parameters, entry.values)
+        if described:
+            print_table(["parameter", "default", "accepts", "meaning"], described)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
-from pydantic import create_model
+from pydantic import Field, create_model
 from pydantic.fields import FieldInfo
 
 from recorders.errors import BadInput, choices
@@ -52,9 +52,8 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> 
 
 
 def _accepted(field: FieldInfo) -> Any:
-    """What a parameter accepts: its type with its bounds."""
-    bounds = tuple(field.metadata)
-    return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
+    """What a parameter accepts, its type with its bounds, and what it means."""
+    return Annotated[(field.annotation, *field.metadata, Field(description=field.description))]
 
 
 def modelled_by(
@@ -207,7 +206,7 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, opening=opening)
+        made = replace(made, opening=opening, assumed=assumed)
         bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
     return bound
 

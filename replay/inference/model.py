@@ -44,7 +44,7 @@ class ModelParameters(Parameters):
     switch_nis: PositiveFloat | None = None
     """Above this NIS a measurement is switched off by degrees, as in dynamic covariance scaling."""
     sigma_fix_m: PositiveFloat | None = None
-    """Of each component of a position fix that does not state its covariance."""
+    """Standard deviation, in m, of each component of a fix that does not state its covariance."""
 
 
 @dataclass(frozen=True, eq=False)
