@@ -90,7 +90,7 @@ class Cell:
             return pickle.dumps(done)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise BadInput(
-                f"what a metric keeps cannot go to another process ({error}); keep numbers, arrays "
+                f"what a metric keeps cannot be sent to another process ({error}); keep numbers, arrays "
                 "and classes of a module"
             ) from error
 
@@ -225,7 +225,9 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
     waiting = deque(number for number, key in enumerate(keys) if not kept.has(key))
     if len(waiting) < len(cells):
         done = len(cells) - len(waiting)
-        _LOG.warning("%s: has %d of %d cells; going on with the others", kept.folder, done, len(cells))
+        _LOG.warning(
+            "%s: has %d of %d cells already; computing the others", kept.folder, done, len(cells)
+        )
     died: Counter[int] = Counter()
     following = 0
     while following < len(cells):
@@ -262,7 +264,7 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                 if times >= ATTEMPTS:
                     cell = cells[number]
                     raise BadInput(
-                        f"runs {cell.first} to {cell.end - 1}: the process that worked on them died "
+                        f"runs {cell.first} to {cell.end - 1}: the process that computed them died "
                         f"{times} times ({lost}); try fewer workers, or --workers 1 to see why"
                     )
 

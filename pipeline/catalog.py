@@ -1,6 +1,6 @@
 """What there is to choose from: scenarios, estimators, metrics, experiments; lists and details."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.experiment import Experiment, load_scenario, shipped
 from pipeline.terminal import print_json, print_table, say
 from recorders.errors import BadInput, choices
-from recorders.parameters import build, describe
+from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
@@ -19,20 +19,25 @@ from replay.engine.estimator import Estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.binding import serving
 from replay.inference.estimators import registered_models
-from replay.inference.model import Model
+from replay.inference.model import Model, ModelParameters
 from replay.inference.needs import needs_of
+from replay.inference.settings import number_fields
 from replay.judging.measuring import Metric
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing to choose: what it is in a line, more facts, its parameters, and values it sets."""
+    """One thing to choose: what it is in a line, more facts, its parameters, and values it sets.
+
+    `stated` are the parameters that a log's channels state where they are not given.
+    """
 
     name: str
     what: str
     facts: Mapping[str, str] = field(default_factory=dict)
     parameters: type[BaseModel] | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
+    stated: Collection[str] = ()
 
 
 def scenarios() -> list[Entry]:
@@ -73,7 +78,7 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
         print_json([_as_json(entry) for entry in entries])
     elif name is None:
         print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
-        say(f"All about one of them: fuselog {kind}s NAME")
+        say(f"For all about one of them: fuselog {kind}s NAME")
     else:
         _print_details(entries[0])
 
@@ -143,7 +148,9 @@ def _model(name: str, model: Model) -> Entry:
         facts["estimable"] = _listed(model.estimable)
     facts["needs"] = needs_of(model)
     facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
-    return Entry(name, model.summary, facts, model.parameters)
+    own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
+    stated = own & {*number_fields(model.parameters)}
+    return Entry(name, model.summary, facts, model.parameters, stated=stated)
 
 
 def _listed(components: Mapping[str, str]) -> str:
@@ -184,5 +191,18 @@ def _print_details(entry: Entry) -> None:
         say(f"{key}: {fact}")
     if entry.parameters:
         described = describe(entry.parameters, entry.values)
-        if described:
-            print_table(["parameter", "default", "accepts", "meaning"], described)
+        table = [
+            [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
+            for each in described
+        ]
+        if any(each.meaning for each in described):
+            print_table(["parameter", "default", "accepts", "meaning"], table)
+        elif table:
+            print_table(["parameter", "default", "accepts"], [row[:-1] for row in table])
+        for place, text in explain(entry.parameters).items() if table else ():
+            say(f"\n{place}\n{text}" if place else f"\n{text}")
+
+
+def _default(value: object, *, is_stated: bool) -> object:
+    """A parameter's default in words, where it is what a log's channels state."""
+    return "from the log" if value is None and is_stated else value

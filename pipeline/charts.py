@@ -80,7 +80,7 @@ class Band(Drawn):
 
 def _check_lengths(*columns: Sequence[Any]) -> None:
     if len(set(map(len, columns))) > 1:
-        raise ValueError("x and the values over it must be of one length")
+        raise ValueError("x and the values over it must have one length")
 
 
 class Panel(Parameters):

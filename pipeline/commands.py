@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.executors import crew_of
@@ -21,6 +23,7 @@ from pipeline.experiment import (
 )
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.results import (
+    RUNS,
     ErrorTables,
     in_order,
     plain,
@@ -105,8 +108,12 @@ def replay_logs(
     ).check()
     _state_losses(source.log for source in sources)
     if tells_parameters and not as_json:
-        print_parameters(done.parameters)
-    told = {"seconds": dict(done.seconds), "parameters": done.parameters}
+        print_parameters(done.parameters, done.stated)
+    told = {
+        "seconds": dict(done.seconds),
+        "parameters": done.parameters,
+        "parameters_of_log": done.stated,
+    }
     _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
 
 
@@ -126,15 +133,17 @@ def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
     """
     if out is not None and out.suffix.lower() == ".mcap":
         if len(logs) > 1:
-            raise BadInput(f"--out {out}: {len(logs)} logs have an estimates log each; give a folder")
+            raise BadInput(f"--out {out}: {len(logs)} logs give as many estimates logs; give a folder")
         return [out]
     if out is not None and out.suffix and not out.is_dir():
-        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder; make it if it is one")
+        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder that exists")
     paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
     places = [path.resolve() for path in paths]
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
-            raise BadInput(f"{path}: the estimates of two logs would be one file; replay them in turn")
+            raise BadInput(
+                f"{path}: the estimates of two logs would have this name; replay the logs one by one"
+            )
     return paths
 
 
@@ -162,16 +171,18 @@ def evaluate_logs(
     are judged in their alignment with the truth.
     """
     if errors and out is None:
-        raise BadInput("--errors: goes into a result folder; give it with --out")
+        raise BadInput("--errors: errors are written into a result folder; give one with --out")
     if logs and len(logs) != len(estimates):
         raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
     try:
         opened = [open_log(path, recover=recover) for path in estimates]
     except NotMcap as error:
-        raise BadInput(f"{error}, or with --truth the file that a trajectory is judged by") from error
+        raise BadInput(
+            f"{error}, or give with --truth the file that a trajectory is judged by"
+        ) from error
     for each in opened:
         if not any(topic.startswith("/estimates/") for topic in each.topics):
-            raise BadInput(f"{each.path}: holds no estimates; give a log that fuselog replay wrote")
+            raise BadInput(f"{each.path}: has no estimates; give a log that fuselog replay wrote")
     places = logs or [log_of_estimates(each) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
@@ -183,11 +194,17 @@ def evaluate_logs(
     compared = ComparedLogs([LogSource(each) for each in opened], {})
     if comparison:
         if "time_offset_s" in comparison:
-            raise BadInput("--time-offset: is for trajectory files; a log has one clock for all of it")
+            raise BadInput(
+                "--time-offset: is for trajectory files, since all streams of a log have one clock; "
+                "leave it out"
+            )
         how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
         compared = compare_logs([LogSource(each) for each in opened], sources, how)
         if not compared.compared:
-            raise BadInput(f"{estimates[0]}: no estimated positions with truth, so none to align")
+            raise BadInput(
+                f"{estimates[0]}: has no estimated positions with truth that could be aligned; leave "
+                "out --align"
+            )
     with result_folder(out) if out is not None else nullcontext() as folder:
         with ErrorTables(folder) if folder and errors else nullcontext() as kept:
             judge = judge_logs(
@@ -198,7 +215,10 @@ def evaluate_logs(
                 on_errors=kept.add if kept else None,
             )
         if not judge.tells:
-            raise BadInput(f"{estimates[0]}: nothing to judge: no estimates with truth, no innovations")
+            raise BadInput(
+                f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
+                "give its log with --log"
+            )
         if folder is not None:
             settings = {
                 "title": f"estimates of {sources[0].name}",
@@ -238,7 +258,10 @@ def evaluate_trajectory(
     if len(estimates) > 1:
         raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
     if logs or metrics or errors or recover:
-        raise BadInput("--log, --metric, --errors and --recover: are for logs; --truth is for files")
+        raise BadInput(
+            "--log, --metric, --errors and --recover: are for logs, --truth is for trajectory files; "
+            "leave out one of both"
+        )
     done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
     written = [] if out is None else [done.save(out).folder]
     for sentence in done.notes:
@@ -288,7 +311,7 @@ def _print_outcome(
         }
         print_json(outcome | dict(told or {}))
         return
-    print_metrics(values, judge.bounds)
+    print_metrics(values, judge.bounds, judge.runs_table)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
             "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
@@ -329,7 +352,8 @@ def view_path(
             _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
         elif any(given is not None for given in (start_s, end_s, focus, save, connect)):
             raise BadInput(
-                f"{rrd}: is drawn already; give --start, --end, --focus, --save and --connect with a log"
+                f"{rrd}: is a finished timeline; --start, --end, --focus, --save and --connect need a "
+                "log"
             )
         if screenshot is not None:
             for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
@@ -403,9 +427,11 @@ def run_named(
         return
     if tells_parameters:
         print_parameters(result.settings["parameters"])
-    print_metrics(result.metrics, result.bounds)
+        say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
+    runs = folder / RUNS
+    print_metrics(result.metrics, result.bounds, pd.read_parquet(runs) if runs.is_file() else None)
     print_claims(result.claims)
-    say(f"{folder}: logs, estimates, tables, figures, result.json")
+    say(f"{folder}: {', '.join(result.contents)}")
 
 
 def _stated_experiment(

@@ -38,7 +38,7 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
     Raises BadInput where there are no samples, or nothing is asked for.
     """
     if not len(inertial):
-        raise BadInput(f"topic {inertial.topic}: has no samples to tell anything of")
+        raise BadInput(f"topic {inertial.topic}: has no samples; give a log with an inertial unit")
     time_ns = inertial.publish_time_ns
     force, rate = inertial["specific_force_mps2"], inertial["turn_rate_radps"]
     shaken, turned = unrest(time_ns, force, rate, parameters.window_s)
@@ -61,5 +61,5 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
             )
             found.append(stream)
     if not found:
-        raise BadInput("nothing to tell: standing_hz and rolling_hz are zero; give one of them")
+        raise BadInput("standing_hz and rolling_hz are both zero; give one of them above zero")
     return found

@@ -95,7 +95,9 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
         return
     given = list(streams)
     if not all(isinstance(each, Stream) for each in given):
-        raise BadInput(f"{path}: give streams to write, as make_stream makes them, or a recording")
+        raise BadInput(
+            f"{path}: there is nothing to write; give streams, as make_stream makes them, or a recording"
+        )
     write_log(path, given)
 
 

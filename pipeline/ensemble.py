@@ -96,6 +96,7 @@ class Pass:
     Attributes:
         judge: of all runs.
         parameters: of every estimator, defaults included, by label.
+        stated: those that are not given, as the first log's channels state them; see `stated_of`.
         seconds: that each estimator took, by label.
         refused: by estimator, why none of the runs can be replayed.
         input_sha256: a hash of the data that went in, where it was asked for.
@@ -106,6 +107,7 @@ class Pass:
     seconds: dict[str, float] = field(default_factory=dict)
     refused: dict[str, BadInput] = field(default_factory=dict)
     input_sha256: str = ""
+    stated: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def merge(self, other: "Pass") -> None:
         """Take in what a pass over later runs left."""
@@ -209,6 +211,7 @@ def replay_parts(
                 yield
         judge.close()
         done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
+        done.stated = stated_of(bound, part.sources[0])
         if passes:
             passes[0].merge(done)
         else:
@@ -252,6 +255,28 @@ def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
         each.name.partition("/")[0]: each.parameters.model_dump(mode="json", exclude_none=True)
         for each in bound
         if each.parameters is not None
+    }
+
+
+def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str]]:
+    """By label, the parameters that are None and that channels of a log state: "VALUE (TOPIC)".
+
+    Of several topics that state the same value the first is named.
+    """
+    found: dict[str, dict[str, dict[str, str]]] = {}
+    for each in bound:
+        own = found.setdefault(each.name.partition("/")[0], {})
+        values = each.parameters.model_dump() if each.parameters is not None else {}
+        for topic in (*each.streams, *each.whole):
+            metadata = source.topics[topic].metadata if topic in source.topics else {}
+            for name in (name for name, value in values.items() if value is None and name in metadata):
+                own.setdefault(name, {}).setdefault(metadata[name], topic)
+    return {
+        label: {
+            name: ", ".join(f"{value} ({topic})" for value, topic in stating.items())
+            for name, stating in own.items()
+        }
+        for label, own in found.items()
     }
 
 
@@ -312,7 +337,7 @@ def judge_logs(
     for source, topics in zip(estimates, held, strict=True):
         if topics != held[0]:
             raise BadInput(
-                f"{source.name}: other estimates than in {estimates[0].name}; judge it on its own"
+                f"{source.name}: has other estimates than {estimates[0].name}; judge it on its own"
             )
     whole: Judge | None = None
     for now in parts_of(len(sources)):

@@ -13,10 +13,14 @@ def log_of_estimates(estimates: Log) -> Path:
     """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
     named = estimates.run.notes.get("log") if estimates.run else None
     if named is None:
-        raise BadInput(f"{estimates.path}: does not say which log it is of; give it with --log")
+        raise BadInput(
+            f"{estimates.path}: does not state the log that it was made from; give that with --log"
+        )
     path = (estimates.path.parent / named).resolve()
     if not path.exists():
-        raise BadInput(f"{estimates.path}: its log {path} is not there; give it with --log")
+        raise BadInput(
+            f"{estimates.path}: the log {path} that it was made from is missing; give it with --log"
+        )
     return path
 
 

@@ -60,7 +60,8 @@ def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
     """
     if scheduler is not None and workers is not None:
         raise BadInput(
-            f"--workers {workers} --scheduler {scheduler}: the scheduler has its own; give one"
+            f"--workers {workers} --scheduler {scheduler}: a scheduler has its own workers; give one "
+            "of the two options"
         )
     if scheduler is not None:
         return dask(scheduler)
@@ -163,7 +164,8 @@ def dask(scheduler: str) -> Crew:
                 client = stack.enter_context(Client(address, timeout=10))
             except (OSError, ValueError) as error:
                 raise BadInput(
-                    f"--scheduler {scheduler}: none answers there ({error}); start one, or give another"
+                    f"--scheduler {scheduler}: no scheduler answers there ({error}); start one, or "
+                    "give another address"
                 ) from None
             _check_code(scheduler, client)
             workers = sum(client.nthreads().values())
@@ -203,7 +205,8 @@ def _check_code(scheduler: str, client: Any) -> None:
     for worker, found in there.items():
         if found != version_of_code():
             raise BadInput(
-                f"--scheduler {scheduler}: worker {worker} has other code than this; install the same"
+                f"--scheduler {scheduler}: worker {worker} has another version of the code; install "
+                "the same there"
             )
 
 

@@ -76,9 +76,12 @@ class Experiment(Parameters):
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
         if sum(each is not None for each in (self.import_, self.record, self.logs)) > 1:
-            raise ValueError("give one of [record], [import] and [logs]")
+            raise ValueError("give exactly one of [record], [import] and [logs]")
         if (self.import_ or self.logs) and (self.runs, self.seed) != (1, 0):
-            raise ValueError("recorded data have no seed, and as many runs as there are; leave out both")
+            raise ValueError(
+                "data that are imported or given as logs have no seed, and as many runs as there are; "
+                "leave out seed and runs"
+            )
         return self
 
     @model_validator(mode="after")
@@ -86,7 +89,10 @@ class Experiment(Parameters):
         if self.late is not None:
             parse_late(self.late, arrival_order=bool(self.arrival_order))
         if self.arrival_order and self.study != "localization":
-            raise ValueError(f"study {self.study} goes by the stamps; leave out arrival_order and late")
+            raise ValueError(
+                f"study {self.study} replays in the order of the stamps; leave out arrival_order and "
+                "late"
+            )
         return self
 
     @property
@@ -203,7 +209,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
     Raises BadInput where no estimator is named.
     """
     if not labels:
-        raise BadInput(f"{logs[0]}: say what to replay it with, such as -e ekf")
+        raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
     values = {
         "title": title,
@@ -222,7 +228,9 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
         found = [place] if place.is_file() else sorted(root.glob(str(place.relative_to(root))))
         logs = [str(each) for each in found if len(found) == 1 or not each.match("*.estimates.mcap")]
         if not logs:
-            raise BadInput(f"{where}: no log is called {place}; give files, or patterns such as *.mcap")
+            raise BadInput(
+                f"{where}: no log has the name {place}; give files, or patterns such as *.mcap"
+            )
         files |= dict.fromkeys(logs)
     return list(files)
 
@@ -281,7 +289,9 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
     values = read_toml(path)
     recorder, parameters = values.get("recorder"), values.get("parameters", {})
     if not isinstance(recorder, str) or not isinstance(parameters, dict):
-        raise BadInput(f'{path}: a scenario file has recorder = "NAME" and a [parameters] table')
+        raise BadInput(
+            f'{path}: a scenario file needs recorder = "NAME" and a [parameters] table; add them'
+        )
     return recorder, parameters, path.stem
 
 

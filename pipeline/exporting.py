@@ -102,7 +102,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             empty = read_empty(log, topic)
             if to in TRAJECTORIES and not _is_state(log, topic):
                 raise BadInput(
-                    f"{log.path}: topic {topic}: is no estimate and no truth; export it as csv"
+                    f"{log.path}: topic {topic}: is neither an estimate nor a truth; export it as csv"
                 )
             if to in TRAJECTORIES and trajectory_of(empty) is None:
                 raise BadInput(f"{log.path}: topic {topic}: states no position; export it as csv")
@@ -115,7 +115,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
         chosen.append(topic)
     if not chosen:
         what = "estimates or truth with a position" if to in TRAJECTORIES else "streams of columns"
-        raise BadInput(f"{log.path}: holds no {what} to export to {to}")
+        raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
     return chosen
 
 
@@ -130,7 +130,7 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
             for topic, stream in block.items():
                 written[topic] += writer.write_companions(companions(stream))
         if not any(written.values()):
-            raise BadInput(f"{log.path}: holds nothing that Foxglove can show; export it as csv")
+            raise BadInput(f"{log.path}: has nothing that Foxglove can show; export it as csv")
     without = [topic for topic, messages in written.items() if messages == 0]
     if without:
         notes.append(f"Foxglove has no message for, left out: {', '.join(without)}")
@@ -167,7 +167,7 @@ def _file_name(topic: str, to: To) -> str:
 
 
 def _refuse(place: Path) -> None:
-    raise BadInput(f"{place}: exists, and export replaces nothing; give another --out")
+    raise BadInput(f"{place}: exists, and fuselog export replaces no file; give another --out")
 
 
 def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
@@ -225,7 +225,8 @@ def _table_file(path: Path, to: To) -> Iterator[Write]:
             writer, columns = begun[0]
             if len(table) and table.column_names != columns:
                 raise BadInput(
-                    f"topic {stream.topic}: has vectors of several lengths; no table holds it"
+                    f"topic {stream.topic}: has vectors of several lengths, which no table can have; "
+                    "leave the topic out with --topic"
                 )
             if len(table):
                 writer.write_table(table)

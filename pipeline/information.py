@@ -149,7 +149,7 @@ def show_cache(*, clear: bool, as_json: bool) -> None:
         rows = [[name, size["files"], size["bytes"] / 1e6] for name, size in found.items()]
         print_table(["", "files", "MB"], rows)
     if others:
-        say(f"{others} other files stay: fuselog did not write them as they are")
+        say(f"{others} other files are left: fuselog did not write them, or they were changed since")
 
 
 def _as_json(log: Log) -> dict[str, Any]:

@@ -49,14 +49,19 @@ class Kept:
             self._lock.acquire()
         except Timeout:
             raise BadInput(
-                f"{self.folder}: another fuselog is at work on this; wait, or give another --out"
+                f"{self.folder}: another fuselog command is working on it; wait for it, or give "
+                "another --out"
             ) from None
         except OSError as error:
             raise BadInput(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         foreign = [each.name for each in self.folder.iterdir() if not _is_ours(each)]
         if foreign or not is_private(self.folder):
             self._lock.release()
-            what = f"holds {foreign[0]}, which is not fuselog's" if foreign else "others may write to it"
+            what = (
+                f"holds {foreign[0]}, which fuselog did not write"
+                if foreign
+                else "others may write to it"
+            )
             raise BadInput(f"{self.folder}: {what}; move it away, or give another --out")
         for path in self.folder.iterdir():
             if _LEFTOVER.fullmatch(path.name):
@@ -112,7 +117,9 @@ class Kept:
         if done and not is_done:
             self._lock.release()
             _LOG.warning(
-                "%s: keeps %d finished cells; the same command goes on from there", self.folder, done
+                "%s: keeps %d finished cells; the same command continues with the others",
+                self.folder,
+                done,
             )
             return
         for path in self.folder.iterdir():

@@ -39,11 +39,13 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
     for topic in wanted:
         if topic not in fitting:
             raise BadInput(
-                f"{log.path}: topic {topic}: holds neither tracks nor a truth in the plane; export it "
+                f"{log.path}: topic {topic}: has neither tracks nor a truth in the plane; export it "
                 "as csv"
             )
     if not wanted:
-        raise BadInput(f"{log.path}: holds no tracks and no truths in the plane to export to mot")
+        raise BadInput(
+            f"{log.path}: has no tracks and no truths in the plane to export to mot; export it as csv"
+        )
     source = LogSource(log)
     truths = [topic for topic in wanted if _is_truth(log.topics[topic])]
     files = {}
@@ -52,7 +54,7 @@ def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], lis
             sizes = f"{topic.rpartition('/')[0]}/set"
             if sizes not in log.topics:
                 raise BadInput(
-                    f"{log.path}: topic {topic}: there is no {sizes} that says how many tracks there "
+                    f"{log.path}: topic {topic}: there is no {sizes} that states how many tracks there "
                     "are at a time; export it as csv"
                 )
             streams = source.read([sizes, topic])

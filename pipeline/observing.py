@@ -66,7 +66,9 @@ def observability(
             case = topic.removeprefix(f"/estimates/{NAME}").removesuffix(f"/{NAME}").strip("/")
             rows += _rows(sources, case, ragged)
     if not any(row["measurements"] for row in rows):
-        raise BadInput(f"{sources[0].name}: no sensor of the model measured anything in the span")
+        raise BadInput(
+            f"{sources[0].name}: no sensor of the model measured anything in the span; give another span"
+        )
     return pd.DataFrame(rows)
 
 

@@ -36,15 +36,15 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
     taken = {_identity(path): f"{role} {path}" for role, paths in inputs.items() for path in paths}
     for path, kind in outputs:
         if path.suffix.lower() != kind.suffix:
-            raise BadInput(f"{path}: {kind.what} goes here; give a name that ends in {kind.suffix}")
+            raise BadInput(f"{path}: this is to be {kind.what}; give a name that ends in {kind.suffix}")
         _refuse_link(path)
         if _identity(path) in taken:
             raise BadInput(f"{path}: would replace the {taken[_identity(path)]}; give another name")
         if _is_of_result(path):
-            raise BadInput(f"{path}: belongs to the result that it is in; give another name")
+            raise BadInput(f"{path}: is part of the result in that folder; give another name")
         if path.exists() and not (path.is_file() and kind.is_written(path)):
             raise BadInput(
-                f"{path}: exists and is not {kind.what}; give another name, or remove it yourself"
+                f"{path}: exists and is not {kind.what}; give another name, or remove the file yourself"
             )
         taken[_identity(path)] = f"output {path}"
 
@@ -61,7 +61,7 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
 
 def _refuse_link(path: Path) -> None:
     if path.is_symlink():
-        raise BadInput(f"{path}: is a symbolic link; give the place that it leads to, or another name")
+        raise BadInput(f"{path}: is a symbolic link; give the path that it leads to, or another name")
 
 
 def _is_of_result(path: Path) -> bool:

@@ -14,6 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline import door
@@ -138,12 +139,19 @@ class Replay:
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
         said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.unjudged]
-        return "\n".join([*said, *self.failures, *self.losses, self.metrics.to_string(index=False)])
+        return "\n".join(
+            [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
+        )
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric, in the order of the estimators: estimator, quantity, case, value."""
-        return summary_table(in_order(self.judge.metrics, self.settings))
+        """A row per metric, in the order of the estimators: estimator, quantity, case, value, low, high.
+
+        From `low` to `high` lie 95 % of all values of a consistent estimator; NaN where that is not known.
+        """
+        metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
+        intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
+        return summary_table(metrics).assign(low=intervals[:, 0], high=intervals[:, 1])
 
     @property
     def runs(self) -> pd.DataFrame:
@@ -200,10 +208,10 @@ class Replay:
         """
         charts = error_charts(self.judge)
         if not charts:
-            raise BadInput("nothing to draw: no estimates with truth")
+            raise BadInput("nothing to draw: no estimate has a truth")
         case = next(iter(charts)) if case is None else case
         if case not in charts:
-            raise BadInput(f"nothing called '{case}' was judged; {choices(case, charts)}")
+            raise BadInput(f"nothing with the name '{case}' was judged; {choices(case, charts)}")
         return draw(charts[case])
 
     def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:
@@ -306,13 +314,20 @@ def settings_of(
             raise BadInput(
                 f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
             )
+        if isinstance(each, Mapping) and "kind" in each:
+            raise BadInput(
+                f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
+                '{"mine": {...}}'
+            )
         for label, what in ({each: {}} if isinstance(each, str) else each).items():
             if label in chosen:
                 raise BadInput(f"estimator {label} is given twice; give the second another label")
             chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
             kind = chosen[label].get("kind", "")
             if isinstance(kind, Model):
-                raise BadInput(f'estimator {label} is a model; add a method: modelled(model, "ekf")')
+                raise BadInput(
+                    f'estimator {label} is a model without a method; give modelled(model, "ekf")'
+                )
             if not isinstance(kind, str | Estimator):
                 raise BadInput(
                     f"estimator {label} is {type(kind).__name__}; make an estimator of it with "

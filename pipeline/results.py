@@ -35,6 +35,8 @@ CSV_ROWS = 20_000
 FORMAT = 1
 # Where every single error is, in a result's folder.
 ERRORS = Path("tables", "errors")
+# The table of runs, in a result's folder.
+RUNS = Path("tables", "runs.parquet")
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -75,6 +77,11 @@ class Result(Parameters):
     files: dict[str, str | None] = {}
     bounds: dict[str, Bounds] = {}
 
+    @property
+    def contents(self) -> list[str]:
+        """The folders and files at the top of the result's folder."""
+        return [*dict.fromkeys(Path(name).parts[0] for name in self.files)]
+
 
 def split_metric(key: str) -> tuple[str, str, str]:
     """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`.
@@ -96,9 +103,9 @@ def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> d
 
 
 class Measured(NamedTuple):
-    """A metric's value, and where it lies with 95 % if all is well."""
+    """A metric's value or what is said of it, and where it lies with 95 % if all is well."""
 
-    value: MetricValue = None
+    value: MetricValue | str = None
     bounds: Bounds | None = None
 
     @property
@@ -119,15 +126,49 @@ class MetricTable:
     quantities: dict[str, dict[str, Measured]]
 
 
-def metric_tables(metrics: Mapping[str, MetricValue], bounds: Mapping[str, Bounds]) -> list[MetricTable]:
-    """The metrics by case."""
+def metric_tables(
+    metrics: Mapping[str, MetricValue],
+    bounds: Mapping[str, Bounds],
+    runs: "pd.DataFrame | None" = None,
+) -> list[MetricTable]:
+    """The metrics by case; with a table of runs also the interval of the mean NEES over them."""
+    over_runs = {} if runs is None else _nees_over_runs(runs)
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
     cases: dict[str, dict[str, dict[str, Measured]]] = {}
     for key, value in metrics.items():
         estimator, quantity, case = split_metric(key)
         measured = Measured(value, bounds.get(key))
-        cases.setdefault(case, {}).setdefault(quantity, {})[estimator] = measured
+        quantities = cases.setdefault(case, {})
+        quantities.setdefault(quantity, {})[estimator] = measured
+        if quantity == "nees" and (estimator, case) in over_runs:
+            said = Measured(over_runs[estimator, case])
+            quantities.setdefault("nees_mean_over_runs", {})[estimator] = said
     return [MetricTable(case, estimators, quantities) for case, quantities in sorted(cases.items())]
+
+
+def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
+    """The mean of the runs' NEES with its 95 % interval, by estimator and case.
+
+    Runs are independent, so that the interval is Student's; fewer than `FEWEST_RUNS` have none. A study
+    may have a table of runs without NEES.
+    """
+    from scipy.stats import sem, t
+
+    from replay.judging.differences import FEWEST_RUNS
+
+    if not {"estimator", "case", "nees"} <= {*runs}:
+        return {}
+    said = {}
+    for (estimator, case), rows in runs.groupby(["estimator", "case"]):
+        nees = rows["nees"].dropna()
+        if len(nees) >= FEWEST_RUNS:
+            mean = float(nees.mean())
+            low, high = t.interval(0.95, len(nees) - 1, loc=mean, scale=sem(nees))
+            components = rows.filter(regex="^rmse_").notna().any().sum()
+            said[str(estimator), str(case)] = (
+                f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
+            )
+    return said
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:
@@ -148,11 +189,12 @@ def _require_ours(found: Path, place: Path) -> None:
         result = read_result(found)
     except BadInput:
         raise BadInput(
-            f"{place}: exists and is no fuselog result; give another folder with --out"
+            f"{place}: exists and is not a result of fuselog; give another folder with --out"
         ) from None
     if _sealed(result) != result:
         raise BadInput(
-            f"{place / RESULT_FILE}: was changed, or an older fuselog wrote it; give another --out"
+            f"{place / RESULT_FILE}: was changed since fuselog wrote it, or an older version wrote it; "
+            "give another --out"
         )
     expected = {Path(name): digest for name, digest in result.files.items()}
     parents = {parent for name in expected for parent in name.parents}
@@ -308,11 +350,11 @@ def read_result(folder: Path) -> Result:
     try:
         values = parse_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
-        raise BadInput(f"{folder}: no {RESULT_FILE}; give a folder that fuselog run wrote") from None
+        raise BadInput(f"{folder}: has no {RESULT_FILE}; give a folder that fuselog run wrote") from None
     except (OSError, ValueError) as error:
         raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
     if not isinstance(values, dict):
-        raise BadInput(f"{path}: is no result of fuselog run; run the experiment again")
+        raise BadInput(f"{path}: is not a result of fuselog run; run the experiment again")
     check_format(path, values.get("format", 1), FORMAT)
     return build(Result, values, str(path))
 

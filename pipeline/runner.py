@@ -68,7 +68,8 @@ class Runner:
             return [_in_memory(LogSource(open_log(file))) for file in files]
         if not experiment.record:
             raise BadInput(
-                f"experiment '{experiment.title}': give what to [record], to [import], or [logs]"
+                f"experiment '{experiment.title}': has no data; give one of the tables [record], "
+                "[import] and [logs]"
             )
         recorder, values, _ = load_scenario(experiment.record.scenario)
         return record_ensemble(

@@ -23,7 +23,8 @@ def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[
     for label, table in tables.items():
         if label not in labels or not isinstance(table, dict):
             raise BadInput(
-                f"{path}: has settings of {label}, and a settings file has a table for each estimator "
+                f"{path}: has settings of {label}, which is not replayed; a settings file has a table "
+                "for each estimator "
                 f"that is replayed: {', '.join(labels)}"
             )
     return tables

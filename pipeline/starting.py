@@ -40,8 +40,9 @@ def order_of(
     found = None if late is None else parse_late(late, arrival_order=arrival_order)
     if found is not None and origins:
         raise BadInput(
-            f"--late {late} --start-from {origins[0]}: a span in the order of arrival begins at no one "
-            "stamp, of which a state could be known; leave out one of the two"
+            f"--late {late} --start-from {origins[0]}: a span in the order of arrival does not begin "
+            "at one "
+            "stamp, at which a state could be known; leave out one of the two"
         )
     return "log_time" if arrival_order else "publish_time", found
 
@@ -52,7 +53,7 @@ def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: 
     Raises BadInput where there is nothing in it.
     """
     if start_s is not None and end_s is not None and start_s >= end_s:
-        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end comes after the start")
+        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end must be after the start")
     if start_s is None and end_s is None:
         return source
     zero_ns = source.zero_ns(order)
@@ -63,7 +64,7 @@ def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: 
     if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
         first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
         raise BadInput(
-            f"{source.name}: nothing in this span; the log goes from {first_s:g} to {last_s:g} s"
+            f"{source.name}: has no messages in this span; the log goes from {first_s:g} to {last_s:g} s"
         )
     return replace(source, start_ns=start_ns, end_ns=end_ns)
 
@@ -87,7 +88,7 @@ def origins_of(
     Raises BadInput where the replay begins with the runs, or an estimates log is of another run.
     """
     if origins and sources[0].start_ns is None:
-        raise BadInput(f"--start-from {origins[0]}: give also the time, with --start")
+        raise BadInput(f"--start-from {origins[0]}: needs a time; give --start too")
     if sigmas and tuple(origins) != ("truth",):
         name, sigma = next(iter(sigmas.items()))
         raise BadInput(f"--start-sigma {name}={sigma:g}: is for --start-from truth")
@@ -126,8 +127,9 @@ def start_from(
     label = bound.name.partition("/")[0]
     for topic in bound.priors.keys() - sources[0].topics.keys():
         raise BadInput(
-            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) that another "
-            "state could stand for; leave out --start-from: it begins at the span's first measurements"
+            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) that the "
+            "state could replace; leave out --start-from: it begins at the first measurements of the "
+            "span"
         )
     priors = {
         topic: gather(
@@ -188,7 +190,7 @@ def _true_state(
     mean = truth_at(timed, np.array([start_ns]), list(components.values()), gap_limit_s)
     if not np.isfinite(mean).all():
         raise BadInput(
-            f"{where}: is not known at the start within {gap_limit_s:g} s; give another --start, a "
+            f"{where}: is not known within {gap_limit_s:g} s of the start; give another --start, a "
             "longer --gap-limit or --start-from ESTIMATES"
         )
     covariance = _with_sigmas(prior, components, sigmas)

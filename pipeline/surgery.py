@@ -145,7 +145,9 @@ def merge(
     """
     target = Path(out)
     if len(paths) < 2:
-        raise BadInput(f"nothing to merge with {', '.join(map(str, paths))}; give at least two logs")
+        raise BadInput(
+            f"{', '.join(map(str, paths))}: one log has nothing to be merged with; give at least two"
+        )
     logs = [open_log(path, recover=recover) for path in paths]
     check_files([(target, CHANGED)], {"log": [log.path for log in logs]})
     offsets_ns = _offsets_ns(logs, offsets_s or {})
@@ -248,7 +250,9 @@ def constrain(
     added = constraints_of(LogSource(log).read([chosen_unit])[chosen_unit], parameters)
     for stream in added:
         if stream.topic in log.topics:
-            raise BadInput(f"{log.path}: has a topic {stream.topic}; rename it first: fuselog relabel")
+            raise BadInput(
+                f"{log.path}: has a topic {stream.topic} already; rename it first with fuselog relabel"
+            )
     notes = _losses(log)
     for stream in added:
         told, total = int(stream["value"].sum()), len(stream)
@@ -364,7 +368,7 @@ def _readable(log: Log, topics: Sequence[str], notes: list[str], asked: Sequence
             )
     if not chosen:
         raise BadInput(
-            f"{log.path}: holds no topic that fuselog reads; import it first, those of ROS with: "
+            f"{log.path}: has no topic that fuselog reads; import it first, logs of ROS with: "
             f"fuselog import ros {log.path}"
         )
     return chosen
@@ -431,7 +435,10 @@ def _thinner(topic: str, rate: int | str, zero_ns: int) -> _Thinner:
             return _Thinner(every=int(text))
     except ValueError:
         pass
-    raise BadInput(f"decimate {topic}={text}: expected every how many stamps, as 10, or a rate, as 5Hz")
+    raise BadInput(
+        f"decimate {topic}={text}: expected a whole number, such as 10 for every tenth stamp, or a "
+        "rate, such as 5Hz"
+    )
 
 
 def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int]:

@@ -69,7 +69,7 @@ def parse_over(text: str) -> Over:
 def over_of(key: str, values: Sequence[Any]) -> Over:
     """A list of values; drawn in the logarithm where they are even in that. BadInput for one twice."""
     if len({*map(str, values)}) < len(values) or not values:
-        raise BadInput(f"sweep over {key}: give one value or more, each once")
+        raise BadInput(f"sweep over {key}: give at least one value, and each once")
     numbers = [each for each in values if isinstance(each, int | float) and each > 0]
     steps = np.diff(np.log(numbers)) if len(numbers) == len(values) > 2 else np.zeros(0)
     is_log = len(steps) > 0 and bool(np.allclose(steps, steps[0]))
@@ -107,10 +107,10 @@ def points_of(
     """
     keys = [each.key for each in over]
     if not over or len(set(keys)) < len(keys):
-        raise BadInput("a sweep is over one parameter or more, each once: --over KEY=LOW:HIGH:N")
+        raise BadInput("a sweep needs at least one parameter, and each once; give --over KEY=LOW:HIGH:N")
     count = math.prod(len(each.taken) for each in over) if samples is None else samples
     if count > MOST_POINTS:
-        raise BadInput(f"the sweep has {count} points; {MOST_POINTS} are the most, give fewer values")
+        raise BadInput(f"the sweep has {count} points; the most are {MOST_POINTS}; give fewer values")
     if samples is None:
         return [
             dict(zip(keys, point, strict=True))
@@ -170,7 +170,8 @@ def run_sweep(
     for experiment in experiments:
         if experiment.study != "localization":
             raise BadInput(
-                f"{name}: its study, {experiment.study}, does more than judge; run single points"
+                f"{name}: its study, {experiment.study}, makes more than metrics of single runs; run "
+                "the points one by one"
             )
         for label, values in experiment.estimators.items():
             configure(label, values)

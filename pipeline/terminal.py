@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -19,6 +19,9 @@ from rich.table import Table
 from pipeline.claims import Claim
 from pipeline.results import Bounds, Measured, MetricValue, metric_tables
 from recorders.errors import printable
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def _console(*, stderr: bool) -> Console:
@@ -106,12 +109,17 @@ def format_value(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def print_metrics(metrics: Mapping[str, MetricValue], bounds: Mapping[str, Bounds]) -> None:
+def print_metrics(
+    metrics: Mapping[str, MetricValue],
+    bounds: Mapping[str, Bounds],
+    runs: "pd.DataFrame | None" = None,
+) -> None:
     """Metrics as tables: one per case, a row per quantity, a column per estimator.
 
-    A value that has bounds stands before them: 95 % of all values lie there if all is well.
+    A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
+    of runs there is also the mean NEES over them, see `metric_tables`.
     """
-    for table in metric_tables(metrics, bounds):
+    for table in metric_tables(metrics, bounds, runs):
         rows = []
         for quantity, values in table.quantities.items():
             cells = [values.get(estimator, Measured()) for estimator in table.estimators]
@@ -142,11 +150,18 @@ def print_pose_errors(metrics: Mapping[str, float]) -> None:
     say(", ".join(counts))
 
 
-def print_parameters(parameters: Mapping[str, Mapping[str, object]]) -> None:
-    """The parameters of estimators by label: a row each, a column per estimator."""
+def print_parameters(
+    parameters: Mapping[str, Mapping[str, object]], stated: Mapping[str, Mapping[str, str]] | None = None
+) -> None:
+    """The parameters of estimators by label: a row each, a column per estimator.
+
+    Those that a log's channels state come last, with the topic of the channel.
+    """
     names = dict.fromkeys(name for values in parameters.values() for name in values)
     rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
     print_table(["parameter", *parameters], rows)
+    if stated and any(stated.values()):
+        print_parameters({f"{label}, from the log": values for label, values in stated.items()})
 
 
 def print_claims(claims: Sequence[Claim]) -> None:

@@ -58,7 +58,9 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
     Raises BadInput where the folder cannot be written, or another process is writing it.
     """
     if _clear_leftovers(place):
-        raise BadInput(f"{place}: another fuselog is writing it; wait, or give another --out")
+        raise BadInput(
+            f"{place}: another fuselog command is writing it; wait for it, or give another --out"
+        )
     if place.exists():
         check(place)
     with _parent_of(place, make=True), _working_folder(place) as work, _telling(place, work):
@@ -114,7 +116,7 @@ def _clear_leftovers(place: Path) -> bool:
         if "." in work.name.removeprefix(f".{place.name}.").removesuffix(".part"):
             continue  # of another place, whose name goes on
         if not _is_ours(work):
-            _LOG.warning("%s: not made by fuselog, or by another user; it stays as it is", work)
+            _LOG.warning("%s: was not written by this user's fuselog; it is left as it is", work)
             continue
         with suppress(OSError):
             work.rmdir()  # its maker was killed before anything was in it
@@ -153,7 +155,7 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
         try:
             old.rename(place)
         except OSError:
-            _LOG.warning("%s: was %s before a command was killed; move it yourself", old, place)
+            _LOG.warning("%s: was %s when a command was killed; move it back by hand", old, place)
             lock.release()
             return
     for member in work.iterdir():

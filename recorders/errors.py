@@ -29,7 +29,8 @@ def check_format(path: object, stated: object, read: int) -> None:
     if isinstance(stated, int) and stated != read:
         age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
         raise BadInput(
-            f"{path}: {age} fuselog wrote it (format {stated}, this one reads {read}); {mend}"
+            f"{path}: {age} version of fuselog wrote it (format {stated}, this version reads {read}); "
+            f"{mend}"
         )
 
 

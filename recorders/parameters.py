@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from inspect import cleandoc
 from textwrap import shorten
 from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -95,6 +96,31 @@ def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> 
     return list(_described(schema, schema.get("$defs", {}), "", values or {}))
 
 
+def explain(kind: type[BaseModel]) -> dict[str, str]:
+    """What a type and those of its nested tables say of their parameters, by where these are.
+
+    A place is the full name of a table and a dot, such as `range_bearing.`, empty for the type's own
+    parameters; several tables of one type stand together. What a type inherits comes first.
+    """
+    places: dict[str, list[str]] = {}
+    for place, table in _tables(kind, ""):
+        told = [
+            cleandoc(each.__doc__)
+            for each in reversed(table.__mro__)
+            if issubclass(each, BaseModel) and each not in (BaseModel, Parameters) and each.__doc__
+        ]
+        if told:
+            places.setdefault("\n\n".join(dict.fromkeys(told)), []).append(place)
+    return {", ".join(names): text for text, names in places.items()}
+
+
+def _tables(kind: type[BaseModel], prefix: str) -> Iterator[tuple[str, type[BaseModel]]]:
+    yield prefix, kind
+    for name, entry in kind.model_fields.items():
+        if table := _table_in(entry.annotation):
+            yield from _tables(table, f"{prefix}{entry.alias or name}.")
+
+
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
 ) -> Iterator[Described]:
@@ -147,7 +173,7 @@ def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:
     if not tables:
         raise BadInput(f"no parameter '{name}'; {choices(name.rpartition('.')[2], sorted(known))}")
     if not numbers:
-        raise BadInput(f"parameter '{name}' is no number that can be searched for")
+        raise BadInput(f"parameter '{name}' is not a number, so that it cannot be searched for")
     low = max(each.get("exclusiveMinimum", each.get("minimum", -math.inf)) for each in numbers)
     return low, min(each.get("exclusiveMaximum", each.get("maximum", math.inf)) for each in numbers)
 
@@ -180,7 +206,9 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         if not equals or not all(parts):
             raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
         if len(parts) > DEEPEST:
-            raise BadInput(f"--set {key[:40]}...: names more than {DEEPEST} tables, one in another")
+            raise BadInput(
+                f"--set {key[:40]}...: has more than {DEEPEST} names with dots between; give fewer"
+            )
         try:
             value = parse_toml(f"value = {text}")["value"]
         except TOMLDecodeError:
@@ -191,7 +219,9 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         for part in parts[:-1]:
             target = target.setdefault(part, {})
             if not isinstance(target, dict):
-                raise BadInput(f"--set {setting}: '{part}' was already given a value of its own")
+                raise BadInput(
+                    f"--set {setting}: '{part}' already has a value of its own; leave out one of the two"
+                )
         target[parts[-1]] = value
     return values
 

@@ -44,11 +44,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise BadInput(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
-        raise BadInput(f"{path}: is not readable as TOML ({error})") from None
+        raise BadInput(f"{path}: cannot be read as TOML ({error})") from None
 
 
 _TOO_DEEP = f"it is nested more than {DEEPEST} levels deep"
-_TOO_LONG = f"it holds a whole number of more than {sys.get_int_max_str_digits()} digits"
+_TOO_LONG = f"it has a whole number of more than {sys.get_int_max_str_digits()} digits"
 # tomllib keeps every beginning of a dotted key: one of 100,000 parts would take all memory.
 _DOTTED_TOO_DEEP = re.compile(rf"(?<![^\s.])(?:[^\s.]++\s*+\.\s*+){{{DEEPEST}}}")
 
@@ -89,5 +89,5 @@ def _whole(digits: str) -> int:
 def _finite(number: str) -> float:
     value = float(number)
     if not math.isfinite(value):
-        raise ValueError(f"it holds {number}, which is no number of JSON")
+        raise ValueError(f"it has {number}, which is not a JSON number")
     return value

@@ -29,7 +29,9 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     stamps_ns = SIMULATION_EPOCH_NS + elapsed_ns
     if not ((stamps_ns >= 0) & (stamps_ns < 2**63)).all():
         longest_s = float(np.max(np.abs(elapsed_s)))
-        raise BadInput(f"the run lasts {longest_s:.3g} s; make it shorter: stamps end in the year 2262")
+        raise BadInput(
+            f"the run lasts {longest_s:.3g} s, and stamps end in the year 2262; make it shorter"
+        )
     return SIMULATION_EPOCH_NS + elapsed_ns.astype(np.int64)
 
 
@@ -46,10 +48,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         if not self.streams:
-            raise BadInput("a recording holds no streams; give it at least one")
+            raise BadInput("a recording has no streams; give it at least one")
         for topic, count in Counter(stream.topic for stream in self.streams).items():
             if count > 1:
-                raise BadInput(f"topic {topic}: recorded as {count} streams; make one stream of them")
+                raise BadInput(f"topic {topic}: is recorded as {count} streams; join them to one")
 
 
 @dataclass
@@ -112,7 +114,7 @@ def record_run(
     if not isinstance(simulator, Simulator):
         raise BadInput(f"'{scenario}' imports real data; use: fuselog import {scenario} PATH")
     if seed < 0 or run < 0:
-        raise BadInput(f"seed {seed}, run {run}: a seed and a run are numbers from zero on")
+        raise BadInput(f"seed {seed}, run {run}: give numbers from zero on")
     parameters = build(simulator.parameters, values, f"scenario {scenario}")
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,)))
     with foreign_code(f"scenario {scenario}"):

@@ -52,7 +52,7 @@ class Trajectory:
             if values is not None and values.shape != shape:
                 raise BadInput(f"{self.name}: {what} has shape {values.shape}; expected {shape}")
         if self.time_ns is not None and np.any(np.diff(self.time_ns) < 0):
-            raise BadInput(f"{self.name}: its stamps go back; give the poses in the order of time")
+            raise BadInput(f"{self.name}: its stamps go back; sort the poses by time")
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -116,17 +116,22 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
         try:
             values[row] = [float(field) for field in fields[: layout.least]]
         except ValueError as error:
-            raise BadInput(f"{path}: line {number} is no pose ({error}); {_wanted(found)}") from None
-    _refuse(~np.isfinite(values).all(axis=1), path, numbers, "holds a value that is not finite; drop it")
+            raise BadInput(f"{path}: line {number} is not a pose ({error}); {_wanted(found)}") from None
+    _refuse(
+        ~np.isfinite(values).all(axis=1),
+        path,
+        numbers,
+        "has a value that is not finite; remove the line",
+    )
     if found == "kitti":
         rotation = values.reshape(-1, 3, 4)[:, :, :3]
         off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
         bad = (off > TOLERANCE) | (np.linalg.det(rotation) < 0)
-        _refuse(bad, path, numbers, "has a matrix that is no rotation; make it orthogonal")
+        _refuse(bad, path, numbers, "has a matrix that is not a rotation; give an orthogonal one")
     else:
         quaternion = values[:, 4:]
         bad = np.abs(np.linalg.norm(quaternion, axis=1) - 1) > TOLERANCE
-        _refuse(bad, path, numbers, "has a quaternion that is not of unit length; scale it")
+        _refuse(bad, path, numbers, "has a quaternion that is not of unit length; scale it to 1")
         rotation = Rotation.from_quat(quaternion, scalar_first=found == "euroc").as_matrix()
     position_m = values[:, layout.position]
     if layout.time_ns is None:
@@ -149,9 +154,9 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror}; give a trajectory file") from None
     except UnicodeDecodeError:
-        raise BadInput(f"{path}: is no text; give a trajectory as TUM, KITTI or EuRoC") from None
+        raise BadInput(f"{path}: is not a text file; give a trajectory as TUM, KITTI or EuRoC") from None
     if not lines:
-        raise BadInput(f"{path}: holds no poses; give a trajectory as TUM, KITTI or EuRoC")
+        raise BadInput(f"{path}: has no poses; give a trajectory as TUM, KITTI or EuRoC")
     return lines
 
 
@@ -168,7 +173,7 @@ def _recognised(path: object, number: int, line: str) -> Format:
         if len(fields) == LAYOUTS[name].least:
             return name
     told = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
-    raise BadInput(f"{path}: line {number} is no pose: it has {len(fields)} columns, where {told}")
+    raise BadInput(f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {told}")
 
 
 def _known(name: str) -> Format:

@@ -18,6 +18,7 @@ from pipeline.checking.golden import (
     write,
 )
 from pipeline.ensemble import Settings
+from pipeline.folders import logs_in
 from pipeline.outputs import Kind, check_files
 from pipeline.results import RESULT_FILE, read_result
 from recorders.errors import BadInput
@@ -77,18 +78,17 @@ def runs_of(path: Path) -> Runs:
 
     Raises BadInput where there are none.
     """
-    files = [path]
     if (path / RESULT_FILE).is_file():
         given = read_result(path).settings.get("logs", {})
         stated = given.get("files", []) if isinstance(given, dict) else given
         files = [Path(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
-    elif path.is_dir():
-        files = [each for each in sorted(path.glob("*.mcap")) if not each.match("*.estimates.mcap")]
+    else:
+        files = logs_in(path)
     if not files:
-        raise BadInput(f"{path}: holds no logs to replay; give a log, or a result that keeps some")
+        raise BadInput(f"{path}: has no logs to replay; give a log, or a result that keeps its logs")
     runs = {file.name: LogSource(open_log(file)) for file in files}
     if len(runs) < len(files):
-        raise BadInput(f"{path}: two of its logs have one name; check them one by one")
+        raise BadInput(f"{path}: two of its logs have the same name; check them one by one")
     return runs
 
 
@@ -112,7 +112,7 @@ def update(
         stated = read_result(path).settings
     chosen = estimators or stated.get("estimators", {})
     if not chosen:
-        raise BadInput(f"{path}: say what its golden is of, such as -e ekf")
+        raise BadInput(f"{path}: name the estimators that the golden is to have, such as -e ekf")
     kept = None if before is None else before["tolerances"]
     golden = make(
         runs_of(path),

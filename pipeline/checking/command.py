@@ -43,7 +43,10 @@ def check_path(
         say(f"{golden}: {len(made['runs'])} runs, {streams} streams, {size_kb:.0f} kB")
         return True
     if labels or settings or settings_file or late or arrival_order or columns or tolerances:
-        raise BadInput(f"{golden}: says what is replayed and allowed; give other settings with --update")
+        raise BadInput(
+            f"{golden}: already states what is replayed and which differences are allowed; to change "
+            "that, add --update"
+        )
     if junit is not None:
         check_files([(junit, JUNIT)], {"golden": [golden]})
     done = check(runs_of(path), read(golden))

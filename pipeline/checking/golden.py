@@ -262,11 +262,13 @@ def read(path: Path) -> Golden:
     try:
         golden = json.loads(lzma.decompress(path.read_bytes()))
     except FileNotFoundError:
-        raise BadInput(f"{path}: there is no such golden; --update writes it") from None
+        raise BadInput(f"{path}: no such golden; --update writes it") from None
     except (OSError, lzma.LZMAError, ValueError) as error:
-        raise BadInput(f"{path}: is no golden, or damaged ({error}); --update writes another") from None
+        raise BadInput(
+            f"{path}: is not a golden, or is damaged ({error}); --update writes a new one"
+        ) from None
     if not isinstance(golden, dict) or "format" not in golden:
-        raise BadInput(f"{path}: is no golden of fuselog check; --update writes one")
+        raise BadInput(f"{path}: is not a golden of fuselog check; --update writes one")
     check_format(path, golden["format"], FORMAT)
     return golden
 
@@ -281,12 +283,15 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
     for name, stored, new in _pairs(golden["runs"], found["runs"]):
         if stored is None or new is None:
             there = ", ".join(golden["runs"])
-            raise BadInput(f"{name}: the golden is of {there}; check the same runs, or --update")
+            raise BadInput(
+                f"{name}: the golden is of {there}; check the same runs, or write a new one with "
+                "--update"
+            )
         is_same_input = stored["input"] == new["input"]
         if not is_same_input and (is_same_cpu or not stored["recorded"]):
             raise BadInput(
-                f"{name}: what is recorded or imported has changed, so that estimates cannot be "
-                "compared; check the golden's own input, or --update"
+                f"{name}: the recorded or imported data have changed, so that estimates cannot be "
+                "compared; check the golden's own data, or write a new one with --update"
             )
     known = {key: Tolerance(**each) for key, each in golden["tolerances"].items()}
 

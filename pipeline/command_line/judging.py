@@ -153,7 +153,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     "Say why an estimator is inconsistent.",
     "fuselog diagnose run.mcap -e ekf",
 )
-@click.argument("log", type=ANY_PATH)
+@click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
 @click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
 @click.option("--save", type=FILE, help="A timeline (.rrd) to write, with the sentences as events.")
@@ -163,7 +163,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @json_option
 @settings_option
 @set_option
-def diagnose(log: Path, **options: Any) -> None:
+def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
 
     LOG is a log, or an estimates log beside the log that it is of. At most five sentences, the likeliest
@@ -171,7 +171,7 @@ def diagnose(log: Path, **options: Any) -> None:
     """
     from pipeline.diagnosing.command import diagnose_log
 
-    diagnose_log(log, **options)
+    diagnose_log(logs, **options)
 
 
 @command(

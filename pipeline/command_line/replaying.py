@@ -91,6 +91,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @command(
     "Search the parameters of an estimator that explain logs best.",
     "fuselog tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad",
+    "fuselog tune train -e ekf --free sigma_range_m --validate test",
 )
 @click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "label", required=True, help="The estimator.")
@@ -120,7 +121,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     "held_out",
     multiple=True,
     type=ANY_PATH,
-    help="A log that is held out, to judge the values by (repeatable).",
+    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
 )
 @click.option(
     "--folds",
@@ -142,6 +143,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
     """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
 
+    LOGS are logs or folders of logs, and --validate takes either, one at a time: --validate test.
     The search starts from --set NAME=VALUE, else from what the log's channels state. It needs no truth,
     but for --by nees and rmse. Ctrl-C ends it with the best values so far. settings.toml in the result
     folder is for --settings of fuselog replay and run.

@@ -159,7 +159,7 @@ class Differences:
 
         sides = self.groups[0]
         if not self.drawable:
-            raise BadInput(f"{save}: there are no estimates of one run to draw side by side")
+            raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
         source = sides[0].pairs[first][0]
         of_sides = (side.estimates(first).streams.items() for side in sides)
@@ -261,7 +261,7 @@ def compare(
     [1]
     """
     if not 0 <= margin < np.inf:
-        raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which is 2 %")
+        raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which means 2 %")
     paths = [Path(side) for side in sides]
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
@@ -299,7 +299,7 @@ def _given(
     kinds = [_kind_of(path, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):
-        raise BadInput(f"{logs[0]}: is a log without estimates; fuselog replay makes them")
+        raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
     if logs:
         if not estimators:
             raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")
@@ -344,7 +344,7 @@ def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
     sources = {run: source for each in others for run, source in each.sources.items()}
     if len(sources) != 1:
         raise BadInput(
-            "a trajectory file is of one run: compare it with the estimates log of that run, or give "
+            "a trajectory file has one run: compare it with the estimates log of that run, or give "
             "the true trajectory with --truth"
         )
     return next(iter(sources.values()))
@@ -360,7 +360,9 @@ def _truth_topic(source: Source, case: str | None) -> str:
         return next(iter(truths.values()))
     if case not in truths:
         known = ", ".join(truths) or "none"
-        raise BadInput(f"{source.name}: say which truth trajectories are of with --case: {known}")
+        raise BadInput(
+            f"{source.name}: name with --case the truth that trajectories are judged by: {known}"
+        )
     return truths[case]
 
 
@@ -373,7 +375,7 @@ def _groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Sid
     if len(givens) == 1:
         chosen = list(labels) or list(givens[0].labels)
         if len(chosen) < 2:
-            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give something to compare with")
+            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give another side to compare with")
         yield [givens[0].side(label, label) for label in chosen]
         return
     names = _distinct([each.name for each in givens])
@@ -383,7 +385,7 @@ def _groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Sid
         return
     if not common:
         told = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
-        raise BadInput(f"no estimator is in all of them: {told}; name one with -e")
+        raise BadInput(f"the sides have no estimator in common: {told}; name those to compare with -e")
     for label in common:
         suffix = f":{label}" if len(common) > 1 else ""
         yield [

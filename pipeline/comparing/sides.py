@@ -184,7 +184,7 @@ def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
     runs = list(map(key_of, done.logs))
     for run in runs:
         if runs.count(run) > 1:
-            raise BadInput(f"{run}: two of the logs are of this run; give each run once")
+            raise BadInput(f"{run}: two of the logs have this run; give each run once")
     pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))
     stated = done.done.parameters
 
@@ -202,12 +202,17 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if not files:
-        raise BadInput(f"{path}: holds no estimates logs (*.mcap) and is no result of fuselog run")
+        raise BadInput(
+            f"{path}: has no estimates logs (*.mcap), and is not a result of fuselog run; give one of "
+            "these"
+        )
     pairs: dict[str, tuple[Source, Source]] = {}
     for file in files:
         log = open_log(file, recover=recover)
         if not labels_of(LogSource(log)):
-            raise BadInput(f"{file}: holds no estimates; say what to replay it with: -e ekf -e ukf")
+            raise BadInput(
+                f"{file}: has no estimates; name the estimators to replay it with, such as -e ekf -e ukf"
+            )
         source = LogSource(open_log(log_of_estimates(log), recover=recover))
         check_same_run(LogSource(log), source)
         run = key_of(source)

@@ -17,7 +17,7 @@ from replay.engine.sources import LogSource
 
 
 def diagnose_log(
-    log: Path,
+    logs: Sequence[Path],
     *,
     label: str | None,
     out: Path | None,
@@ -30,6 +30,12 @@ def diagnose_log(
     settings: Sequence[str],
 ) -> None:
     """Diagnose, write what is asked for, and print sentences, components and metrics."""
+    log, *others = logs
+    if others:
+        raise BadInput(
+            f"{len(logs)} logs: one log is diagnosed at a time; give each by itself, and all of them to "
+            "fuselog tune"
+        )
     if out is not None:
         check_folder(out, {"log": [log]})
     if save is not None:

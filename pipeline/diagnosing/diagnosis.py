@@ -231,26 +231,32 @@ def diagnose(
         set: parameters of the estimator.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
-    Raises BadInput where the estimator does not fit the log, fails, or gives no innovations.
+    Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
+    no innovations.
 
     >>> from pipeline.door import record
     >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')
     """
-    [source] = sources_of(log)
-    source, chosen = _asked(source, estimator)
+    sources = sources_of(log)
+    if len(sources) > 1:
+        raise BadInput(
+            f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
+            "The table `runs` of a replay shows which run is worst, and tune takes several logs"
+        )
+    source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, set or {})
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
-        raise BadInput(f"{done.failures[0]}; mend that first")
+        raise BadInput(f"{done.failures[0]}; solve that first")
     innovations, estimates = (
         _outputs(done, schema) for schema in (schemas.INNOVATION, schemas.GAUSSIAN_ESTIMATE)
     )
     if not innovations:
         raise BadInput(
-            f"{source.name}: {label} gives no innovations, by which it could be diagnosed; give a "
+            f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
             "filter of the same model, such as -e ekf"
         )
     bound = bind(label, [source], {"kind": label, **settings})
@@ -270,7 +276,8 @@ def diagnose(
         tried, least = len(alternatives), least_gain(len(alternatives))
     else:
         notes.append(
-            f"{label} states no likelihood of its innovations: faults are named by what is unusual alone"
+            f"{label} states no likelihood of its innovations: faults are named by unusual "
+            "measurements alone"
         )
     sentences = [_sentence(each) for each in causes]
     has_outliers = any(each.kind == "outliers" for each in sentences)
@@ -307,7 +314,7 @@ def _asked(
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
         return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
     if estimator is None:
-        raise BadInput(f"{source.name}: holds no estimates; name the estimator to diagnose with -e")
+        raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
@@ -335,7 +342,7 @@ def _first_part(
         for topic in streamed:
             streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
         notes.append(
-            f"causes were looked for in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
+            f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
             f"{MOST_MESSAGES} of {len(stamps_ns)} messages; all else is of the whole log. For another "
             "part: fuselog cut"
         )

@@ -90,7 +90,7 @@ def of_innovations(
                 topic,
                 f"{case}: the gate keeps out all {end - begin} measurements from "
                 f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}: the filter "
-                "has lost its way, and what would bring it back is kept out; --set gate_probability=1, "
+                "has drifted away, and what would correct it is kept out; --set gate_probability=1, "
                 "or gate_reopens_s=1",
                 int(times_ns[begin]),
             )

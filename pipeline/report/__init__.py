@@ -114,19 +114,21 @@ def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
 def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Section:
     for each in result.files:
         if each.startswith(("figures/", "tables/")) and not (folder / each).is_file():
-            raise BadInput(f"{folder}: {each} is missing; run it again")
+            raise BadInput(f"{folder}: {each} is missing; run the experiment again")
     try:
         tables = {path.stem: _read_table(path) for path in sorted(folder.glob("tables/*.parquet"))}
         figures = sorted(map(_figure, sorted(folder.glob("figures/*.svg"))), key=_rank)
     except (OSError, ValueError) as error:
-        raise BadInput(f"{folder}: a table or figure is damaged ({error}); run it again") from error
+        raise BadInput(
+            f"{folder}: a table or figure is damaged ({error}); run the experiment again"
+        ) from error
     short = {
         name: table
         for name, table in tables.items()
         if len(table) <= LONGEST_TABLE and name != "summary"
     }
     lead = [*_first_run(folder, viewer=viewer), *figures[:1]]
-    metrics = metric_tables(result.metrics, result.bounds)
+    metrics = metric_tables(result.metrics, result.bounds, tables.get("runs"))
     return Section(name, result, verdict(result), lead, metrics, short, figures[1:])
 
 
@@ -149,7 +151,7 @@ def _figure(path: Path) -> Shown:
     if described.is_file():
         values = parse_json(described.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
-            raise ValueError(f"{described.name} is no chart")
+            raise ValueError(f"{described.name} is not a chart")
         return _chart(name, build(Chart, values, str(described)))
     return Shown(name, name, f"Figure: {name}", picture=_address("svg+xml", path.read_bytes()))
 

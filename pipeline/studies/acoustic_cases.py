@@ -54,9 +54,9 @@ class AcousticOptions(Parameters):
     @model_validator(mode="after")
     def _has_what_claims_need(self) -> Self:
         if 1.0 not in self.multipliers:
-            raise ValueError("multipliers must have 1, the paper's noise, among them")
+            raise ValueError("multipliers must contain 1, the paper's noise")
         if not {BEARINGS, LOCAL, NATIVE} <= set(self.modes):
-            raise ValueError(f"modes must have {BEARINGS}, {LOCAL} and {NATIVE} among them")
+            raise ValueError(f"modes must contain {BEARINGS}, {LOCAL} and {NATIVE}")
         return self
 
 

@@ -118,7 +118,9 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
                 )
             )
     if not tables:
-        raise BadInput("the log has no topic of differences (fuselog.ArrivalDifference)")
+        raise BadInput(
+            "the log has no arrival differences (fuselog.ArrivalDifference); give recordings of sounds"
+        )
     return pd.concat(tables, ignore_index=True)
 
 

@@ -37,7 +37,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     replayed = Runner(experiment, setting).run()
     vessels = vessel_table(replayed)
     if options.estimator not in set(vessels["estimator"]):
-        raise BadInput(f"no tracks of '{options.estimator}' with identities to judge them by")
+        raise BadInput(
+            f"no tracks of '{options.estimator}', or no identities to judge them by; give a log with "
+            "both"
+        )
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update(replayed.metrics(experiment.metrics))
     outcome.tables["summary"] = summary_table(outcome.metrics)
@@ -58,7 +61,9 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
         for table in track_tables(reports_of(each))
     ]
     if not tables:
-        raise BadInput("no tracks to judge: the log has no identities, or no estimator gives tracks")
+        raise BadInput(
+            "no tracks to judge: the log has no identities, or no estimator gives tracks; give both"
+        )
     return pd.concat(tables).rename(columns={"target": "mmsi"})
 
 

@@ -49,7 +49,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: BinghamOptions = setting.options
     missing = {options.estimator, options.additive, options.rotated} - set(experiment.estimators)
     if missing:
-        raise BadInput(f"experiment '{experiment.title}': estimator {min(missing)} is missing")
+        raise BadInput(f"experiment '{experiment.title}': estimator {min(missing)} is missing; add it")
     require_spread(experiment.runs)
     stated = _stated(experiment)
     sources: list[MemorySource] = []
@@ -74,11 +74,13 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 def _stated(experiment: Experiment) -> AxisParameters:
     """The scenario's parameters; BadInput where it is none of axes or orientations."""
     if not experiment.record:
-        raise BadInput(f"experiment '{experiment.title}': give the scenario to [record]")
+        raise BadInput(f"experiment '{experiment.title}': names no scenario; give it in [record]")
     name, values, label = load_scenario(experiment.record.scenario)
     kind = load("recorders", name, Recorder).parameters
     if not issubclass(kind, AxisParameters):
-        raise BadInput(f"study bingham: scenario {label} is none of axes or orientations")
+        raise BadInput(
+            f"study bingham: scenario {label} has neither axes nor orientations; give one that has"
+        )
     return build(kind, merge(values, experiment.record.parameters), f"scenario {label}")
 
 

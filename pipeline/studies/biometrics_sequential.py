@@ -242,7 +242,8 @@ def watched(
         steady = [np.sort(reference.ratio[reference.is_genuine == kind]) for kind in (False, True)]
         if min(map(len, steady)) == 0 or len(seen.ratio) < options.watched_probes:
             raise BadInput(
-                f"study biometrics-sequential: the other matchers are sure of {len(seen.ratio)} probes "
+                f"study biometrics-sequential: the other matchers are certain of {len(seen.ratio)} "
+                "probes "
                 f"of {size} to watch {matcher} by; lower options.label_ratio, or give other matchers"
             )
         for fault in ("none", *FAULTS):

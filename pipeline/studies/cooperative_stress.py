@@ -88,7 +88,7 @@ def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int
     for name in ("leaving", "liar"):
         if getattr(options, name) not in numbers:
             raise BadInput(
-                f"options.{name} = {getattr(options, name)} is none of the robots "
+                f"options.{name} = {getattr(options, name)} is not one of the robots "
                 f"{', '.join(map(str, numbers))} of {source.name}; name one of them"
             )
     return numbers

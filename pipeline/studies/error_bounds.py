@@ -62,7 +62,8 @@ def state_bounds(
     prefixes = [each for each in prefixes if all(f"{each}/{leaf}" in first for leaf in leaves)]
     if len(prefixes) < 2 or "/landmarks" not in first:
         raise BadInput(
-            f"{sources[0].name}: each robot's bounds are taken from the others: two robots or more with "
+            f"{sources[0].name}: the bounds of each robot are taken from the others: two robots or "
+            "more with "
             "odometry, range_bearing and truth are needed, and /landmarks; "
             f"there are {len(prefixes)} such robots"
         )

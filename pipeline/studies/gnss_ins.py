@@ -124,7 +124,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     ]
     if not runs:
         raise BadInput(
-            f"{folder}: no window of {listed(options.lengths_s, 0, ', ')} s has a truth all over; "
+            f"{folder}: no window of {listed(options.lengths_s, 0, ', ')} s has a truth throughout; "
             "options.first_s, options.every_s and options.lengths_s move them"
         )
     runner = Runner(experiment, setting)

@@ -85,7 +85,9 @@ def outage_of(source: MemorySource) -> Span:
     """The outage of a drive; BadInput where it has none, or more than one."""
     given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
     if len(given) != 1:
-        raise BadInput(f"study imu-grades: {len(given)} outages; give one as gnss.outages_s=[[50, 80]]")
+        raise BadInput(
+            f"study imu-grades: {len(given)} outages; give exactly one, as gnss.outages_s=[[50, 80]]"
+        )
     return Span(*given[0])
 
 

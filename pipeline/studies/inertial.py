@@ -39,7 +39,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for name, rows in trials.groupby("estimator", sort=False)
     }
     if options.estimator not in means:
-        raise BadInput(f"no estimates of '{options.estimator}' over movement with truth to judge")
+        raise BadInput(
+            f"no estimates of '{options.estimator}' during movement with truth; give a trial with both"
+        )
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
     for trial, estimator, rmse_deg, _ in trials.to_numpy():

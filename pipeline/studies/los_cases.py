@@ -61,7 +61,7 @@ class LosOptions(Parameters):
     def _are_the_papers(self) -> Self:
         if len(self.scenarios) != len(self.paper.sensor_position_m):
             raise ValueError(
-                f"scenarios must be the paper's {len(self.paper.sensor_position_m)}, in order"
+                f"scenarios must be the {len(self.paper.sensor_position_m)} of the paper, in its order"
             )
         return self
 
@@ -143,7 +143,10 @@ def run_case(experiment: Experiment, setting: Setting, number: int, name: str, c
     recorder, values, _ = load_scenario(name)
     sensors = len(options.paper.sensor_position_m[number - 1])
     if recorder != "optical-los" or len(values.get("bias_deg", [])) != sensors:
-        raise BadInput(f"scenario {name}: no optical-los scenario with bias_deg of {sensors} sensors")
+        raise BadInput(
+            f"scenario {name}: is not an optical-los scenario with bias_deg of {sensors} sensors; give "
+            "one"
+        )
     bias_deg = (chosen.bias_deg * np.array(values["bias_deg"])).tolist()
     values = merge(values, {"sigma_rad": chosen.sigma_rad, "bias_deg": bias_deg})
     values = merge(values, experiment.record.parameters if experiment.record else {})

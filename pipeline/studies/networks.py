@@ -71,7 +71,7 @@ def _after(errors: Errors, settle_s: float) -> Errors:
     kept = errors.elapsed_s > settle_s + 1e-9
     if not kept.any():
         raise BadInput(
-            f"{errors.estimator} {errors.case} estimates nothing after settle_s = {settle_s:g} s; "
+            f"{errors.estimator} {errors.case} has no estimates after settle_s = {settle_s:g} s; "
             "record more steps"
         )
     columns = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
@@ -221,9 +221,8 @@ def _claim_of_equation_17() -> Claim:
     """(17) as printed equates P_c^-1 with the bracket that belongs between two factors P."""
     stated = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
     fused = fuse(CI, np.zeros((2, 2)), stated)
-    inner = sum(
-        w**2 * np.linalg.inv(p) for w, p in zip(fused.weights, stated, strict=True)
-    )  # with P_ab = 0
+    # with P_ab = 0
+    inner = sum(w**2 * np.linalg.inv(p) for w, p in zip(fused.weights, stated, strict=True))
     printed = float(np.trace(np.linalg.inv(inner)))
     actual = float(np.trace(fused.covariance @ inner @ fused.covariance))
     return judged(

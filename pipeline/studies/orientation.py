@@ -112,7 +112,7 @@ def trials(experiment: Experiment, setting: Setting) -> Iterator[tuple[str, Memo
     assert setting.data is not None
     files = sorted(setting.data.glob("*.hdf5")) if setting.data.is_dir() else [setting.data]
     if not files:
-        raise BadInput(f"{setting.data}: no .hdf5 files; give a BROAD trial or the folder of some")
+        raise BadInput(f"{setting.data}: has no .hdf5 files; give a BROAD trial, or a folder of them")
     for path in setting.progress(files, "replaying trials", len(files)):
         given = experiment.import_
         yield path.stem, memory_source(*import_run(given.source, Path(path), given.parameters))

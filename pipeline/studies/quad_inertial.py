@@ -167,7 +167,10 @@ def flight_of(name: str, source: MemorySource) -> Flight:
     """A recording of the mapping `quadrotor`; raises BadInput where it has no units, or no truth."""
     topics = sorted(topic for topic in source.topics if re.fullmatch(r"/imu\w+/inertial", topic))
     if not topics or not {"/truth", "/fix"} <= source.topics.keys():
-        raise BadInput(f"{name}: needs /truth, /fix and units such as /imu1/inertial")
+        raise BadInput(
+            f"{name}: lacks /truth, /fix or inertial units such as /imu1/inertial; give a log that has "
+            "them"
+        )
     truth = source["/truth"]
     time_ns, place = truth.publish_time_ns, truth["state"][:, :3]
     velocity = np.gradient(place, (time_ns - time_ns[0]) * 1e-9, axis=0)

@@ -25,7 +25,9 @@ EFFICIENT = "95 % if efficient"
 def require_spread(solutions: int) -> None:
     """Raise BadInput where `solutions` of one experiment have no standard error."""
     if solutions < 2:
-        raise BadInput("one run has no standard error to judge claims by; give --runs 2 or more")
+        raise BadInput(
+            "one run gives no standard error, by which claims are judged; give --runs 2 or more"
+        )
 
 
 def errors_named(replayed: Replayed, estimator: str) -> Errors:

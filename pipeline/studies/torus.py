@@ -112,7 +112,7 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
     """Figure 3; see `pipeline.experiment.Study`. `runs` are those of the random samples."""
     options: PropagationOptions = setting.options
     if experiment.record or experiment.import_ or experiment.estimators:
-        raise BadInput("study torus-propagation is numerics: leave out record, import and estimators")
+        raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")
     drawn_bytes = experiment.runs * len(options.correlations) * options.random_samples * 2 * 8
     require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)  # as drawn, and moved
     outcome = Outcome()
@@ -208,7 +208,9 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
     """The recursive toroidal filter beside unscented filters; see `pipeline.experiment.Study`."""
     options: FilterOptions = setting.options
     if options.estimator not in experiment.estimators:
-        raise BadInput(f"experiment '{experiment.title}': estimator {options.estimator} is missing")
+        raise BadInput(
+            f"experiment '{experiment.title}': estimator {options.estimator} is missing; add it"
+        )
     outcome = Outcome()
     sources: list[MemorySource] = []
     errors_rad: dict[str, dict[str, Floats]] = {}

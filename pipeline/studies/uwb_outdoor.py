@@ -135,7 +135,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
         ends = begin + np.flatnonzero(window.end.holds(state[begin:, :2]))
         if not len(ends):
             raise BadInput(
-                f"{of.recording.path}: its path does not go through the window; set options.windows to "
+                f"{of.recording.path}: its path does not cross the window; set options.windows to "
                 "one of its own, or to {} for all of it"
             )
         end = int(ends[0])

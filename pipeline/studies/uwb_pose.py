@@ -46,7 +46,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     for path in recordings(setting, "UWB*.csv"):
         captured = path.with_name(path.name.replace("UWB", "motion_capture", 1))
         if not captured.exists():
-            raise BadInput(f"{path}: has no {captured.name} beside it, the motion capture of the run")
+            raise BadInput(
+                f"{path}: has no {captured.name} beside it, the motion capture of the run; give the "
+                "folder as published"
+            )
         name = path.stem.removeprefix("UWB").strip("_") or path.parent.name
         pairs.append(Recording(name, path, (captured,)))
     found = list(replayed(experiment, setting, pairs))
@@ -81,7 +84,9 @@ def figures_of(
     begin_ns = max(int(stamps[0]) + round(options.skip_s * 1e9), int(truth.time_ns[0]))
     rows = (stamps >= begin_ns) & (stamps <= truth.time_ns[-1])
     if not rows.any():
-        raise BadInput(f"{of.recording.path}: no estimate of {label} lies within the motion capture")
+        raise BadInput(
+            f"{of.recording.path}: no estimate of {label} is within the span of the motion capture"
+        )
     error = states["mean"][rows, :3] - truth.at(stamps[rows])
     error[:, 2] = wrap_angle(error[:, 2])
     size = round(np.sqrt(states["covariance"].shape[1]))

@@ -33,7 +33,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: VehiclesOptions = setting.options
     if options.reference not in experiment.estimators:
-        raise BadInput(f"experiment '{experiment.title}': estimator {options.reference} is missing")
+        raise BadInput(
+            f"experiment '{experiment.title}': estimator {options.reference} is missing; add it"
+        )
     cases: list[Case] = []
     for name, replayed in Runner(experiment, setting).cases(options.cases):
         scores = scores_of(replayed.sources, replayed.outputs, experiment.estimators, replayed.sets)

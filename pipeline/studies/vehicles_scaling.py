@@ -57,7 +57,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     options: ScalingOptions = setting.options
     if not experiment.record or set(options.methods) != set(experiment.estimators):
-        raise BadInput(f"experiment '{experiment.title}': give [record], and every estimator's method")
+        raise BadInput(
+            f"experiment '{experiment.title}': give [record], and a method for every estimator"
+        )
     rows, sources = [], []
     for count in setting.progress(options.vehicles, "numbers of vehicles", len(options.vehicles)):
         for place in ("apart", "together"):

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.folders import logs_in
 from pipeline.outputs import check_folder
 from pipeline.results import plain
 from pipeline.settings import settings_of_estimators
-from pipeline.terminal import print_json, print_metrics, print_table, say, status
+from pipeline.terminal import print_json, print_metrics, print_table, say, status, warn
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
 from pipeline.tuning.tuning import tune
@@ -37,9 +38,13 @@ def tune_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Tune, write the result folder, and print values, notes and metrics."""
+    """Say what is tuned on and what is held out, tune, write the result folder, print what was found."""
+    logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
+    _check_apart(logs, held_out)
     check_folder(out, {"log": [*logs, *held_out]})
     chosen = settings_of_estimators([label], settings, settings_file, model=model)
+    if not as_json:
+        say(f"tuned on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
 
         def tell(best: Best) -> None:
@@ -67,6 +72,8 @@ def tune_logs(
     if as_json:
         print_json(
             {
+                "logs": [str(path) for path in logs],
+                "held_out": [str(path) for path in held_out],
                 "parameters": parameters,
                 "correlation": found.correlation.replace({np.nan: None}).to_dict(),
                 "notes": found.notes,
@@ -84,8 +91,35 @@ def tune_logs(
     for sentence in found.notes:
         say(sentence)
     for each in found.replays:
-        print_metrics(plain(each.judge.metrics), each.judge.bounds)
+        print_metrics(plain(each.judge.metrics), each.judge.bounds, each.judge.runs_table)
     say(f"{out / SETTINGS}: for --settings; {out}: tables, figures, timeline, result.json")
+
+
+def _check_apart(logs: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Refuse or warn of logs that were likely meant to be held out, and would be tuned on.
+
+    Of `--validate test/*.mcap` the shell makes many words, and the option takes only the first.
+    """
+    folders = {path.resolve().parent for path in held_out}
+    beside = [path for path in logs if path.resolve().parent in folders]
+    mend = "to hold out several, give --validate the folder, or once before each log"
+    for path in logs:
+        if path.resolve() in {each.resolve() for each in held_out}:
+            raise BadInput(f"{path}: would be tuned on and held out; leave it out of one of them")
+    if beside and len(beside) < len(logs):
+        more = f", as would {len(beside) - 1} more of its folder" if len(beside) > 1 else ""
+        raise BadInput(
+            f"{beside[0]}: would be tuned on{more}, while {held_out[0]} beside it is held out; {mend}"
+        )
+    if len(beside) > 1:
+        warn(f"the {len(beside)} logs tuned on are in one folder with those held out; {mend}")
+
+
+def _in_words(logs: Sequence[Path]) -> str:
+    """How many logs, the first and the last."""
+    if len(logs) > 1:
+        return f"{len(logs)} logs, {logs[0]} to {logs[-1]}"
+    return f"1 log, {logs[0]}" if logs else "none"
 
 
 def _bound(text: str) -> tuple[str, tuple[float, float]]:

@@ -61,7 +61,10 @@ def _without(source: MemorySource, vehicles: Collection[str]) -> MemorySource:
     found = {topic.split("/")[1] for topic in source.streams}
     for vehicle in vehicles:
         if vehicle not in found:
-            raise BadInput(f"{source.name}: no topic begins with /{vehicle}/; there are {sorted(found)}")
+            raise BadInput(
+                f"{source.name}: no topic begins with /{vehicle}/; the vehicles are "
+                f"{', '.join(sorted(found))}"
+            )
     kept = {
         topic: stream for topic, stream in source.streams.items() if topic.split("/")[1] not in vehicles
     }

@@ -231,7 +231,7 @@ class Objective:
                 pickle.dumps(self._without_runs())
             except (pickle.PicklingError, AttributeError, TypeError) as error:
                 raise BadInput(
-                    f"{self.label}: cannot go to another process ({error}); tune it without workers"
+                    f"{self.label}: cannot be sent to another process ({error}); tune it with one worker"
                 ) from error
         self.best = Best(self.best.evaluations, np.empty(0), np.inf)
         self._told, self.runs = [], [self.begun(start, run) for run in self.runs]

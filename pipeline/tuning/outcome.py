@@ -220,7 +220,7 @@ class Tuning:
         if found.was_stopped:
             yield (
                 f"stopped after {found.evaluations} evaluations: these are the best values so far, "
-                "and nothing is known of how well the logs tell them"
+                "and how well the logs determine them is not known"
             )
         elif not found.has_converged:
             yield "the search was ended before it converged; start from these values once more"
@@ -300,7 +300,9 @@ class Tuning:
         """Whether logs that were not searched by are explained better too."""
         if self.held_out_costs is not None:
             before, after = self.held_out_costs
-            what, sign = ("log-likelihood", -1.0) if self.objective.by == "likelihood" else ("cost", 1.0)
+            what, sign = "cost", 1.0
+            if self.objective.by == "likelihood":
+                what, sign = f"log-likelihood ({self._scale})", -1.0
             yield (
                 f"logs held out: {what} {sign * before:.6g} at the start, {sign * after:.6g} tuned: "
                 f"{'better' if after < before else 'no better'}"
@@ -308,6 +310,14 @@ class Tuning:
         if len(self.folds):
             better = int((self.folds[f"cost_{TUNED}"] < self.folds[f"cost_{START}"]).sum())
             yield f"{better} of {len(self.folds)} folds are explained better by what the others give"
+
+    @property
+    def _scale(self) -> str:
+        """What the log-likelihood of the logs held out is, beside that of the tables."""
+        count = len(self.held_out_logs)
+        total = "of 1 log" if count == 1 else f"the sum over {count} logs"
+        is_open, is_closed = (", gate open", ", with the gate") if self.gate < 1.0 else ("", "")
+        return f"{total}{is_open}; in the tables: the mean per log{is_closed}"
 
     @property
     def toml(self) -> str:

@@ -117,7 +117,8 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
             units[place], (below, middle, above) = _unit(near, each)
         if below == middle == above:
             raise BadInput(
-                f"{each.name}: nothing in the logs depends on it, so that they cannot tell its value; "
+                f"{each.name}: nothing in the logs depends on it, so that they cannot determine its "
+                "value; "
                 "leave it out of --free"
             )
     return Coordinates(free, units)

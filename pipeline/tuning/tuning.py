@@ -178,13 +178,14 @@ def _searched(
         raise BadInput("--free: name at least one parameter to search for")
     for name in bounds:
         if name not in names:
-            raise BadInput(f"--bound {name}: is not searched for; {choices(name, names)}")
+            raise BadInput(f"--bound {name}: this parameter is not searched for; {choices(name, names)}")
     for number, name in enumerate(names):
         if name in names[:number]:
-            raise BadInput(f"--free {name}: is named twice; once is enough")
+            raise BadInput(f"--free {name}: is named twice; name it once")
         if name in OPEN and CRITERIA[by].is_smooth:
             raise BadInput(
-                f"--free {name}: the best gate would let nothing in; leave it out, or tune --by nees"
+                f"--free {name}: the likelihood is greatest for a gate that accepts no measurement; "
+                "leave it out, or tune --by nees"
             )
     return [_free(name, bounds.get(name), source, bound[0]) for name in names]
 

@@ -37,9 +37,10 @@ NO_LATITUDE, NO_LONGITUDE, NO_COURSE, NO_SPEED = 91.0, 181.0, 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """Where the tangent plane touches (latitude, longitude), and what the notes call unlikely.
+    """The origin of the tangent plane (latitude, longitude), and what is reported as unlikely.
 
-    Without an origin it is the median of the positions, to a hundredth of a degree.
+    Without an origin it is the median of the positions, rounded to 0.01 deg. Speeds above
+    `top_speed_mps` and gaps above `gap_s` are counted in the notes.
     """
 
     origin_deg: (
@@ -77,7 +78,10 @@ def read(path: Path, parameters: AisParameters) -> Recording:
     east, north, up = into_tangent_plane((reports.latitude_deg, reports.longitude_deg), origin)
     near = up > -SEMI_MAJOR_M
     if not near.any():
-        raise BadInput(f"{path}: all positions are on the other half of the earth from {origin}")
+        raise BadInput(
+            f"{path}: all positions are on the other half of the earth, seen from {origin}; give an "
+            "origin near them"
+        )
     if not near.all():
         notes["beyond the tangent plane's half of the earth"] = f"{(~near).sum()} reports dropped"
     reports, place = reports.take(near), np.stack([east, north], axis=1)[near]
@@ -145,7 +149,8 @@ def _table(path: Path) -> pd.DataFrame:
     missing = [name for name in ("Time", *NUMBERS) if name not in table.columns]
     if missing:
         raise BadInput(
-            f"{path}: has no column {missing[0]}; an AIS table has Time, {', '.join(NUMBERS)}"
+            f"{path}: has no column {missing[0]}; an AIS table has the columns Time, "
+            f"{', '.join(NUMBERS)}"
         )
     if table.empty:
         raise BadInput(f"{path}: has a header line but no reports; give an AIS table with rows")
@@ -164,7 +169,10 @@ def _with_positions(reports: Reports, path: Path, notes: dict[str, str]) -> Repo
     """Those whose position is known; counts also what else is not."""
     unknown = (reports.latitude_deg > 90.0) | (reports.longitude_deg > 180.0)
     if unknown.all():
-        raise BadInput(f"{path}: no report has a position; all say 91 or 181, not available")
+        raise BadInput(
+            f"{path}: no report has a position: all have latitude 91 or longitude 181, which mean not "
+            "available"
+        )
     if unknown.any():
         notes["position not available"] = f"{unknown.sum()} reports dropped"
     for what, values in (("course", reports.course_deg), ("speed", reports.speed_mps)):

@@ -37,12 +37,13 @@ PLANE = ("x_m", "y_m")
 
 
 class PlaceSensor(Parameters):
-    """What a sensor of places is taken to be like; its channels state it to trackers.
+    """What is assumed of a sensor that measures positions; its channels state it to trackers.
 
-    The error has `sigma_m` along the line of sight, and across it also `sigma_across_rad` of the range.
-    Detections are where a target was `lag_s` ago. The probability of a detection holds up to
-    `near_range_m`, falls linearly to `far_detection_probability` at `far_range_m` and is that beyond.
-    Detections within `joined_within_m` of one another are of one target.
+    The error has the standard deviation `sigma_m` along the line of sight; across it `sigma_across_rad`
+    times the range is added. Detections are where a target was `lag_s` ago. The probability of a
+    detection holds up to `near_range_m`, falls linearly to `far_detection_probability` at
+    `far_range_m`, and keeps that beyond. Detections within `joined_within_m` of each other count as one
+    target.
     """
 
     sigma_m: PositiveFloat
@@ -58,11 +59,11 @@ class PlaceSensor(Parameters):
 
 
 class Camera(Parameters):
-    """What a camera's bearings are taken to be like; its channels state it to trackers.
+    """What is assumed of a camera's bearings; its channels state it to trackers.
 
-    The error's variance is `sigma_rad` squared and, for where a box lies on a hull, the square of
-    `sigma_across_m` over the range. Errors stay alike for seconds: a track takes one bearing every
-    `interval_s`.
+    The variance of a bearing is `sigma_rad` squared plus the square of `sigma_across_m` over the range,
+    since a box may lie anywhere on a hull. Errors last for seconds, so that a track uses one bearing
+    every `interval_s`.
     """
 
     sigma_rad: PositiveFloat = 0.04
@@ -74,7 +75,7 @@ class Camera(Parameters):
 
 
 class AutoferryParameters(Parameters):
-    """What the files do not say: what the sensors are like, the same in all scenarios."""
+    """What the files do not state: the sensors' properties, the same in all scenarios."""
 
     lidar: PlaceSensor = PlaceSensor(
         sigma_m=2.0,
@@ -153,7 +154,8 @@ def _file(folder: Path, kind: str) -> Path:
     found = sorted(folder.glob(f"*_{kind}.json")) if folder.is_dir() else []
     if len(found) != 1:
         raise BadInput(
-            f"{folder}: {len(found) or 'no'} files *_{kind}.json; give the folder of one Autoferry "
+            f"{folder}: {len(found) or 'no'} files *_{kind}.json, expected one; give the folder of one "
+            "Autoferry "
             "scenario, such as scenario2"
         )
     return found[0]
@@ -165,7 +167,7 @@ def _entries(path: Path) -> list[Any]:
     except (OSError, ValueError) as error:
         raise BadInput(f"{path}: cannot be read as JSON ({error})") from None
     if not isinstance(entries, list) or not entries:
-        raise BadInput(f"{path}: holds no list of entries; give the file as published")
+        raise BadInput(f"{path}: is not a list of entries; give the file as published")
     return entries
 
 
@@ -175,7 +177,9 @@ def _scans(path: Path) -> Scans:
         where = f"{path}: scan {number}"
         sensor = _of(entry, "sensorID", where)
         if type(sensor) is not int or sensor not in SENSORS:
-            raise BadInput(f"{where}: sensorID is {sensor}; known are {', '.join(map(str, SENSORS))}")
+            raise BadInput(
+                f"{where}: sensorID is {sensor}; expected one of {', '.join(map(str, SENSORS))}"
+            )
         sensors.append(sensor)
         stamps.append(_stamp_ns(entry, where))
         ownships.append(_numbers(_of(entry, "ownshipPosition", where), where, "ownshipPosition", 2))
@@ -192,7 +196,9 @@ def _places(measurement: Any, where: str) -> Floats:
         return np.empty((0, 2))
     rows = measurement if isinstance(measurement, list) else [measurement]
     if len(rows) != 2 or isinstance(rows[0], list) != isinstance(rows[1], list):
-        raise BadInput(f"{where}: measurement is not [], [N, E] or [[N ...], [E ...]]")
+        raise BadInput(
+            f"{where}: measurement must be [], [N, E] or [[N ...], [E ...]]; give the file as published"
+        )
     several = isinstance(rows[0], list)
     north, east = (
         _numbers(row if several else [row], where, "measurement", len(rows[0]) if several else 1)
@@ -220,7 +226,9 @@ def _truths(path: Path) -> dict[int, tuple[Integers, Floats]]:
             north, east, *_ = _numbers(_of(target, "position", where), where, "position", 3)
             stamps = found.setdefault(name, {})
             if stamps.setdefault(_stamp_ns(target, where), (east, north)) != (east, north):
-                raise BadInput(f"{where}: target {name} is at two places at one time; leave one out")
+                raise BadInput(
+                    f"{where}: target {name} has two positions at one time; remove one of the entries"
+                )
     return {
         target: (np.array(sorted(stamps), np.int64), np.array([stamps[each] for each in sorted(stamps)]))
         for target, stamps in sorted(found.items())

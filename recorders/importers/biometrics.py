@@ -34,7 +34,7 @@ class Matchers(Parameters):
     @classmethod
     def _differ(cls, matchers: list[Matcher]) -> list[Matcher]:
         if len({each.name for each in matchers}) < len(matchers):
-            raise ValueError("give every matcher a name of its own")
+            raise ValueError("two matchers have the same name; give each its own")
         return matchers
 
 
@@ -66,7 +66,9 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
     for matcher, matrix in zip(matchers, matrices, strict=True):
         path = folder / f"{matcher.name}.csv"
         if matrix.probes != matrix.gallery:
-            raise BadInput(f"{path}: rows and columns must be of the same users in the same order")
+            raise BadInput(
+                f"{path}: rows and columns must have the ids of the same users in the same order"
+            )
         if matrix.gallery != first.gallery:
             raise BadInput(
                 f"{path}: {len(matrix.gallery)} users, not the {len(first.gallery)} of "
@@ -83,10 +85,12 @@ def read(folder: Path, parameters: ScoreMatricesParameters) -> Recording:
 def _described(folder: Path) -> list[Matcher]:
     path = folder / "matchers.toml"
     if not path.exists():
-        raise BadInput(f"{path}: missing; name the matchers there or as parameter 'matchers'")
+        raise BadInput(f"{path}: no such file; list the matchers in it, or in the parameter 'matchers'")
     matchers = build(Matchers, read_toml(path), str(path)).matchers
     if not matchers:
-        raise BadInput(f"{path}: names no matchers; give [[matchers]] with name and modality")
+        raise BadInput(
+            f"{path}: lists no matchers; give a [[matchers]] table with name and modality for each"
+        )
     return matchers
 
 
@@ -94,7 +98,7 @@ def _matrix(path: Path) -> Matrix:
     try:
         table = pd.read_csv(path, index_col=0, dtype={0: str}, keep_default_na=False)
     except FileNotFoundError:
-        raise BadInput(f"{path}: missing; a matcher needs its matrix") from None
+        raise BadInput(f"{path}: no such file; every matcher needs its matrix") from None
     except (OSError, ValueError, IndexError) as error:
         raise BadInput(f"{path}: cannot be read as a matrix with ids ({error})") from None
     if table.empty or table.shape[0] != table.shape[1]:
@@ -106,7 +110,9 @@ def _matrix(path: Path) -> Matrix:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         found = table.iloc[row, column]
-        raise BadInput(f"{path}: probe {row + 1}, gallery entry {column + 1} is {found!r}, no number")
+        raise BadInput(
+            f"{path}: probe {row + 1}, gallery entry {column + 1} is {found!r}; expected a number"
+        )
     return Matrix(table.index.astype(str).tolist(), table.columns.astype(str).tolist(), numbers)
 
 
@@ -115,7 +121,9 @@ def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> N
     valid = scores != matcher.failure if matcher.failure is not None else np.ones(scores.shape, bool)
     genuine = np.eye(len(scores), dtype=bool)
     if not valid.any() or np.ptp(scores[valid]) == 0:
-        raise BadInput(f"{path}: all scores are equal; leave this matcher out")
+        raise BadInput(
+            f"{path}: all scores are equal, so that they cannot separate users; leave this matcher out"
+        )
     if not (valid & genuine).any() or not (valid & ~genuine).any():
         raise BadInput(f"{path}: needs scores of the same and of different users; give more users")
     ahead = np.median(scores[valid & genuine]) - np.median(scores[valid & ~genuine])
@@ -128,7 +136,7 @@ def _check_sense(path: Path, matcher: Matcher, scores: NDArray[np.float64]) -> N
 
 
 SCORE_MATRICES = Importer(
-    "biometric score matrices: a folder with a CSV per matcher, ids in the first row and column",
+    "biometric score matrices, as of NIST BSSR1: a folder with a CSV per matcher, with users' ids",
     ScoreMatricesParameters,
     read,
 )

@@ -27,7 +27,7 @@ DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement":
 
 
 class BroadParameters(Parameters):
-    """How far a quaternion may be from unit length, and what is a gap in the inertial stream."""
+    """How far a quaternion's length may be from 1, and which gaps of inertial samples are reported."""
 
     unit_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     gap_s: PositiveFloat = 0.1
@@ -41,7 +41,7 @@ def read(path: Path, parameters: BroadParameters) -> Recording:
     """
     files = sorted(path.glob("*.hdf5")) if path.is_dir() else [path]
     if not files:
-        raise BadInput(f"{path}: no .hdf5 files; give a BROAD trial or the folder of some")
+        raise BadInput(f"{path}: has no .hdf5 files; give a BROAD trial, or a folder of them")
     notes: dict[str, str] = {}
     streams = [stream for file in files for stream in _trial(file, parameters, notes)]
     return Recording(streams, SIMULATION_EPOCH_NS, notes)
@@ -56,7 +56,7 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
     seen = np.isfinite(data["opt_quat"]).all(axis=1)
     if not sampled.any() or not seen.any():
         missing = "truth" if sampled.any() else "inertial samples"
-        raise BadInput(f"{file}: no {missing}: every value is NaN; leave this trial out")
+        raise BadInput(f"{file}: every value of {missing} is NaN; leave this trial out")
     truth = require_unit(data["opt_quat"][seen], f"{file}: truth opt_quat", parameters.unit_tolerance)
     moving = data["movement"] != 0
     changes = np.flatnonzero(np.append(True, moving[1:] != moving[:-1]))
@@ -103,7 +103,7 @@ def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
         raise BadInput(f"{file}: attribute sampling_rate must be a positive number of Hz, as published")
     count = len(data["movement"]) if data["movement"].ndim else 0
     if count == 0:
-        raise BadInput(f"{file}: dataset movement holds no samples; give a BROAD trial")
+        raise BadInput(f"{file}: dataset movement is empty; give a BROAD trial as published")
     for name, width in DATASETS.items():
         if data[name].dtype.kind not in "biuf":
             raise BadInput(f"{file}: dataset {name} is of {data[name].dtype}; expected real numbers")

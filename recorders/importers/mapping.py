@@ -136,7 +136,7 @@ def schema_of(mapping: StreamMapping, where: str) -> Schema:
     for entry in entries.values():
         is_needed = not (entry.may_be_nan or entry.may_be_absent or entry.kind == "identifier")
         if is_needed and entry.name not in given:
-            raise BadInput(f"{where}: gives no field for {schema.name}'s {entry.name}")
+            raise BadInput(f"{where}: {schema.name} needs the field {entry.name}; add it to `fields`")
     return schema
 
 
@@ -211,7 +211,7 @@ class _Maker(NamedTuple):
         lengths = (stated,) if name in _STATED and mapping.components else _LENGTHS.get(name, (width,))
         if width not in lengths:
             wanted = " or ".join(map(str, lengths))
-            raise BadInput(f"{self.where}: field {name} is given {width} numbers; expected {wanted}")
+            raise BadInput(f"{self.where}: field {name} is given {width} columns; expected {wanted}")
         if name in {**mapping.factors, **mapping.offsets, **mapping.units}:
             factors = self._spread(mapping.factors.get(name, 1.0), width, f"factors of {name}")
             offsets = self._spread(mapping.offsets.get(name, 0.0), width, f"offsets of {name}")
@@ -237,7 +237,8 @@ class _Maker(NamedTuple):
         if name in mapping.cross_deviations:
             if width != 3:
                 raise BadInput(
-                    f"{self.where}: cross_deviations of {name} are of 3 deviations, not {width}"
+                    f"{self.where}: cross_deviations of {name} need 3 deviations beside them, found "
+                    f"{width}"
                 )
             crossed = self._numbers(mapping.cross_deviations[name])
             for column, (row, other) in enumerate(((0, 1), (0, 2), (1, 2))):
@@ -275,7 +276,7 @@ class _Maker(NamedTuple):
         """One for each entry of a vector."""
         values = _listed(given)
         if len(values) not in (1, width):
-            raise BadInput(f"{self.where}: {what} are {len(values)}; expected one, or {width}")
+            raise BadInput(f"{self.where}: {what}: found {len(values)} values; give one, or {width}")
         return np.array(values * (width // len(values)))
 
 
@@ -292,7 +293,10 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
     vectors, covariance = _IN_BODY.get(schema.name, ((), ""))
     for name in vectors:
         if columns[name].shape[1] != 3:
-            raise BadInput(f"{where}: field {name} is given 2 numbers; mounting_deg turns 3")
+            raise BadInput(
+                f"{where}: field {name} has 2 columns, and mounting_deg turns vectors of 3; leave "
+                "mounting_deg out"
+            )
         columns[name] = columns[name] @ turn.as_matrix().T
     width = 3 * len(vectors)
     if covariance and columns[covariance].shape[1] == width**2:
@@ -305,7 +309,10 @@ def _mount(columns: dict[str, NDArray], mapping: StreamMapping, schema: Schema, 
     elif "state" in columns and which:
         columns["state"][:, which] = _turned_back(columns["state"][:, which], turn)
     elif not vectors:
-        raise BadInput(f"{where}: {schema.name} has nothing in the body's axes; leave mounting_deg out")
+        raise BadInput(
+            f"{where}: {schema.name} has no vector in the body's axes that could be turned; leave "
+            "mounting_deg out"
+        )
 
 
 def _quaternion_of(mapping: StreamMapping) -> list[int]:
@@ -346,7 +353,10 @@ def checked(where: str, field: str, column: NDArray) -> NDArray:
     limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
     if limit is not None and len(column) and np.abs(column).max() > limit:
         worst = column[np.abs(column).argmax()]
-        raise BadInput(f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}")
+        raise BadInput(
+            f"{where}: a {field.removesuffix('_deg')} is {worst:.9g} deg, beyond {limit:g}; check the "
+            "column and its unit"
+        )
     if field == "quaternion":
         return require_unit(column, f"{where}: its quaternions", _UNIT_TOLERANCE)
     is_infinite = np.isinf(column) if column.dtype.kind == "f" else np.zeros(0, bool)

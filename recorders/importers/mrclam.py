@@ -22,11 +22,12 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
 
 class MrclamParameters(Parameters):
-    """What the data do not say: sensor data sheets and how well the start is known.
+    """What the data do not state: noise of odometry and sensor, and the uncertainty of the start.
 
-    The same for all sets and robots. The odometry's densities are those of its error over 1 to 20 s,
-    rounded up. The errors of successive ranges and bearings are alike (lag 1: 0.5-0.7) at up to ten a
-    second, which a filter takes for independent: their sigmas are a few times the scatter.
+    They are the same for all sets and robots. The densities of the odometry (m and rad per square root
+    of a second) are those of its errors over 1 to 20 s, rounded up. Errors of successive ranges and
+    bearings are correlated (by 0.5 to 0.7 from one to the next), while a filter assumes them
+    independent: so their standard deviations are a few times the scatter.
     """
 
     forward_noise_density: PositiveFloat = 0.05
@@ -69,7 +70,7 @@ def _robots(folder: Path) -> list[int]:
     names = [re.fullmatch(r"Robot(\d+)_\w+\.dat", path.name) for path in folder.iterdir()]
     robots = sorted({int(name.group(1)) for name in names if name})
     if not robots:
-        raise BadInput(f"{folder}: no RobotN_*.dat files; give the folder of one MRCLAM set")
+        raise BadInput(f"{folder}: has no files RobotN_*.dat; give the folder of one MRCLAM set")
     return robots
 
 
@@ -134,18 +135,20 @@ def _table(path: Path, columns: int, identifiers: tuple[int, ...] = ()) -> NDArr
     try:
         table = pd.read_csv(path, sep=r"\s+", comment="#", header=None, dtype=str)
     except FileNotFoundError:
-        raise BadInput(f"{path}: missing; an MRCLAM folder needs it") from None
+        raise BadInput(f"{path}: no such file; an MRCLAM folder needs it") from None
     except pd.errors.EmptyDataError:
-        raise BadInput(f"{path}: no data rows") from None
+        raise BadInput(f"{path}: has no data rows; give the file as published") from None
     except (OSError, pd.errors.ParserError, UnicodeDecodeError) as error:
         raise BadInput(f"{path}: cannot be read as columns ({error})") from None
     if table.shape[1] != columns:
-        raise BadInput(f"{path}: expected {columns} columns, found {table.shape[1]}")
+        raise BadInput(
+            f"{path}: has {table.shape[1]} columns, expected {columns}; give the file as published"
+        )
     numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(float)
-    _refuse(~np.isfinite(numbers), path, table, "no number")
+    _refuse(~np.isfinite(numbers), path, table, "expected a number")
     is_identifier = (numbers >= 0) & (numbers < 2**32) & (numbers == np.floor(numbers))
     is_identifier[:, [column not in identifiers for column in range(columns)]] = True
-    _refuse(~is_identifier, path, table, "no whole number from zero up")
+    _refuse(~is_identifier, path, table, "expected a whole number from zero up")
     return numbers
 
 
@@ -166,7 +169,7 @@ def _timed(
     """
     table = _table(path, columns, identifiers)
     bad = (table[:, :1] < 0) | (table[:, :1] > 9e9)
-    _refuse(bad, path, pd.DataFrame(table), "no time in seconds since 1970")
+    _refuse(bad, path, pd.DataFrame(table), "expected a time in seconds since 1970")
     times_ns = np.rint(table[:, 0] * 1e6).astype(np.int64) * 1000
     order = np.argsort(times_ns, kind="stable")
     return times_ns[order], table[order, 1:]

@@ -36,10 +36,10 @@ AXES = ("x", "y", "z")
 
 
 class SoundRecordingsParameters(Parameters):
-    """What the files do not say: the air, the band that is used, and where sounds came from, by name.
+    """What the files do not state: the air, the band that is used, and true positions of sounds by name.
 
-    Without a band it is from 200 Hz to nine tenths of half the rate. It is told where more than
-    `clipped_share` of the samples are at the greatest value.
+    Without `band_hz` the band is from 200 Hz to nine tenths of half the sampling rate. A file is
+    reported as clipped if more than `clipped_share` of its samples have the greatest value.
     """
 
     speed_of_sound_mps: PositiveFloat = 343.0
@@ -82,14 +82,18 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     one cannot be used at all, or no sound is left.
     """
     if not folder.is_dir():
-        raise BadInput(f"{folder}: is no folder; give one of WAV files with the table of their places")
+        raise BadInput(
+            f"{folder}: is not a folder; give one that has WAV files and a table of the microphones' "
+            "positions"
+        )
     tables = {path: _table(path) for path in sorted(folder.rglob("*.csv"))}
     placing = {
         path: table for path, table in tables.items() if {"x", "y"} <= set(table.columns) and len(table)
     }
     if not placing:
         raise BadInput(
-            f"{folder}: no table says where microphones are; give a CSV with the columns file, x, y"
+            f"{folder}: has no table of the microphones' positions; add a CSV file with the columns "
+            "file, x, y"
         )
     notes: dict[str, str] = {}
     arrays, count = [], 0
@@ -106,10 +110,10 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     ]
     if not streams:
         left = "; ".join(f"{what}: {why}" for what, why in notes.items())
-        raise BadInput(f"{folder}: holds no sound that can be located ({left or 'none is detected'})")
+        raise BadInput(f"{folder}: has no sound that can be located ({left or 'none is detected'})")
     missing = sorted(parameters.truth_m.keys() - {stream.topic.split("/")[1] for stream in streams})
     if missing:
-        notes["truth_m"] = f"no sound is called {', '.join(missing)}"
+        notes["truth_m"] = f"no sound has the name {', '.join(missing)}"
     places = np.array([array.places[name] for array in arrays for name in array.files])
     return Recording([microphone_stream(epoch_ns, places), *streams], epoch_ns, notes)
 
@@ -119,12 +123,15 @@ def _array(folder: Path, path: Path, table: pd.DataFrame, first_id: int, notes: 
     places = _places(path, table)
     files = _recordings(folder, places, notes)
     if not files:
-        raise BadInput(f"{path}: none of its files can be used; give the folder that they count from")
+        raise BadInput(
+            f"{path}: none of the files that it names can be used; give the folder that their paths "
+            "start from"
+        )
     silent = [name for name, each in files.items() if each.begin_ns is None]
     if silent and len(silent) < len(files):
         raise BadInput(
-            f"{path}: {silent[0]} does not say when it began (recording_start_time), others do; "
-            "give all of them that comment or none"
+            f"{path}: {silent[0]} lacks the comment recording_start_time, which others have; "
+            "give it to all of them or to none"
         )
     return Array(path, places, {name: first_id + place for place, name in enumerate(files)}, files)
 
@@ -147,9 +154,9 @@ def _places(path: Path, table: pd.DataFrame) -> dict[str, Floats]:
         if len(axes) < 3 or np.isnan(place[-1]):
             place = np.append(place[:2], 0.0)
         if not np.isfinite(place).all():
-            raise BadInput(f"{path}: {name}: its place is no number; give x and y in m")
+            raise BadInput(f"{path}: {name}: its position is not two numbers; give x and y in m")
         if name in found:
-            raise BadInput(f"{path}: {name}: stands there twice; leave one out")
+            raise BadInput(f"{path}: {name}: is listed twice; remove one of the rows")
         found[str(name)] = place
     return found
 
@@ -178,8 +185,8 @@ def _recordings(folder: Path, at: Mapping[str, Floats], notes: dict[str, str]) -
         other = next(iter(found.items()), None)
         if other and other[1].rate_hz != recorded.rate_hz:
             raise BadInput(
-                f"{path}: has {recorded.rate_hz} samples a second, {other[0]} has {other[1].rate_hz}; "
-                "bring all of an array to one rate"
+                f"{path}: has {recorded.rate_hz} samples per second, {other[0]} has {other[1].rate_hz}; "
+                "resample all files of an array to one rate"
             )
         found[name] = recorded
     return found
@@ -200,7 +207,7 @@ def _read(path: Path) -> Recorded:
         samples = samples.astype(float) - 128.0
     samples = samples.astype(float)
     if not np.isfinite(samples).all():
-        raise BadInput(f"{path}: has samples that are not finite; write it again without them")
+        raise BadInput(f"{path}: has samples that are not finite; export it again without them")
     return Recorded(samples, int(rate_hz), _begin_ns(path))
 
 
@@ -239,9 +246,7 @@ def _sounds(array: Array, tables: Mapping[Path, pd.DataFrame], epoch_ns: int) ->
         has_one = True
         begin, end = (table[name].map(_number) for name in TIMES)
         if not ((begin >= 0.0) & (begin < end)).all():
-            raise BadInput(
-                f"{path}: start_time and end_time must be numbers of s, the latter the larger"
-            )
+            raise BadInput(f"{path}: start_time and end_time must be in s, and the end after the start")
         first_ns = file.map({name: span[0] for name, span in spans.items()}).fillna(-1).astype(np.int64)
         begin_ns = first_ns + (begin * 1e9).round().astype(np.int64)
         for kind in [each for each in table.columns[1:] if each not in TIMES]:
@@ -310,8 +315,9 @@ def _streams(
     low, high = parameters.band_hz or (200.0, 0.45 * rate_hz)
     if not low < high <= 0.5 * rate_hz:
         raise BadInput(
-            f"sound {name}: band_hz = [{low:g}, {high:g}] for {rate_hz} samples a second; give a lower "
-            f"and a higher frequency, the latter no more than {0.5 * rate_hz:g}"
+            f"sound {name}: band_hz = [{low:g}, {high:g}] for {rate_hz} samples per second; give a "
+            "lower "
+            f"and a higher frequency in Hz, the higher one at most {0.5 * rate_hz:g}"
         )
     shortest = min(map(len, kept.values()))
     yield difference_stream(

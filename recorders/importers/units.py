@@ -64,7 +64,7 @@ def unit(text: str) -> Unit:
 
 
 def unit_of(name: str) -> str:
-    """What a field or component is in by its name; empty where it is a mere number.
+    """What a field or component is in by its name; empty where it has no unit.
 
     >>> unit_of("specific_force_mps2"), unit_of("orientation_w")
     ('m/s^2', '')
@@ -83,6 +83,6 @@ def conversion(given: str, name: str) -> float:
     wanted = unit_of(name)
     here, there = unit(given), unit(wanted)
     if here.powers != there.powers:
-        is_in = f"is in {wanted}" if wanted else "is a mere number"
-        raise BadInput(f"the unit '{given}' does not fit: {name} {is_in}")
+        is_in = f"is in {wanted}" if wanted else "has no unit"
+        raise BadInput(f"the unit '{given}' does not fit: {name} {is_in}; give a unit of that kind")
     return here.size / there.size

@@ -136,7 +136,7 @@ def _uncompressed(chunk: bytes) -> bytes | memoryview:
     if len(packed) != packed_length:
         raise ValueError("its length is wrong")
     if compression not in _MOST_FROM_A_BYTE:
-        raise ValueError(f"the compression '{compression}' is none of zstd, lz4 and none")
+        raise ValueError(f"the compression '{compression}' is not one of zstd, lz4 and none")
     if size > _MOST_FROM_A_BYTE[compression] * len(packed):
         raise ValueError("its size is wrong")
     data: bytes | memoryview = packed

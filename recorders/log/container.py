@@ -36,7 +36,7 @@ _DATA_END_BYTES = RECORD_HEAD.size + 4
 _ATTACHMENT_HEAD = struct.Struct("<QQI")
 # A run of records outside chunks is cut here, so that memory stays bounded.
 _LOOSE_BYTES = 1 << 20
-# No record has this opcode: it stands for bytes that hold no whole record.
+# No record has this opcode: it stands for bytes that are not a whole record.
 _LOST = 0
 
 
@@ -160,7 +160,7 @@ def _opened(file: BinaryIO, use_index: bool) -> Container:
         except Damaged as damage:
             found.damages.append(str(damage))
     if place.opcode != Opcode.DATA_END:
-        damage_at_end = f"it was cut off: its last {size - place.end} bytes hold no whole record"
+        damage_at_end = f"it was cut off: its last {size - place.end} bytes are not a whole record"
     elif place.end != summary.start:
         damage_at_end = _behind(file, size, place.end, summary) or damage_at_end
     if damage_at_end:
@@ -180,21 +180,21 @@ def _behind(file: BinaryIO, size: int, data_end: int, summary: _Summary) -> str:
         end = position + len(MAGIC)
         if place.opcode == Opcode.FOOTER and end < size:
             return (
-                f"it ends at byte {end}, and the {size - end} bytes behind that, another log perhaps, "
+                f"it ends at byte {end}, and the {size - end} bytes after that, perhaps another log, "
                 "are left out"
             )
     if summary.start is None:
         return ""
     return (
-        f"its data end at byte {data_end} and its summary begins at byte {summary.start}: what is "
-        "between is left out"
+        f"its data end at byte {data_end} and its summary begins at byte {summary.start}: the "
+        "bytes between are left out"
     )
 
 
 def _missing(found: Container, summary: _Summary, chunks: Iterable[int]) -> Iterator[str]:
     """What the summary tells of and the data section has not: `chunks`, metadata; and the reverse."""
     for offset in sorted(chunks):
-        yield f"there is no chunk at byte {offset}, where its index tells of one"
+        yield f"there is no chunk at byte {offset}, where its index states one"
     for entry in summary.records:
         if isinstance(entry, records.MetadataIndex) and entry.name not in found.metadata:
             yield f"its metadata record '{entry.name}' is missing"
@@ -301,7 +301,7 @@ def _stated_places(summary: _Summary) -> list[_Place]:
 def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> None:
     """Note what one place of the data section holds. Raises Damaged."""
     if place.opcode == _LOST:
-        raise Damaged(f"its bytes {place.offset} to {place.end} hold no whole record")
+        raise Damaged(f"its bytes {place.offset} to {place.end} are not a whole record")
     entry = index.chunk(place)
     if entry is not None:
         span = Span(entry.message_start_time, entry.message_end_time)

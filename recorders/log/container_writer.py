@@ -36,7 +36,7 @@ class ContainerWriter:
 
     def __init__(self, path: Path, compression: str) -> None:
         if compression not in COMPRESSIONS:
-            raise BadInput(f"compression '{compression}' is none of {', '.join(COMPRESSIONS)}")
+            raise BadInput(f"compression '{compression}' is not one of {', '.join(COMPRESSIONS)}")
         self._path = path
         self._compression = compression
         self._schemas: dict[bytes, records.Schema] = {}

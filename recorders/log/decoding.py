@@ -62,8 +62,8 @@ class Decoder:
         if schema is None or schema.encoding != "protobuf" or encoding != "protobuf":
             raise BadInput(
                 f"{self._where} is {schema.name if schema else 'without a schema'} in the encoding "
-                f"'{encoding}'; fuselog replays protobuf messages with numeric fields, "
-                "import other logs first, those of ROS with: fuselog import ros PATH"
+                f"'{encoding}'; fuselog replays protobuf messages with numeric fields: "
+                "import other logs first, such as those of ROS with: fuselog import ros PATH"
             )
         return schema
 
@@ -138,8 +138,8 @@ class Decoder:
             ]
         except DecodeError as error:
             raise BadInput(
-                f"{self._where}: a message is no {self.schema.full_name} ({error}); "
-                "it was written wrongly, leave the topic out"
+                f"{self._where}: a message cannot be read as {self.schema.full_name} ({error}); "
+                "leave the topic out, or write the log again"
             ) from error
 
     def _column(self, entry: Field, messages: Sequence[Message]) -> NDArray:
@@ -149,7 +149,7 @@ class Decoder:
             if len(widths) > 1:
                 raise BadInput(
                     f"{self._where}: field {entry.name} has vectors of different lengths "
-                    f"{sorted(widths)}; a stream keeps one, split the topic"
+                    f"{sorted(widths)}; a stream has one length, so split the topic"
                 )
             return np.array([list(value) for value in values], entry.dtype)
         column = np.array(values, entry.dtype)

@@ -50,9 +50,9 @@ class RunMetadata:
             epoch_ns = _stated(record, "epoch_ns", int)
             notes = _stated(record, "notes", dict)
             if epoch_ns >= 2**63:
-                raise ValueError("epoch_ns is past the year 2262")
+                raise ValueError("epoch_ns is after the year 2262")
             if not all(isinstance(note, str) for note in notes.values()):
-                raise ValueError("notes are not all texts")
+                raise ValueError("the notes are not all texts")
             return cls(
                 scenario=record["scenario"],
                 parameters=_stated(record, "parameters", dict),

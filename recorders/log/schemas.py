@@ -208,9 +208,9 @@ SHOT_DETECTION = _declare(
 )
 SHOT_REPORT = _declare(
     "ShotReport",
-    "What one of several sensors tells of a shot: where the muzzle blast came from, the bullet's "
-    "direction as its shockwave tells it, and by how much the shockwave was ahead, one of two by the "
-    "side of the muzzle blast from which it came.",
+    "What one of several sensors reports of a shot: where the muzzle blast came from, the bullet's "
+    "direction by its shockwave, and by how much the shockwave came earlier: one of two numbers, by the "
+    "side of the muzzle blast from which the shockwave came.",
     _identifier("sensor_id"),
     _real("muzzle_blast_azimuth_rad"),
     _real("trajectory_rad", may_be_nan=True),
@@ -351,7 +351,7 @@ TRUTH_STATE = _declare(
 )
 OUTAGE = _declare(
     "Outage",
-    "A span in which a sensor was dead.",
+    "A span in which a sensor was silent.",
     Field("end_time_ns", "time_ns"),
 )
 LINK_EVENT = _declare(
@@ -364,7 +364,7 @@ LINK_EVENT = _declare(
 )
 IDENTITY = _declare(
     "Identity",
-    "Which thing the message of the same row of another topic is of, where that does not say it.",
+    "Which target the message of the same row of another topic is of, if that does not state it.",
     _identifier("thing_id"),
 )
 
@@ -402,13 +402,13 @@ DENSITY_ESTIMATE = _declare(
 )
 EFFECTIVE_PARTICLES = _declare(
     "EffectiveParticles",
-    "Of how many particles an estimate was made, and how many of equal weight are worth as much.",
+    "The number of particles of an estimate, and the number of equal weight that is worth as much.",
     _identifier("particles"),
     _real("effective"),
 )
 INNOVATION = _declare(
     "Innovation",
-    "How one measurement fitted the prediction, and whether the gate let it in.",
+    "How one measurement differs from its prediction, and whether the gate accepted it.",
     _identifier("target_id"),
     _identifier("accepted"),
     _vector("innovation", may_be_nan=True),
@@ -502,12 +502,13 @@ TRACK_ESTIMATE = _declare(
 
 EXISTENCE = _declare(
     "Existence",
-    "How probable it is that the track of the same row of another topic is that of a thing.",
+    "How probable it is that the track of the same row of another topic is that of a target.",
     _real("existence"),
 )
 ASSOCIATION = _declare(
     "Association",
-    "How probable it is that a detection is a track's; the metadata lists the sensors by number. Those "
+    "How probable it is that a detection is a track's; the metadata lists the sensors by number. "
+    "Detections "
     "of a scan that were joined, being of one hull, count as one.",
     _identifier("track_id"),
     _identifier("sensor_id"),

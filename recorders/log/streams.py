@@ -191,12 +191,13 @@ def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns")
         raise BadInput(f"{what} is not numeric ({error})") from error
     if column.ndim != axes:
         raise BadInput(
-            f"{what} wants {axes} {'axis' if axes == 1 else 'axes'}, got shape {column.shape}"
+            f"{what} needs {axes} {'axis' if axes == 1 else 'axes'}, and has shape {column.shape}"
         )
     if not is_kept:
         lost = given[np.argmax(column != given)]
         raise BadInput(
-            f"{what} holds {lost}, which {dtype.name} cannot keep; round it, or choose another range"
+            f"{what} holds {lost}, which {dtype.name} cannot hold; round the values, or scale them "
+            "into its range"
         )
     return column
 
@@ -208,7 +209,8 @@ def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) ->
     """
     if not stream.topic.isprintable():
         raise BadInput(
-            f"{where}topic {stream.topic!r}: its name holds what cannot be printed; give it another"
+            f"{where}topic {stream.topic!r}: its name has characters that cannot be printed; give it "
+            "another name"
         )
     label = f"{where}topic {stream.topic}"
     published, logged = stream.publish_time_ns, stream.log_time_ns
@@ -218,7 +220,8 @@ def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) ->
             raise BadInput(f"{label}: {name} has {len(times)} values for {len(stream)} messages")
         if len(times) and times.min() < 0:
             raise BadInput(
-                f"{label}: {name} is negative or past the year 2262; shift the run to an epoch between"
+                f"{label}: {name} is before 1970 or after the year 2262; shift the run to an epoch "
+                "between"
             )
     for entry in stream.schema:
         column = stream.columns[entry.name]
@@ -247,7 +250,7 @@ def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
         if len(widths) > 1:
             raise BadInput(
                 f"{where}topic {first.topic}: field {name} has vectors of different lengths "
-                f"{sorted(widths)}; a stream keeps one, split the topic"
+                f"{sorted(widths)}; a stream has one length, so split the topic"
             )
     return replace(
         first,

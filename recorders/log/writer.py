@@ -100,7 +100,7 @@ class LogWriter:
         names = [stream.topic for stream in block]
         if len(set(names)) < len(names):
             raise BadInput(
-                f"{self.path}: a topic comes twice among {', '.join(names)}; join its streams"
+                f"{self.path}: a topic is given twice among {', '.join(names)}; join its streams"
             )
         for stream in block:
             check_stream(stream, f"{self.path}: ")
@@ -151,17 +151,21 @@ class LogWriter:
             self._topics[stream.topic] = topic
         if topic.schema.descriptor_set != stream.schema.descriptor_set:
             raise BadInput(
-                f"{self.path}: topic {stream.topic} is {topic.schema.full_name} and cannot become "
+                f"{self.path}: topic {stream.topic} has {topic.schema.full_name} already and cannot "
+                "take "
                 f"{stream.schema.full_name}; use another topic"
             )
         if topic.metadata != metadata:
-            raise BadInput(f"{self.path}: topic {stream.topic} changes its metadata between blocks")
+            raise BadInput(
+                f"{self.path}: topic {stream.topic} changes its metadata between blocks; give every "
+                "block the same"
+            )
         if topic.messages == 0:
             topic.widths = widths
         elif len(stream) and topic.widths != widths:
             raise BadInput(
                 f"{self.path}: topic {stream.topic} has vectors of widths {topic.widths} and cannot "
-                f"take {widths}; a stream keeps one width, use another topic"
+                f"take {widths}; a stream has one width, so use another topic"
             )
 
 

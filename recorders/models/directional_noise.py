@@ -37,7 +37,7 @@ def sample_bingham(
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):
-        raise BadInput("Bingham concentrations must be finite to be sampled; give numbers")
+        raise BadInput("Bingham concentrations must be finite to be sampled; give finite ones")
     d = concentrations.shape[-1]
     shape = np.broadcast_shapes(axes.shape[:-2], concentrations.shape[:-1])
     z = concentrations - concentrations.max(axis=-1, keepdims=True)

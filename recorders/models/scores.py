@@ -91,7 +91,8 @@ def comparisons_of(stream: Stream) -> Comparisons:
     if len(pairs) != len(stream) or len(stream) != users**2:
         raise BadInput(
             f"topic {stream.topic}: {len(stream)} score vectors, {len(pairs)} of them of different "
-            f"pairs, for {users} users; every probe must be compared once with every gallery entry"
+            f"pairs, for {users} users; every probe must be compared with every gallery entry exactly "
+            "once"
         )
     scores = np.empty((users, users, len(matchers)))
     scores[probe, gallery] = stream["scores"]

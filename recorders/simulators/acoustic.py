@@ -30,7 +30,12 @@ Place = tuple[float, float]
 
 
 class AcousticParameters(Parameters):
-    """The scenario; the trajectory is anticlockwise from the x axis."""
+    """Shooter, sensors and air.
+
+    `trajectory_deg` is the direction of the shot, anticlockwise from the x axis. Standard deviations
+    are of a sensor's two angles, of the time between shockwave and muzzle blast, and of its own
+    position. A detection is lost with `dropout_probability`; `interval_s` is the time between shots.
+    """
 
     shooter_position_m: Place = (50, 50)
     trajectory_deg: float = 30.0
@@ -88,7 +93,7 @@ def require_time_to_hear(interval_s: float, longest_s: float) -> None:
     if longest_s >= interval_s:
         raise BadInput(
             f"interval_s = {interval_s}: the sound travels {longest_s:.3g} s to the "
-            "farthest sensor; fire less often"
+            "farthest sensor; give a longer interval_s"
         )
 
 

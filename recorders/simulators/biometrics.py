@@ -73,7 +73,13 @@ LOWEST = 0.1
 
 
 class BiometricScoresParameters(Parameters):
-    """The scenario; counts of special users are those of the real 517."""
+    """Users and the special ones among them, whose numbers are those of the real 517.
+
+    Probes come `probe_interval_s` apart on average. The first face matcher fails to enrol
+    `failures_to_enrol` users of the gallery, and the second has low scores for `low_galleries` of them.
+    `poor_fingers_share` is the share of users with poor fingers, and `broken_probes` fingers match
+    nobody.
+    """
 
     users: Annotated[int, Field(ge=20, le=5000)] = 517
     probe_interval_s: PositiveFloat = 1.0

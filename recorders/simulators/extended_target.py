@@ -22,7 +22,11 @@ Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
 class ExtendedTargetParameters(Parameters):
-    """The scenario; a target is (half_x_m, half_y_m, x_m, y_m), its drift what a filter supposes."""
+    """A rectangle, the points that are measured of it, and what a filter assumes.
+
+    `target` is (half_x_m, half_y_m, x_m, y_m), and so is the prior. The drifts are variances that a
+    filter adds per step; the true rectangle has none.
+    """
 
     points: PositiveInt = 150
     step_s: PositiveFloat = 1.0
@@ -76,7 +80,7 @@ def simulate(parameters: ExtendedTargetParameters, rng: np.random.Generator) -> 
 
 
 EXTENDED_TARGET = Simulator(
-    "a rectangle stands still; noisy points of its surface are seen, one at a time",
+    "a rectangle stands still; noisy points of its surface are measured one at a time",
     ExtendedTargetParameters,
     simulate,
 )

@@ -27,7 +27,12 @@ def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
 
 
 class HeadingsParameters(Parameters):
-    """The scenario; standard deviations are those of both angles."""
+    """Two headings that turn each other.
+
+    Per step the first turns by `drift1_rad` + `coupling_rad` times the cosine of the second, the second
+    by `drift2_rad` + `coupling_rad` times the sine of the first. Standard deviations hold for both
+    headings, correlations are between them.
+    """
 
     steps: PositiveInt = 50
     step_s: PositiveFloat = 0.1

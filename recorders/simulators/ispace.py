@@ -24,10 +24,11 @@ Index = Annotated[int, Field(ge=1)]
 
 
 class Node(Parameters):
-    """A node's sensor: which components of the state it measures, how well, and at every how many steps.
+    """The sensor of a node: what it measures, how accurately, and how often.
 
-    It measures at the first step, and then at every so many. `acceleration_density` is what the node's
-    own motion model believes; None is the truth.
+    `components` are those of the state that it measures, `sigmas` their standard deviations in the
+    components' units. It measures at the first step and then at every `every_steps`-th.
+    `acceleration_density` is what the node's own motion model assumes; none means the true one.
     """
 
     components: tuple[str, ...] = ("x_m", "y_m")
@@ -45,7 +46,7 @@ ROOM = (
 
 
 class NodeOutage(Parameters):
-    """A span in which a node neither senses nor sends nor hears; then it is back."""
+    """A span in which a node neither measures nor sends nor receives."""
 
     node: Index
     start_s: NonNegativeFloat
@@ -53,9 +54,13 @@ class NodeOutage(Parameters):
 
 
 class IspaceParameters(Parameters):
-    """The room; links work both ways. With `random_nodes` above 0 the graph is drawn anew for every run.
+    """A room with sensor nodes, the links between them, and the target that moves there.
 
-    A drawn graph is a ring with `random_chords` chords, its nodes have the sensors of `nodes` in turn.
+    Links work in both directions. With `random_nodes` above 0 every run has another graph: a ring of so
+    many nodes with `random_chords` further links, whose nodes have the sensors of `nodes` in turn.
+    `acceleration_density` is the power spectral density of the acceleration in m^2/s^3. A message over
+    a link is lost or doubled with these probabilities, and arrives after `delay_s` and a random time of
+    mean `delay_jitter_s`.
     """
 
     steps: PositiveInt = 100
@@ -137,9 +142,11 @@ def _network(
 def _check(parameters: IspaceParameters, count: int, links: NDArray[np.int64]) -> None:
     named = [*links.ravel(), *(outage.node for outage in parameters.outages)]
     if named and max(named) > count:
-        raise BadInput(f"scenario ispace: a link or outage names node {max(named)}; there are {count}")
+        raise BadInput(
+            f"scenario ispace: a link or outage names node {max(named)}; there are nodes 1 to {count}"
+        )
     if np.any(links[:, 0] == links[:, 1]):
-        raise BadInput("scenario ispace: a link joins a node with itself; leave it out")
+        raise BadInput("scenario ispace: a link leads from a node to itself; leave it out")
     for number, node in enumerate(parameters.nodes, start=1):
         if not set(node.components) <= set(COMPONENTS) or len(node.components) != len(node.sigmas):
             raise BadInput(
@@ -210,7 +217,7 @@ def _outage_streams(parameters: IspaceParameters) -> list[Stream]:
 
 
 ISPACE = Simulator(
-    "a room of networked sensor nodes that follow one moving thing; any graph, losses, delays, outages",
+    "a room of networked sensor nodes that track one moving target; any graph, losses, delays, outages",
     IspaceParameters,
     simulate,
 )

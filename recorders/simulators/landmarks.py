@@ -36,7 +36,13 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
 
 class Sensor(Parameters):
-    """What every sensor of a robot has in common; a rate of zero switches it off."""
+    """What the sensors of a robot have in common.
+
+    A rate of zero switches a sensor off. It sees targets up to `maximum_range_m` within its field of
+    view. An outlier is any value that the sensor can have. An outage lasts for `outage_s`. A message
+    reaches the recorder after `latency_s` and a random time of mean `latency_jitter_s`;
+    `clock_offset_s` is how far the sensor's clock is ahead, `stamp_offset_s` how far its stamps are.
+    """
 
     rate_hz: NonNegativeFloat = 0.0
     maximum_range_m: PositiveFloat = 8.0
@@ -58,7 +64,8 @@ class Sensor(Parameters):
 class Fixes(Parameters):
     """A receiver of positions; a rate of zero switches it off.
 
-    With `origin_deg`, latitude and longitude, it says where on earth it is; else where in the plane.
+    With `origin_deg`, latitude and longitude of the plane's origin, it gives latitudes and longitudes,
+    otherwise positions in the plane. An outage lasts for `outage_s`.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -69,7 +76,12 @@ class Fixes(Parameters):
 
 
 class LandmarksParameters(Parameters):
-    """The scenario; noise densities are per square root of a second."""
+    """Robots in a square arena with landmarks, their odometry and their sensors.
+
+    Noise densities of the odometry are per square root of a second: `forward_noise_density` in m,
+    `turn_noise_density` in rad. `forward_scale_error` is the share by which it reports too much, and
+    `turn_bias_radps` is added to its turn rate.
+    """
 
     duration_s: PositiveFloat = 60.0
     robots: PositiveInt = 1

@@ -20,11 +20,12 @@ Floats = NDArray[np.float64]
 
 
 class ManoeuvresParameters(Parameters):
-    """The scenario.
+    """A vehicle that drives straight, turns, stops and starts, and its position fixes.
 
-    Straights and stands have lengths of an exponential distribution with these means; a turn is by a
-    sixth to five twelfths of a circle, either way. `acceleration_sigma_mps2` is what the prior's channel
-    states of driving straight on; the truth has none of it.
+    The lengths of straight parts and of stops are exponentially distributed with the means `straight_s`
+    and `standing_s`. A turn is by a sixth to five twelfths of a circle to either side.
+    `acceleration_sigma_mps2` is what the prior's channel states for driving straight; the truth has no
+    such acceleration.
     """
 
     duration_s: PositiveFloat = 120.0

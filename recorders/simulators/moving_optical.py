@@ -38,11 +38,14 @@ FIRST_S = 0.5  # before the first sighting, and so before any clock that is off
 
 
 class MovingOpticalParameters(Parameters):
-    """The scenario; densities are per square root of hertz, sigmas those from which truth is drawn.
+    """Sensors on aircraft, targets, and the errors of attitudes and clocks.
 
-    Every sensor sees a target `sightings_hz` times a second, one after the other. It weaves sideways by
-    `weave_m` to both sides, and turns with its course. The clock of the first is right; the others' are
-    off by `clock_sigma_s`. With `known_sigma_m` the first target tells where it is, once a second.
+    Every sensor sees a target `sightings_hz` times a second, one after the other. It weaves by
+    `weave_m` to both sides and turns with its course. True biases of attitude have the standard
+    deviation `bias_sigma_rad` and drift by `bias_drift` (rad per square root of a second); the true
+    clock of every sensor but the first is off by a time of standard deviation `clock_sigma_s`.
+    `acceleration_density` is in m/s^2 per square root of hertz. With `known_sigma_m` the first target
+    reports its position once a second.
     """
 
     duration_s: Annotated[float, Field(gt=1)] = 60.0
@@ -80,7 +83,7 @@ def simulate(parameters: MovingOpticalParameters, rng: np.random.Generator) -> R
     sensors = len(parameters.sensor_position_m)
     if len(parameters.weave_m) != sensors:
         raise BadInput(
-            f"weave_m has {len(parameters.weave_m)} numbers for {sensors} sensors; give one each"
+            f"weave_m has {len(parameters.weave_m)} numbers for {sensors} sensors; give one for each"
         )
     start_rng, course_rng, schedule_rng, noise_rng = rng.spawn(4)
     period_s = 1.0 / parameters.sightings_hz

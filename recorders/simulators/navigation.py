@@ -28,11 +28,13 @@ GRID_S = 0.05  # between the knots of the path
 
 
 class Unit(Parameters):
-    """The grade of an inertial unit; that of a small one, as telephones have, unless given.
+    """The errors of an inertial unit; without settings those of a telephone's.
 
-    Noise densities are per square root of hertz, those of the biases' random walks per square root of a
-    second; the first biases, errors of scale and misalignments of the axes are drawn with their standard
-    deviations. A quantum of zero rounds nothing.
+    Noise densities are per square root of hertz, in m/s^2 and rad/s; the densities of the biases'
+    random walks are per square root of a second, in the same units. The biases at the start, the errors
+    of scale (a share) and the misalignments of the axes are drawn with their standard deviations.
+    Values are rounded to multiples of the quantum, where it is above zero. Samples are stamped
+    `delay_s` late.
     """
 
     rate_hz: PositiveFloat = 100.0
@@ -50,11 +52,13 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """A GNSS receiver: rates and standard deviations, horizontal and up.
+    """A GNSS receiver: rates, standard deviations (horizontal and up), and its weak times.
 
-    It is silent during `outages_s` and reports float solutions during `floats_s`, spans of begin and
-    end: these err `float_factor` times as much, and say so. During `multipath_s` positions are off by
-    `multipath_m`, which it does not say. A velocity rate of zero leaves velocities out.
+    It is silent during `outages_s`, a list of [begin, end] in s, and has float solutions during
+    `floats_s`: their errors are `float_factor` times larger, as their covariance states. During
+    `multipath_s` positions are off by `multipath_m` (east, north, up), which the covariance does not
+    state. `lever_m` is the antenna's position in the body. Positions and velocities are stamped late by
+    their delays. A velocity rate of zero leaves velocities out.
     """
 
     rate_hz: PositiveFloat = 5.0
@@ -74,11 +78,11 @@ class Receiver(Parameters):
 
 
 class Carried(Parameters):
-    """What else is on board: rates, of which zero leaves a sensor out, and standard deviations.
+    """Further sensors on board, with their rates and standard deviations; a rate of zero leaves one out.
 
-    Wheels at the axle measure one and their error of scale, drawn with its standard deviation, times how
-    fast it moves forward. A compass tells the orientation, of which the heading errs, a barometer the
-    height.
+    Wheels measure the forward speed at the axle (`axle_m` in the body), times 1 plus an error of scale
+    that is drawn with `wheel_scale_sigma`. A compass measures the orientation with an error of heading,
+    a barometer the height.
     """
 
     wheel_rate_hz: NonNegativeFloat = 0.0
@@ -92,7 +96,10 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """Standard deviations of what is told of the start; the biases' are the unit's."""
+    """The prior of the log: standard deviations of position, velocity, tilt and heading at the start.
+
+    Those of the biases are the unit's. With `is_told = false` the log has no prior.
+    """
 
     is_told: bool = True
     sigma_m: PositiveFloat = 0.5
@@ -102,11 +109,12 @@ class Prior(Parameters):
 
 
 class NavigationParameters(Parameters):
-    """The scenario: what moves, along which way-points (east, north, up, in m), and its sensors.
+    """What moves, where, and its sensors.
 
-    Without way-points they are drawn at random, a leg of `leg_s` apart. A person sways and bobs with
-    each step and turns to both sides of the way; a quadrotor leans into its acceleration and looks where
-    it likes.
+    `way_points_m` (east, north, up) are the path; without any they are drawn at random, `leg_s` seconds
+    apart. The body rests for `rest_s` first. A person sways, bobs with each step and turns to both
+    sides of the path; a quadrotor leans into its acceleration and may look in any direction. The origin
+    is that of the plane, on the WGS 84 ellipsoid.
     """
 
     carrier: Literal["vehicle", "pedestrian", "quadrotor"] = "vehicle"
@@ -188,7 +196,10 @@ def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
     if not len(points):
         points = _random_points(parameters, rng)
     if len(points) < 3:
-        raise BadInput(f"way_points_m has {len(points)} points; give three or more, east, north and up")
+        raise BadInput(
+            f"way_points_m has {len(points)} points; give three points or more, each of east, north "
+            "and up"
+        )
     begin_s, end_s = parameters.rest_s, parameters.duration_s
     knots_s = np.linspace(begin_s, end_s, len(points))
     still = [(1, np.zeros(3)), (2, np.zeros(3))]

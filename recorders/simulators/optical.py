@@ -26,10 +26,11 @@ Triples = Annotated[list[Triple], Field(min_length=1)]
 
 
 class OpticalParameters(Parameters):
-    """The scenario; attitudes and biases are yaw, pitch and roll of each sensor.
+    """Sensors, targets and what is seen.
 
-    The targets are seen in turn every `interval_s`, or with `all_at_once` together; this is one pass. A
-    sensor sees what lies inside a cone of `field_of_view_deg` around the middle of the targets.
+    Attitudes and biases are yaw, pitch and roll of each sensor, in deg. The targets are seen one after
+    the other, `interval_s` apart, or all at once with `all_at_once`; that is one of `passes`. A sensor
+    sees what is inside a cone of `field_of_view_deg` about the middle of the targets.
     """
 
     sensor_position_m: Triples = [(-5500, 950, 15), (-230, 2720, 45), (5900, 50, 20)]

@@ -21,10 +21,11 @@ from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class Noise(Parameters):
-    """A distribution on the unit vectors, along the components of a complex number or quaternion.
+    """A distribution of unit vectors, along the components of a complex number or quaternion.
 
-    `diagonal` are the concentrations of a Bingham distribution, 0 for its mode and at most 0 else; or
-    the variances of a Gaussian about the identity (1, 0, ...), whose samples are scaled to unit length.
+    `diagonal` are the concentrations of a Bingham distribution: 0 for its mode, at most 0 for the
+    others. For a Gaussian they are variances about the identity (1, 0, ...), and its samples are scaled
+    to unit length.
     """
 
     distribution: Literal["bingham", "gaussian"] = "bingham"
@@ -35,9 +36,11 @@ class Noise(Parameters):
         if len(self.diagonal) not in (2, 4):
             raise ValueError("give 2 numbers for an axis, 4 for an orientation")
         if self.distribution == "bingham" and max(self.diagonal) != 0.0:
-            raise ValueError("Bingham concentrations are 0 for the mode and at most 0 else")
+            raise ValueError(
+                "Bingham concentrations must be 0 for the mode and at most 0 for the others"
+            )
         if self.distribution == "gaussian" and min(self.diagonal) < 0.0:
-            raise ValueError("variances are not negative")
+            raise ValueError("variances must not be negative")
         return self
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -63,10 +66,10 @@ class AxisParameters(Parameters):
         sizes = [len(self.start), *(len(each.diagonal) for each in (self.prior, self.system))]
         if sizes != [len(self.measurement.diagonal)] * 3 or sizes[0] != self.dimension():
             raise ValueError(
-                f"start, prior, system and measurement have {self.dimension()} numbers each"
+                f"start, prior, system and measurement must have {self.dimension()} numbers each"
             )
         if not np.isclose(np.linalg.norm(self.start), 1.0, rtol=0.0, atol=1e-9):
-            raise ValueError("start has unit length")
+            raise ValueError("start must have unit length")
         return self
 
     @classmethod

@@ -25,9 +25,9 @@ POSE = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "turn_radps")
 
 
 class Blocked(Parameters):
-    """Lines of sight that are blocked: how often, for how long on average, and by how much ranges grow.
+    """Blocked lines of sight: how often, how long on average, and by how much ranges become longer.
 
-    An anchor is blocked for all tags at once; the excess is uniform between its limits.
+    An anchor is blocked for all tags at once. The excess is uniform between `least_m` and `most_m`.
     """
 
     times_per_minute: NonNegativeFloat = 0.0
@@ -37,10 +37,12 @@ class Blocked(Parameters):
 
 
 class RangingParameters(Parameters):
-    """The scenario; densities are per square root of hertz, the prior's standard deviations the model's.
+    """Anchors, the tags on a trolley, its motion, and the errors of ranges.
 
-    Anchors and tags are numbered from 0 on; all tags range to all anchors at once. Channels state the
-    white noise, and neither the bias nor the errors that last.
+    Anchors and tags are numbered from 0; all tags measure ranges to all anchors at once. The densities
+    of the accelerations are in m/s^2 and rad/s^2 per square root of hertz. A range has white noise
+    (`sigma_range_m`), a common bias, and for every pair an error of standard deviation `error_sigma_m`
+    that lasts for about `error_time_s`. Channels state the white noise alone.
     """
 
     duration_s: Annotated[float, Field(gt=0)] = 60.0

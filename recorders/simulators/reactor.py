@@ -20,7 +20,7 @@ Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
 class ReactorParameters(Parameters):
-    """The scenario; variances are per time step."""
+    """Partial pressures of a gas reaction; variances are per time step."""
 
     steps: PositiveInt = 50
     step_s: PositiveFloat = 0.1
@@ -41,8 +41,9 @@ def simulate(parameters: ReactorParameters, rng: np.random.Generator) -> Recordi
             state[step + 1] = np.array(react(state[step], parameters.step_s)) + noise[step]
     if not np.isfinite(state).all():
         raise BadInput(
-            f"start = {parameters.start}, step_s = {parameters.step_s:g}: the reaction runs away; "
-            "start at pressures from 0 on, and take shorter or fewer steps"
+            f"start = {parameters.start}, step_s = {parameters.step_s:g}: the pressures grow without "
+            "bound; "
+            "start at pressures from 0 on, and give shorter or fewer steps"
         )
     (total,) = total_pressure(state[1:].T)
     read = total + rng.normal(size=parameters.steps) * np.sqrt(parameters.pressure_variance)

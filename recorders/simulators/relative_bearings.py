@@ -21,10 +21,11 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """The scene: that of section V (noise-free, its first pairs), or one drawn from squares.
+    """The scene of section V of the paper (without noise, its first pairs), or random scenes.
 
-    Landmarks are within `spread_m` of the middle in x and in y, the robot within `robot_spread_m`.
-    A misidentified pair takes another landmark for its first one.
+    In a random scene landmarks are within `spread_m` of the middle in x and in y, and the robot within
+    `robot_spread_m`. An error is uniform within `error_share` of `bound_deg`. A misidentified pair has
+    another landmark in place of its first one.
     """
 
     scene: Literal["section-v", "random"] = "section-v"
@@ -57,7 +58,9 @@ def simulate(parameters: RelativeBearingsParameters, rng: np.random.Generator) -
         first, second = np.triu_indices(parameters.landmarks, 1)
         error_rad = parameters.error_share * bound_rad
     if np.any(np.all(places == robot, axis=1)):
-        raise BadInput("scenario relative-bearings: the robot stands on a landmark")
+        raise BadInput(
+            "scenario relative-bearings: the robot is at the position of a landmark; move one of them"
+        )
     count = len(first)
     looks = np.repeat(np.arange(parameters.looks), count)
     wrong = rng.uniform(size=len(looks)) < parameters.misidentified_probability

@@ -23,10 +23,11 @@ Point = tuple[float, float, float]
 
 
 class SoundSourceParameters(Parameters):
-    """The scenario. The signal-to-noise ratio is that at the nearest microphone, in the band.
+    """Microphones and a sound.
 
-    The source is anywhere in a box about the microphones' middle, `reach_m` to each side; it is in their
-    plane where they all are at one height.
+    The signal-to-noise ratio is that at the nearest microphone, in the band. The source is in a box
+    about the middle of the microphones, `reach_m` to each side; if all microphones have one height, it
+    has that height too.
     """
 
     microphones_m: Annotated[list[Point], Field(min_length=3)] = [
@@ -49,8 +50,9 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
     low, high = parameters.band_hz
     if not low < high <= 0.5 * parameters.rate_hz:
         raise BadInput(
-            f"band_hz = [{low:g}, {high:g}]: give a lower and a higher frequency, the latter no more "
-            f"than half of rate_hz = {parameters.rate_hz:g}"
+            f"band_hz = [{low:g}, {high:g}]: give a lower and a higher frequency, the higher one at "
+            "most "
+            f"half of rate_hz = {parameters.rate_hz:g}"
         )
     places = np.array(parameters.microphones_m)
     source = places.mean(axis=0) + parameters.reach_m * rng.uniform(-1.0, 1.0, 3)

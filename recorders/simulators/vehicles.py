@@ -39,14 +39,14 @@ POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Delayed(Parameters):
-    """How late messages reach the recorder: a fixed part, and one that is exponential."""
+    """How late messages arrive: by `latency_s` and a random time of mean `latency_jitter_s`."""
 
     latency_s: NonNegativeFloat = 0.0
     latency_jitter_s: NonNegativeFloat = 0.0
 
 
 class Fixes(Delayed):
-    """The vehicles' own positioning, equal in both axes."""
+    """The position fixes of the vehicles; the variance is that of each axis."""
 
     rate_hz: PositiveFloat = 1.0
     variance_m2: PositiveFloat = 0.5
@@ -54,7 +54,7 @@ class Fixes(Delayed):
 
 
 class Scans(Delayed):
-    """What reaches the reader of unordered scans; false detections are uniform over the field."""
+    """Unordered scans; false detections are uniform over the field, with this mean number per scan."""
 
     detection_probability: Detected = 1.0
     clutter_per_scan: NonNegativeFloat = 0.0
@@ -69,12 +69,12 @@ class Infrastructure(Scans):
 
 
 class VehiclesParameters(Parameters):
-    """The scenario.
+    """Vehicles in the plane, and who detects them.
 
-    `start` are the vehicles' states (x, vx, y, vy); `vehicles`, where it is not zero, has so many start
-    anywhere in the field instead. The truth is without noise unless `stochastic`: then starts are drawn
-    from the prior, and accelerations of `acceleration_sigma_mps2` hold for `step_s` each. Filters
-    suppose both in any case. `field_m` is (least x, greatest x, least y, greatest y).
+    `start` are the states (x, vx, y, vy) of the vehicles in m and m/s; if `vehicles` is not zero, so
+    many start anywhere in the field instead. The truth has no noise unless `stochastic` is set: then
+    starts are drawn from the prior, and an acceleration of `acceleration_sigma_mps2` holds for each
+    `step_s`. Filters assume both in any case. `field_m` is (least x, greatest x, least y, greatest y).
     """
 
     duration_s: PositiveFloat = 100.0
@@ -183,7 +183,9 @@ def _drive(parameters: VehiclesParameters, rng: np.random.Generator) -> Drive:
     count = len(start)
     rates = np.array(parameters.turn_rate_radps or (0.0,) * count)
     if len(rates) != count:
-        raise BadInput(f"turn_rate_radps has {len(rates)} entries for {count} vehicles; give one each")
+        raise BadInput(
+            f"turn_rate_radps has {len(rates)} entries for {count} vehicles; give one for each"
+        )
     steps = max(1, int(np.ceil(parameters.duration_s / parameters.step_s - 1e-9)))
     accelerations = rng.normal(size=(steps, count, 2)) * parameters.acceleration_sigma_mps2
     disturbance = rng.normal(size=(count, 4)) * np.sqrt(parameters.prior_variance)
@@ -339,7 +341,7 @@ def _clocks(sensor: Delayed, times_s: Floats, rng: np.random.Generator) -> tuple
 
 
 VEHICLES = Simulator(
-    "vehicles tell a network their fixes; an infrastructure sensor of unknown pose sees them, unordered",
+    "vehicles send fixes to a network; a roadside sensor of unknown pose detects them, unordered",
     VehiclesParameters,
     simulate,
 )

@@ -44,12 +44,13 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
     d = z.shape[-1] if z.ndim else 0
     if d not in (2, 4) or axes.shape[-2:] != (d, d):
         raise BadInput(
-            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d), (..., d), d 2 or 4"
+            f"Bingham axes {axes.shape}, concentrations {z.shape}; give (..., d, d) and (..., d) with "
+            "d = 2 or 4"
         )
     if not np.isfinite(z).all():
-        raise BadInput("Bingham concentrations must be finite; give numbers, 0 for no concentration")
+        raise BadInput("Bingham concentrations must be finite; give finite numbers, 0 for none")
     if not np.allclose(axes @ np.swapaxes(axes, -1, -2), np.eye(d), rtol=0.0, atol=1e-9):
-        raise BadInput("Bingham axes must be orthonormal columns; orthonormalise them")
+        raise BadInput("Bingham axes must be orthonormal columns; give such a matrix")
     shape = np.broadcast_shapes(axes.shape[:-1], z.shape)
     order = np.argsort(np.broadcast_to(z, shape), axis=-1, kind="stable")
     z = np.take_along_axis(np.broadcast_to(z, shape), order, -1)
@@ -193,7 +194,7 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
     """
     variance, axes = np.linalg.eigh(_symmetric(gaussian_covariance, "Gaussian covariance"))
     if variance[0] < -1e-12 * variance[-1]:
-        raise BadInput("a Gaussian covariance has no negative eigenvalues; give such a matrix")
+        raise BadInput("a Gaussian covariance must have no negative eigenvalues; give such a matrix")
     variance = np.maximum(variance, 0.0)
     along = np.asarray(mean, float) @ axes
     log_t, step = np.linspace(-40.0, 80.0, 1201, retstep=True)

@@ -72,7 +72,9 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
     are fewer than ten angles a component.
     """
     if len(angles) < 10 * components:
-        raise BadInput(f"{len(angles)} pairs of angles for {components} components; give 10 for each")
+        raise BadInput(
+            f"{len(angles)} pairs of angles for {components} components; give at least 10 for each"
+        )
     embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
     labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]

@@ -62,12 +62,13 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
             "give (..., 2) and (..., 2, 2)"
         )
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        raise BadInput("mean and covariance of a wrapped normal must be finite; give numbers")
+        raise BadInput("mean and covariance of a wrapped normal must be finite; give finite numbers")
     if not np.allclose(
         covariance[..., 0, 1], covariance[..., 1, 0], rtol=1e-9, atol=0.0
     ) or not _is_definite(covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]):
         raise BadInput(
-            "the covariance of a wrapped normal must be symmetric and positive definite; mend it"
+            "the covariance of a wrapped normal must be symmetric and positive definite; give such a "
+            "matrix"
         )
     return WrappedNormal(wrap_angle(mean), covariance)
 
@@ -105,7 +106,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
     """
     require_central_weight(central_weight)
     if not np.all(np.abs(moments.correlation) <= 1.0):
-        raise BadInput("a circular correlation lies in [-1, 1]; check the moments")
+        raise BadInput("a circular correlation must lie in [-1, 1]; check the moments")
     a, b, w1, w3 = kernels.diracs(
         moments.variance[..., 0], moments.variance[..., 1], moments.correlation, central_weight
     )
@@ -117,7 +118,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 def require_central_weight(central_weight: float) -> None:
     """BadInput where w5 is not in [0, 1/2], where the five samples have real positions for every m_1."""
     if not 0.0 <= central_weight <= 0.5:
-        raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, .2 is the paper's")
+        raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, such as 0.2, the paper's")
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:

@@ -53,8 +53,9 @@ class Bundle:
         origin = getattr(value, "__qualname__", "<locals>")
         if literal is None and "<locals>" in origin and not isinstance(value, FunctionType | ModuleType):
             raise BadInput(
-                f"a kernel uses '{name}', a {type(value).__name__}, which is neither function, number "
-                "nor tuple, nor can be imported by name: hand it in as an argument"
+                f"a kernel uses '{name}', a {type(value).__name__}, which is neither a function, a "
+                "number "
+                "nor a tuple, and cannot be imported by name: pass it as an argument"
             )
         key = value if literal is None else (name, literal)
         if key not in self._names:
@@ -70,8 +71,8 @@ class Bundle:
         elif isinstance(value, ModuleType):
             if value.__name__.partition(".")[0] not in _VERSIONED:
                 raise BadInput(
-                    f"a kernel uses the module {value.__name__}: import what it needs of it by name, "
-                    "so that a change there is noticed"
+                    f"a kernel uses the module {value.__name__}: import what it needs by name, "
+                    "so that a change in the module is noticed"
                 )
             definition = f"import {value.__name__} as {_NAME}"
         elif literal is not None:
@@ -175,12 +176,15 @@ def _definition(function: FunctionType) -> ast.FunctionDef:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError) as error:
         raise BadInput(
-            f"the source of {function.__qualname__} is not at hand ({error}); "
+            f"the source of {function.__qualname__} cannot be found ({error}); "
             "define it as a function in a file"
         ) from error
     definition = tree.body[0]
     if not isinstance(definition, ast.FunctionDef):
-        raise BadInput(f"{function.__qualname__} is no `def` function; kernels are made of these")
+        raise BadInput(
+            f"{function.__qualname__} is not a `def` function, of which kernels are made; write it as "
+            "one"
+        )
     definition.decorator_list = []
     if ast.get_docstring(definition) is not None:
         definition.body = definition.body[1:]

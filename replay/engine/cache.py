@@ -56,7 +56,7 @@ def is_private(folder: Path) -> bool:
             return False
         if status.st_mode & _OTHERS_MAY_WRITE:
             say_once(
-                f"the cache {place} is not used: other users may write to it; chmod go-w mends that"
+                f"the cache {place} is not used: other users may write to it; chmod go-w forbids them"
             )
             return False
     return True

@@ -36,7 +36,9 @@ def _number(topic: str, name: str, text: str, parameters: type[Parameters] | Non
     try:
         value = float(text)
     except ValueError:
-        raise BadInput(f"topic {topic} states {name} = {text}, which is no number") from None
+        raise BadInput(
+            f"topic {topic} states {name} = {text}, which is not a number; state a number"
+        ) from None
     if parameters is not None:
         build(parameters, {name: value}, f"topic {topic}")
     return value

@@ -152,7 +152,10 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
     """
     if not re.fullmatch(r"[\w:=-]+", label):
-        raise BadInput(f"estimator '{label}': a label is made of letters, digits and '-', '_', ':', '='")
+        raise BadInput(
+            f"estimator '{label}': a label may have letters, digits and '-', '_', ':', '=' alone; "
+            "choose another"
+        )
     values = dict(settings)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))

@@ -104,7 +104,7 @@ def _reasons(stream: Stream) -> list[str]:
         reasons = None
     if not isinstance(reasons, list) or not all(isinstance(reason, str) for reason in reasons):
         raise BadInput(
-            f"topic {stream.topic}: its reasons are no JSON list of sentences; replay the log again "
+            f"topic {stream.topic}: its reasons are not a JSON list of sentences; replay the log again "
             "with this version of fuselog"
         )
     return reasons

@@ -8,9 +8,10 @@ import pickle
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from hashlib import sha256
 from importlib.metadata import version
+from multiprocessing import parent_process
 from pathlib import Path
 from threading import Timer
 from types import ModuleType, SimpleNamespace
@@ -131,7 +132,7 @@ def _compiling(title: str) -> Iterator[None]:
     numba makes an error of every type that does not fit and tries the next; colours of these, which are
     there where colorama is installed, take a thirtieth.
     """
-    patience = Timer(_PATIENCE_S, _LOG.info, (f"compiling {title}, once",))
+    patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
     patience.daemon = True
     collecting = gc.isenabled()
     colours = errors._termcolor_inst  # type: ignore[attr-defined]
@@ -145,6 +146,22 @@ def _compiling(title: str) -> Iterator[None]:
         errors._termcolor_inst = colours  # type: ignore[attr-defined]
         if collecting:
             gc.enable()
+
+
+def _say(sentence: str) -> None:
+    """By the program's logging, as the command line sets it up; else on standard error, each once.
+
+    Not from a worker process, whose parent is what somebody watches.
+    """
+    if _LOG.hasHandlers():
+        _LOG.info(sentence)
+    elif parent_process() is None:
+        _print_once(sentence)
+
+
+@cache
+def _print_once(sentence: str) -> None:
+    print(f"fuselog: {sentence}", file=sys.stderr, flush=True)
 
 
 def _described(kind: Any) -> str:

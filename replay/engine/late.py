@@ -60,7 +60,7 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
         )
     if policy == "drop":
         if text != policy:
-            raise BadInput(f"--late {text}: what is dropped needs no seconds; give drop")
+            raise BadInput(f"--late {text}: drop takes no seconds; give --late drop")
         return Late(policy, 0)
     try:
         window_s = float(seconds)
@@ -78,14 +78,14 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
     """
     if not isinstance(bound, Recursive):
         raise BadInput(
-            f"estimator {bound.name}: solves for all messages at once, so that none is late; "
+            f"estimator {bound.name}: solves for all messages at once, so that none can be late; "
             "leave out --late"
         )
     if late.policy == "rewind":
         if bound.rewinding is None:
             raise BadInput(
-                f"estimator {bound.name}: only estimators that are made of a model and a method can go "
-                "back; give --late drop or --late wait:SECONDS"
+                f"estimator {bound.name}: only an estimator made of a model and a method can go "
+                "back to a late message; give --late drop or --late wait:SECONDS"
             )
         bound = bound.rewinding(late.window_ns)
     return replace(

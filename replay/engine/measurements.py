@@ -110,7 +110,7 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
     if width == size:
         return stream[covariance][:, :, None] * np.eye(size)
     raise BadInput(
-        f"topic {stream.topic}: {covariance} has {width} numbers, {size**2} are needed for the {size} "
+        f"topic {stream.topic}: {covariance} has {width} numbers; {size**2} are needed for the {size} "
         f"of {field}"
     )
 
@@ -167,7 +167,7 @@ def check_width(stream: Stream, field: str, width: int) -> None:
     """Raise BadInput where a vector field does not have so many numbers."""
     if len(stream) and stream[field].shape[1] != width:
         raise BadInput(
-            f"topic {stream.topic}: {field} has {stream[field].shape[1]} numbers, {width} are needed"
+            f"topic {stream.topic}: {field} has {stream[field].shape[1]} numbers; {width} are needed"
         )
 
 

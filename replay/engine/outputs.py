@@ -149,6 +149,14 @@ class Outputs:
             made.append(self._innovations_of_block(messages, results))
         return [*made, *self._further_of_block(messages, results.further)]
 
+    def of_skipped(self, skipped: Skipped) -> list[Ragged]:
+        """What was not used, for estimators of what may lack a covariance."""
+        if not any(skipped.reasons):
+            return []
+        topic = f"{self.topic}/skipped"
+        stream = reason_stream(topic, schemas.SKIPPED, skipped.time_ns, skipped.reason, skipped.reasons)
+        return [Ragged(stream, skipped.offsets)]
+
     def of_solved(self, solved: Solved, runs: int) -> list[Ragged]:
         """The outputs of a batch."""
         made = [failures_by_run(self.topic, solved.failures, runs)]
@@ -160,6 +168,31 @@ class Outputs:
             nothing = next(iter(found.values())).take(slice(0, 0))
             made.append(gather([found.get(run, nothing) for run in range(runs)]))
         return made
+
+    def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
+        rows = np.flatnonzero(np.isfinite(results.squared))
+        stream = innovation_stream(
+            f"{self.topic}/innovation",
+            messages.time_ns[rows],
+            self.measured,
+            self.truth,
+            target_id=results.target[rows],
+            accepted=results.accepted[rows],
+            innovation=results.innovation[rows],
+            covariance=results.innovation_covariance[rows],
+            squared=results.squared[rows],
+        )
+        return Ragged(stream, np.searchsorted(rows, messages.offsets))
+
+    def _further_of_block(self, messages: Messages, told: Floats) -> Iterator[Ragged]:
+        first = 0
+        for name, schema in self.further.items():
+            names = [field.name for field in schema.fields[1:]]
+            own, first = told[:, first : first + len(names)], first + len(names)
+            rows = np.flatnonzero(np.isfinite(own[:, 0]))
+            columns = dict(zip(names, own[rows].T, strict=True))
+            stream = make_stream(f"{self.topic}/{name}", schema, messages.time_ns[rows], **columns)
+            yield Ragged(stream, np.searchsorted(rows, messages.offsets))
 
     def _of_run(self, estimates: Estimates) -> Iterator[Stream]:
         """What is said of one run, in streams; raises BadInput where a shape is wrong."""
@@ -213,42 +246,9 @@ class Outputs:
             if array.shape != wanted:
                 raise BadInput(
                     f"estimator {self.name}: {part}{name} has the shape {array.shape}; "
-                    f"{wanted} is wanted"
+                    f"{wanted} is needed"
                 )
         return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
-
-    def of_skipped(self, skipped: Skipped) -> list[Ragged]:
-        """What was not used, for estimators of what may lack a covariance."""
-        if not any(skipped.reasons):
-            return []
-        topic = f"{self.topic}/skipped"
-        stream = reason_stream(topic, schemas.SKIPPED, skipped.time_ns, skipped.reason, skipped.reasons)
-        return [Ragged(stream, skipped.offsets)]
-
-    def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
-        rows = np.flatnonzero(np.isfinite(results.squared))
-        stream = innovation_stream(
-            f"{self.topic}/innovation",
-            messages.time_ns[rows],
-            self.measured,
-            self.truth,
-            target_id=results.target[rows],
-            accepted=results.accepted[rows],
-            innovation=results.innovation[rows],
-            covariance=results.innovation_covariance[rows],
-            squared=results.squared[rows],
-        )
-        return Ragged(stream, np.searchsorted(rows, messages.offsets))
-
-    def _further_of_block(self, messages: Messages, told: Floats) -> Iterator[Ragged]:
-        first = 0
-        for name, schema in self.further.items():
-            names = [field.name for field in schema.fields[1:]]
-            own, first = told[:, first : first + len(names)], first + len(names)
-            rows = np.flatnonzero(np.isfinite(own[:, 0]))
-            columns = dict(zip(names, own[rows].T, strict=True))
-            stream = make_stream(f"{self.topic}/{name}", schema, messages.time_ns[rows], **columns)
-            yield Ragged(stream, np.searchsorted(rows, messages.offsets))
 
 
 def _last_of_stamps(messages: Messages, rows: Integers) -> Integers:

@@ -106,7 +106,9 @@ def recursive(
     [5.0, 3.0, 3.0]
     """
     if (follow is None) == (follow_all is None):
-        raise BadInput(f"estimator '{summary}': give follow or follow_all")
+        raise BadInput(
+            f"estimator '{summary}': neither follow nor follow_all is given; give one of them"
+        )
     for leaf, schema in outputs.items():
         _require_numbers(summary, leaf, schema)
 

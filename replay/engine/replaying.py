@@ -202,7 +202,7 @@ def _refuse_old_priors(
             if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(
                     f"{ensemble[run].name}: the replay would start {bound.name} from {topic}, which is "
-                    f"{(start_ns - int(times_ns[0])) * 1e-9:g} s older than its span; say what "
+                    f"{(start_ns - int(times_ns[0])) * 1e-9:g} s before the span; say what "
                     "to start from with --start-from truth or --start-from ESTIMATES"
                 )
 

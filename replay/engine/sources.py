@@ -301,8 +301,9 @@ class Ensemble(list[SourceType]):
                 there = source.topics.get(topic)
                 if there is None or (there.schema_name, there.metadata) != stated:
                     raise BadInput(
-                        f"{source.name}: topic {topic} is not as in {first.name}; the runs of an "
-                        "ensemble hold the same topics, replay this one on its own"
+                        f"{source.name}: topic {topic} differs from that of {first.name}; the runs of "
+                        "an "
+                        "ensemble have the same topics and types, so replay this one on its own"
                     )
             self._alike.add(topic)
 

@@ -253,7 +253,9 @@ def _check(setting: Setting, heard: Detections) -> None:
                 "give (runs, sensors), and (runs, sensors, 2) positions"
             )
     if min(setting.noise) <= 0.0:
-        raise BadInput(f"acoustic noise {setting.noise} must be positive; give standard deviations")
+        raise BadInput(
+            f"acoustic noise {setting.noise} must be positive; give standard deviations above zero"
+        )
 
 
 def _blocks(residual: list, jacobian: list, covariance: list, slope: list | None = None) -> _Blocks:

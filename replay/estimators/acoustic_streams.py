@@ -25,7 +25,7 @@ from replay.estimators.solutions import (
 
 
 class ShooterParameters(Parameters):
-    """What the sensors send, and whether their positions are estimated along; see `Setting`."""
+    """What the sensors send, and whether their own positions are estimated too."""
 
     mode: Mode = Mode.NATIVE_MEASUREMENTS
     estimate_sensors: bool = True
@@ -43,7 +43,9 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
         return []
     worlds = {_world(topics[f"/sensor{s}/detections"]) for s in sensors}
     if len(worlds) > 1:
-        raise BadInput(f"estimator {name}: the sensors state different noise or air; give them the same")
+        raise BadInput(
+            f"estimator {name}: the sensors state different noise or air temperature; give all the same"
+        )
     noise, medium = worlds.pop()
     setting = Setting(
         parameters.mode, noise, medium, parameters.estimate_sensors, parameters.cross_covariances

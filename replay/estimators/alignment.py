@@ -44,20 +44,21 @@ _NS = 1e-9
 
 
 class AlignmentParameters(ModelParameters):
-    """What is taken for rest and for a course, and how well the start is known then.
+    """How the unit is mounted and delayed, and how the state at the start is found.
 
-    The unit is levelled by its first `level_s`. The body rests until `rest_margin_s` before it first
-    moves faster than `still_mps`. Its heading is the course at the first speed above `course_mps`, less
-    what the gyro has turned until then; where there is none, the heading is unknown. Standard deviations
-    are of the first position, its velocity, one that nothing measures, the tilt, the heading and the
-    biases. Those that are not given are found: position and velocity are so little known that their own
-    first messages, used like any other, are what counts; the tilt is as uncertain as the
-    accelerometer's bias, with which it goes, and the motion make it; the gyro's bias as its mean over
-    the rest; the heading as the course of the first `course_s` differs from what the gyro turned.
+    Tilt comes from the first `level_s` seconds. The body is assumed to rest until `rest_margin_s`
+    before it first moves faster than `still_mps`. The heading is the course at the first speed above
+    `course_mps`, less the turn of the gyro until then; without such a speed it is unknown. The standard
+    deviations of the start are `start_sigma_m` of the position, `start_sigma_mps` of a velocity that is
+    measured and `unmeasured_sigma_mps` of one that is not, `tilt_sigma_rad`, `heading_sigma_rad`, and
+    those of the biases. Those that are not given come from the data: position and velocity start so
+    uncertain that their first messages, used like any other, decide; the tilt is as uncertain as the
+    accelerometer's bias and the motion make it; the gyro's bias as its mean over the rest; the heading
+    as much as the course of the first `course_s` differs from the turn of the gyro.
 
-    The mounting turns the unit's axes into forward, left, up: by yaw about up, of pitch about left, of
-    roll about forward. An axis measures 1 + its scale times what is there, and the bias. A message was
-    measured its topic's delay before its stamp.
+    The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
+    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias. A message
+    was measured its topic's delay before its stamp.
     """
 
     mounting_roll_rad: float = 0.0
@@ -140,7 +141,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     """
     samples, topic = _samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
-        raise BadInput(f"no position to begin {topic} at; give a topic of fixes")
+        raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
     start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
     moving, how = _moving(streams, parameters), "levelled, its heading unknown"
     mean, covariance = np.zeros(16), np.zeros((15, 15))
@@ -215,7 +216,7 @@ def _samples(inertial: Stream, parameters: Any) -> _Samples:
     ]
     finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
     if not finite.any():
-        raise BadInput(f"topic {inertial.topic}: no samples to begin with")
+        raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / _NS)
     force, rate = (column[finite] for column in columns)
     return _Samples(time_ns, force, rate)
@@ -325,7 +326,8 @@ def _bias(
     largest = float(np.abs(bias).max())
     if largest > LARGEST_BIAS_RADPS:
         raise BadInput(
-            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than any gyro errs; it looks "
+            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than the error of any gyro; "
+            "it looks "
             "like deg/s: import it with that unit"
         )
     since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * _NS
@@ -353,7 +355,7 @@ def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {moving.topic} sets off {later_s:.3g} s after the unit: if one clock has the "
+        f"; {moving.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
         f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
         f"inertial_delay_s={shift_s:g} moves the unit's"
     )

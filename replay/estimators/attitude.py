@@ -33,12 +33,14 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 
 
 class AttitudeParameters(ModelParameters):
-    """Noise of the unit and of what carries it, and how well the start is known.
+    """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
-    Noise densities are per square root of hertz, and cover errors of scale while the body moves; those
-    of random walks are per square root of a second. Velocity and field are measured once a second, since
-    their errors last about as long. The body rests for its first `rest_s`. Where the unit is silent for
-    longer than `inertial_gap_s`, it may turn by `gap_turn_radps` meanwhile.
+    Noise densities are per square root of hertz (rad/s and m/s^2) and cover errors of scale while the
+    body moves. Densities of random walks are per square root of a second: of the gyro's bias in rad/s,
+    of the magnetic field in uT. That the velocity is about zero and the field about constant is used
+    once a second, with `sigma_velocity_mps` and `sigma_field_ut`, since their errors last about as
+    long. The body rests for its first `rest_s`. If the unit is silent for longer than `inertial_gap_s`,
+    the body may turn at `gap_turn_radps` meanwhile.
     """
 
     gyro_noise_density: NonNegativeFloat = 0.002
@@ -142,15 +144,16 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
     )
     if not np.isfinite(field).all():
         raise BadInput(
-            f"topic {stream.topic}: no magnetic field in its first {parameters.rest_s:g} s, from which "
-            "the heading begins; rest_s sets how long to take, or give the log a prior"
+            f"topic {stream.topic}: has no magnetic field in its first {parameters.rest_s:g} s, by "
+            "which "
+            "the heading begins; make rest_s longer, or give the log a prior"
         )
     with np.errstate(invalid="ignore"):
         orientation = triad(force, field)
     if not np.isfinite(orientation).all():
         raise BadInput(
             f"topic {stream.topic}: specific force and magnetic field are parallel at the start, which "
-            "tells no heading; give the log a prior"
+            "determines no heading; give the log a prior"
         )
     _, north, up = into_plane(tuple(orientation), tuple(field))
     mean = np.concatenate([orientation, np.zeros(6), [north, up]])
@@ -168,7 +171,7 @@ def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 UNIT = replace(CARRIED, delay="", estimates=True)  # its own clock is the only one
 ATTITUDE = Model(
-    "orientation of what is carried about with a gyro, an accelerometer and a magnetometer",
+    "orientation of a body with a gyro, an accelerometer and a magnetometer",
     {**ORIENTATION, **BIAS, **VELOCITY, **PLACE},
     AttitudeParameters,
     (

@@ -184,7 +184,9 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
     """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
     if users < 2 * folds:
         fewer = f", or at most {users // 2} folds" if users >= 4 else ""
-        raise BadInput(f"{users} users are too few for {folds} folds; give {2 * folds} users{fewer}")
+        raise BadInput(
+            f"{users} users are too few for {folds} folds; give at least {2 * folds} users{fewer}"
+        )
     return rng.permutation(users) % folds
 
 
@@ -336,7 +338,7 @@ def _sequence(
         return 1, len(chosen)
     if len(counts) > 1:
         raise BadInput(
-            f"{', '.join(modalities)}: an HMM needs as many matchers of every modality; "
+            f"{', '.join(modalities)}: an HMM needs the same number of matchers of every modality; "
             'choose another subset, or topology = "joint"'
         )
     return len(chosen) // counts.pop(), modalities.count(modalities[0])
@@ -377,7 +379,9 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
             raise BadInput(f"logarithmic: no modality '{name}'; {choices(name, known)}")
     of_logarithm = [matcher.modality in parameters.logarithmic for matcher in compared.matchers]
     if np.nanmin(scores[:, :, of_logarithm], initial=0.0) < 0:
-        raise BadInput(f"logarithmic: {', '.join(parameters.logarithmic)} has scores below zero")
+        raise BadInput(
+            f"logarithmic: {', '.join(parameters.logarithmic)} has scores below zero; leave it out"
+        )
     shifted = np.where(of_logarithm, scores, 0.0)
     return normalise(np.where(of_logarithm, np.log1p(shifted), scores), "z")
 
@@ -425,7 +429,8 @@ def _bind(
         users = {len(each.scores) for each in compared}
         if len(users) > 1:
             raise BadInput(
-                f"topic {TOPIC}: {min(users)} to {max(users)} users; replay such logs in turn"
+                f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its "
+                "own"
             )
         return [
             gather(

@@ -27,7 +27,7 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """The standard deviation about each axis that is assumed, since the method tells none."""
+    """The standard deviation about each axis that is assumed, since the method estimates none."""
 
     sigma_deg: PositiveFloat = 3.0
 
@@ -38,20 +38,20 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """The gain (rad/s) of the gradient's direction; .041 is the author's for such a unit."""
+    """The gain in rad/s of the gradient's direction; 0.041 is the author's for such a unit."""
 
     gain: NonNegativeFloat = 0.041
 
 
 class MahonyParameters(AssumedParameters):
-    """The gains of the correction (1/s), and of the bias by it (1/s^2)."""
+    """The gain of the correction in 1/s, and of the bias in 1/s^2."""
 
     gain: NonNegativeFloat = 1.0
     bias_gain: NonNegativeFloat = 0.3
 
 
 class VqfParameters(AssumedParameters):
-    """The time constants (s) of its corrections of inclination and of heading."""
+    """The time constants in s of its corrections of inclination and of heading."""
 
     inclination_s: PositiveFloat = 3.0
     heading_s: PositiveFloat = 9.0

@@ -41,10 +41,11 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """How sightings of robots are used, and who uses landmarks; None takes what the channels state.
+    """How robots use their sightings of each other, and which of them use landmarks.
 
-    `criterion` is what CI makes least: the trace of a pose's covariance, in m^2 + rad^2, or its
-    determinant.
+    `mode` is alone, naive, ci or joint; `anchors` are the numbers of the robots that know the map.
+    `criterion` is what covariance intersection makes least: the trace of a pose's covariance, in m^2 +
+    rad^2, or its determinant. Noise that is none is what the channels state.
     """
 
     mode: Mode = "ci"
@@ -478,7 +479,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
     for anchor in parameters.anchors:
         if anchor not in numbers:
             raise BadInput(
-                f"estimator {name}: anchor {anchor} is none of the robots "
+                f"estimator {name}: anchor {anchor} is not one of the robots "
                 f"{', '.join(map(str, numbers))}; name those that know the map with --set anchors=[...]"
             )
 

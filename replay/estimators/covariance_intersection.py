@@ -500,7 +500,10 @@ def fuse(
         )
     known = np.zeros_like(covariance) if independents is None else np.asarray(independents, float)
     if known.shape != covariance.shape:
-        raise BadInput(f"independent parts {known.shape}, covariances {covariance.shape}: not alike")
+        raise BadInput(
+            f"independent parts {known.shape}, covariances {covariance.shape}; give one part for each "
+            "covariance"
+        )
     for part in (mean, covariance, known):
         if not np.isfinite(part).all():
             raise BadInput("an estimate is not finite; leave it out")
@@ -508,9 +511,11 @@ def fuse(
         raise BadInput("a covariance is not symmetric; give the full matrix")
     least = np.linalg.eigvalsh(covariance)[..., 0]
     if np.any(least <= 0):
-        raise BadInput("a covariance is singular; fuse what is certain as a constraint, not by rules")
+        raise BadInput(
+            "a covariance is singular; a certain component cannot be fused by rules; give it a variance"
+        )
     if np.any(np.linalg.eigvalsh(covariance - known)[..., 0] < -1e-9 * least):
-        raise BadInput("an independent part exceeds its covariance; it is a part of it")
+        raise BadInput("an independent part exceeds its covariance; give at most the covariance")
     batch, (count, size) = mean.shape[:-2], mean.shape[-2:]
     runs = int(np.prod(batch))
     fused = Fused(
@@ -526,7 +531,10 @@ def fuse(
         fused,
     )
     if np.any(np.isinf(fused.gap)):
-        raise BadInput("a covariance is singular to working precision; state it in like units")
+        raise BadInput(
+            "a covariance is singular to working precision; choose units in which its variances are "
+            "alike"
+        )
     if np.any(fused.gap > tolerance):
         raise BadInput(
             f"the weights did not converge: the certificate is {fused.gap.max():.1e}, not {tolerance}"

@@ -47,7 +47,7 @@ Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """Distributions of the prior and of both noises; None takes what the log's channel states."""
+    """Distributions of prior and noises; one that is none is what the log's channel states."""
 
     prior: Noise | None = None
     system: Noise | None = None
@@ -61,7 +61,7 @@ class KalmanParameters(BinghamParameters):
 
 
 class HeadingsFilterParameters(Parameters):
-    """The model of `recorders.simulators.headings`; None takes what the log's channel states."""
+    """The model of the scenario `headings`; a number that is none is what the log's channel states."""
 
     coupling_rad: float | None = None
     drift1_rad: float | None = None
@@ -73,7 +73,7 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """And the weight w5 of the central one of the five samples."""
+    """`central_weight` is the weight of the central one of the five samples (w5 in the paper)."""
 
     central_weight: Annotated[float, Field(ge=0, le=0.5)] = 0.2
 
@@ -111,7 +111,9 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
                 f"--set {name}.diagonal=[...]"
             ) from None
         if len(found[name].diagonal) != d:
-            raise BadInput(f"{name}: {len(found[name].diagonal)} numbers for {d} components")
+            raise BadInput(
+                f"{name}: {len(found[name].diagonal)} numbers for {d} components; give one for each"
+            )
     return Distributions(**found)
 
 

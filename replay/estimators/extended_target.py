@@ -21,7 +21,7 @@ STATES = 4
 
 
 class ExtendedTargetParameters(ModelParameters):
-    """Variances added per step, and of a point; None takes what the log's channel states."""
+    """Variances that are added per step, and that of a point."""
 
     size_drift_m2: NonNegativeFloat | None = None
     position_drift_m2: NonNegativeFloat | None = None

@@ -66,16 +66,19 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
         float(bound_rad),
     )
     if not 0 < pairs.bound_rad < 0.5 * np.pi:
-        raise BadInput(f"bound of {bound_rad} rad: it must lie above 0 and below pi / 2")
+        raise BadInput(f"a bound of {bound_rad} rad; give one above 0 and below pi / 2")
     if not len(pairs.first) == len(pairs.second) == len(pairs.angle_rad):
         raise BadInput(
             f"{len(pairs.first)} first and {len(pairs.second)} second landmarks for "
             f"{len(pairs.angle_rad)} angles; give one of each per relative bearing"
         )
     if not all(np.isfinite(part).all() for part in pairs[:3]):
-        raise BadInput("a landmark or an angle is not finite; drop that relative bearing")
+        raise BadInput("a landmark or an angle is not finite; leave that relative bearing out")
     if np.any(np.all(pairs.first == pairs.second, axis=1)):
-        raise BadInput("two landmarks of a pair coincide; the angle between them says nothing")
+        raise BadInput(
+            "the two landmarks of a pair are at one place, so that their angle says nothing; leave it "
+            "out"
+        )
     return pairs
 
 
@@ -224,7 +227,7 @@ def area(border: Arcs) -> float:
 def box(border: Arcs) -> Arena:
     """The tightest axis-parallel box; raises BadInput for an empty set."""
     if len(border.length) == 0:
-        raise BadInput("the set is empty: it has no box")
+        raise BadInput("the set is empty, so that it has no bounding box")
     points = [border.start, border.at(border.length)]
     turn = border.curvature * border.length
     for quarter in range(4):

@@ -50,11 +50,12 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class PhdParameters(Parameters):
-    """The scene; None takes what the scans' channel states.
+    """Motion, births and detections of targets; what is none is what the scans' channel states.
 
-    `sensor` is the one to listen to, such as `network`; where it is empty all are, each on its own.
-    Births are per m^2 and scan, clutter per m^2 and scan. Components within `merge_squared` of another
-    by their own covariance become one. `gate_probability` is that of a detection of a component.
+    `sensor` is the one to use, such as `network`; if it is empty each sensor has a filter of its own.
+    Births and clutter are per m^2 and scan. Components whose squared Mahalanobis distance is below
+    `merge_squared` become one, those of less than `prune_weight` are dropped. `gate_probability` is
+    that of a detection of a component being inside its gate.
     """
 
     sensor: str = ""
@@ -382,7 +383,9 @@ def start(whole: Mapping[str, Ragged], *, most: int) -> Mixture | None:
         return None
     runs = next(iter(whole.values())).runs
     if len(whole) > most:
-        raise BadInput(f"{len(whole)} priors for {most} components; give --set most_components=...")
+        raise BadInput(
+            f"{len(whole)} priors are more than {most} components; give --set most_components=..."
+        )
     mixture = no_components(runs, most)
     for component, prior in enumerate(whole.values()):
         time_ns, mean, covariance = gaussians(prior)
@@ -537,7 +540,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> 
 
 
 GM_PHD = Estimator(
-    "how many things there are and where, from unordered scans: Gaussian mixture PHD filter",
+    "number and positions of targets from unordered scans: Gaussian mixture PHD filter",
     "per sensor .../scan and .../detection",
     PhdParameters,
     _bind,

@@ -205,7 +205,10 @@ def _prepared(
     """Checked samples, and estimates to fill."""
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
-        raise BadInput("inertial samples: give a time, and rate, force and field (3) of each")
+        raise BadInput(
+            "inertial samples: give for each a time, and turn rate, specific force and magnetic field "
+            "of 3 numbers"
+        )
     if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
         raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
     if estimates is None:

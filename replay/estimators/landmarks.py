@@ -42,7 +42,7 @@ class DeadReckoningParameters(ModelParameters):
 
 
 class LocalizationParameters(DeadReckoningParameters):
-    """Sensor noise and bias, and how improbable a measurement must be to be kept out.
+    """Noise and bias of the sensors.
 
     Poses and headings that do not state their covariance have `sigma_fix_m` and `sigma_heading_rad`.
     """
@@ -58,7 +58,7 @@ class LocalizationParameters(DeadReckoningParameters):
     bias_bearing_rad: float = 0.0
     """Bearings are too large by so much, in rad."""
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
-    """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
 
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:

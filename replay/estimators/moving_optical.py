@@ -30,9 +30,9 @@ from replay.inference.model import Model, ModelParameters, Motion, Sensor
 
 
 class MovingSightParameters(ModelParameters):
-    """Noise, biases and clocks; noise that is None is what the log's channels state.
+    """Noise of motion and sights, and the errors of attitudes and clocks.
 
-    The noise density of the targets' acceleration is per square root of hertz. A clock is ahead by its
+    `acceleration_density` is in m/s^2 per square root of hertz. A sensor's clock is ahead by its
     parameter.
     """
 

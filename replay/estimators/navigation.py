@@ -35,14 +35,15 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 
 
 class NavigationParameters(AlignmentParameters):
-    """The inertial unit, how it is mounted, and where; None takes what the log's channels state.
+    """Noise of the inertial unit and the other sensors, where they are mounted, and gaps.
 
-    Noise densities are per square root of hertz, those of the biases' random walks per square root of a
-    second; biases are those of the body's axes. The lever arm is where fixes are of, from the unit, in
-    the body's axes; the axle is where wheels are. The magnetic field is that of the place, along east,
-    north, up. Gravity and the turn of the earth are those of the plane's origin.
+    Noise densities are per square root of hertz (m/s^2 and rad/s), those of the biases' random walks
+    per square root of a second; the biases are those of the body's axes. The lever arm is the position
+    of the antenna, the axle that of the wheels, both from the unit in the body's axes. The magnetic
+    field is that of the place along east, north, up. Gravity and the rotation of the earth are those of
+    the plane's origin.
 
-    Where the unit is silent for longer than `inertial_gap_s`, all but the biases is unknown: the body
+    If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes unknown: the body
     may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
     """
 

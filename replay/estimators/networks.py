@@ -55,15 +55,16 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """The fusion rule, and how exactly its weights are optimised.
+    """The fusion rule, what nodes send, and a node that sends false estimates.
 
-    "alone" fuses nothing, "centralised" is one filter with all sensors and no links, "own-again" is a
-    trap: it fuses the own x* and then uses its measurement a second time.
+    The rule "alone" fuses nothing, "centralised" is one filter with all sensors and no links, and
+    "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses its measurement a
+    second time. `tolerance` is how exactly weights are optimised.
 
-    A node sends at most once in `send_interval_s`, and nothing before its x* differs from what its last
-    message says of now by a Kullback-Leibler divergence of `send_divergence` nats. What it hears it
-    fuses if its prediction agrees with it: honest estimates, however correlated, pass that gate with at
-    least `gate_probability`.
+    A node sends at most once in `send_interval_s`, and only when its estimate differs from its last
+    message by a Kullback-Leibler divergence of `send_divergence` nats. A received estimate is fused if
+    it agrees with the node's own: honest estimates, however correlated, pass that gate with at least
+    `gate_probability`. The node `liar` adds `lie_m` to its estimates after `lie_after_s`.
     """
 
     rule: Rule = "ci-trace"
@@ -125,6 +126,23 @@ class Fusion(NamedTuple):
     lie_after_ns: int
 
 
+class Nodes(NamedTuple):
+    """What the nodes of one run know, first axis = node.
+
+    Attributes:
+        time_ns: (nodes,), of their estimates.
+        mean, covariance: (nodes, n), (nodes, n, n).
+        said_ns, said_mean, said_covariance: of each node's last message; -1 where there is none.
+    """
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    said_ns: Integers
+    said_mean: Floats
+    said_covariance: Floats
+
+
 class Results(NamedTuple):
     """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
 
@@ -178,6 +196,20 @@ def observe(
                 covariance[column, row] = covariance[row, column]
 
 
+def observe_all(
+    activity: int,
+    mean: Floats,
+    covariance: Floats,
+    independent: Floats,
+    activities: Activities,
+    sensing: Sensing,
+) -> None:
+    """Update with all that a node measures in an activity, see `observe`."""
+    for k in range(activities.measured[activity], activities.measured[activity + 1]):
+        variance = sensing.variance[sensing.sensor[k]]
+        observe(mean, covariance, independent, sensing.value[k], variance)
+
+
 def squared_distance(difference: Floats, covariance: Floats) -> float:
     """The squared Mahalanobis distance; infinity where the covariance is singular."""
     information = np.empty_like(covariance)
@@ -229,106 +261,135 @@ def follow(
     results: Results,
     failed_ns: Integers,
 ) -> None:
-    """Move the nodes of one run through their activities, until these end or a fusion fails."""
-    nodes, size = len(sensing.density), prior_mean.shape[1]
-    mean, covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
-    time_ns, said_ns = np.empty(nodes, np.int64), np.full(nodes, -1)
-    said_mean, said_covariance = np.empty((nodes, size)), np.empty((nodes, size, size))
-    for node in range(nodes):
-        copy_gaussian(prior_mean[run], prior_covariance[run], mean[node], covariance[node])
-        time_ns[node] = prior_ns[run]
+    """Move the nodes of one run through their activities, until these end or a fusion fails.
+
+    At every time all nodes send first, and then take in what they hear.
+    """
+    count, size = len(sensing.density), prior_mean.shape[1]
+    nodes = Nodes(
+        np.full(count, prior_ns[run]),
+        np.empty((count, size)),
+        np.empty((count, size, size)),
+        np.full(count, -1),
+        np.empty((count, size)),
+        np.empty((count, size, size)),
+    )
+    for node in range(count):
+        copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
     begin, last = activities.offsets[run], activities.offsets[run + 1]
     most = 1
     for activity in range(begin, last):
         most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
     weights, square = np.empty(most), (most, size, size)
     parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
-    said = Estimate(np.empty(size), np.empty((size, size)), np.empty((size, size)))
     while begin < last:
         now = activities.time_ns[begin]
         end = begin
         while end < last and activities.time_ns[end] == now:
-            node = activities.node[end]
-            if now > time_ns[node]:
-                span_s = (now - time_ns[node]) * 1e-9
-                move(mean[node], covariance[node], sensing.density[node], span_s)
-                time_ns[node] = now
-            sent_mean, sent_covariance = results.sent_mean[end], results.sent_covariance[end]
-            copy_gaussian(mean[node], covariance[node], sent_mean, sent_covariance)
-            for k in range(activities.measured[end], activities.measured[end + 1]):
-                observe(
-                    sent_mean,
-                    sent_covariance,
-                    results.sent_independent[end],
-                    sensing.value[k],
-                    sensing.variance[sensing.sensor[k]],
-                )
-            if activities.may_send[end]:
-                is_due = said_ns[node] < 0
-                if not is_due and now - said_ns[node] >= fusion.interval_ns:
-                    copy_gaussian(said_mean[node], said_covariance[node], said.mean, said.covariance)
-                    silent_s = (now - said_ns[node]) * 1e-9
-                    move(said.mean, said.covariance, sensing.density[node], silent_s)
-                    is_due = fusion.divergence == 0.0 or fusion.divergence <= divergence(
-                        sent_mean, sent_covariance, said.mean, said.covariance
-                    )
-                if is_due:
-                    results.sent[end], said_ns[node] = True, now
-                    copy_gaussian(sent_mean, sent_covariance, said_mean[node], said_covariance[node])
-                if node == fusion.liar and now - prior_ns[run] >= fusion.lie_after_ns:
-                    sent_mean[0] += fusion.lie_m
+            predict_and_send(end, prior_ns[run], activities, sensing, fusion, nodes, results)
             end += 1
         for activity in range(begin, end):
             node = activities.node[activity]
-            first, last_message = activities.received[activity], activities.received[activity + 1]
-            count = 0
-            for i in range(-1, last_message - first):
-                is_own = i < 0
-                source = activity if is_own else activities.message[first + i]
-                if not is_own and not results.sent[source]:
-                    continue
-                its_mean, its_covariance = mean[node], covariance[node]
-                if not is_own or fusion.own_first:
-                    its_mean = results.sent_mean[source]
-                    its_covariance = results.sent_covariance[source]
-                copy_gaussian(its_mean, its_covariance, parts.mean[count], parts.covariance[count])
-                late_s = (now - activities.time_ns[source]) * 1e-9
-                # what was new in a late one others may have passed on
-                new = 1.0 if not is_own and late_s <= 0.0 else 0.0
-                for row in range(size):
-                    for column in range(size):
-                        own = results.sent_independent[source, row, column]
-                        parts.independent[count, row, column] = new * own
-                if late_s > 0.0:
-                    move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
-                if is_own or agrees(mean[node], covariance[node], one_of(parts, count), fusion.gate):
-                    count += 1
-                else:
-                    results.refused[first + i] = True
-            if count > 1:
-                gap = fuse_by(
-                    fusion.rule,
-                    count,
-                    parts,
-                    weights,
-                    mean[node],
-                    covariance[node],
-                    fusion.tolerance,
-                )
+            mean, covariance = nodes.mean[node], nodes.covariance[node]
+            heard = hear(activity, activities, sensing, fusion, nodes, parts, results)
+            if heard > 1:
+                gap = fuse_by(fusion.rule, heard, parts, weights, mean, covariance, fusion.tolerance)
                 if not gap < np.inf:
                     failed_ns[run] = now
                     return
-            for k in range(activities.measured[activity], activities.measured[activity + 1]):
-                observe(
-                    mean[node],
-                    covariance[node],
-                    parts.independent[0],  # of no use any more
-                    sensing.value[k],
-                    sensing.variance[sensing.sensor[k]],
-                )
-            found_mean, found_covariance = results.mean[activity], results.covariance[activity]
-            copy_gaussian(mean[node], covariance[node], found_mean, found_covariance)
+            # the independent part is of no use any more
+            observe_all(activity, mean, covariance, parts.independent[0], activities, sensing)
+            copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
         begin = end
+
+
+def predict_and_send(
+    activity: int,
+    start_ns: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    results: Results,
+) -> None:
+    """Predict a node to now, update x* with its own measurements, and send that where it is due."""
+    node, now = activities.node[activity], activities.time_ns[activity]
+    if now > nodes.time_ns[node]:
+        span_s = (now - nodes.time_ns[node]) * 1e-9
+        move(nodes.mean[node], nodes.covariance[node], sensing.density[node], span_s)
+        nodes.time_ns[node] = now
+    mean, covariance = results.sent_mean[activity], results.sent_covariance[activity]
+    copy_gaussian(nodes.mean[node], nodes.covariance[node], mean, covariance)
+    independent = results.sent_independent[activity]
+    observe_all(activity, mean, covariance, independent, activities, sensing)
+    if not activities.may_send[activity]:
+        return
+    if is_due(node, now, mean, covariance, sensing, fusion, nodes):
+        results.sent[activity], nodes.said_ns[node] = True, now
+        copy_gaussian(mean, covariance, nodes.said_mean[node], nodes.said_covariance[node])
+    if node == fusion.liar and now - start_ns >= fusion.lie_after_ns:
+        mean[0] += fusion.lie_m
+
+
+def is_due(
+    node: int,
+    now: int,
+    mean: Floats,
+    covariance: Floats,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+) -> bool:
+    """Whether x* may be sent again, and differs enough from what the last message says of now."""
+    if nodes.said_ns[node] < 0:
+        return True
+    if now - nodes.said_ns[node] < fusion.interval_ns:
+        return False
+    if fusion.divergence == 0.0:
+        return True
+    said_mean, said_covariance = nodes.said_mean[node].copy(), nodes.said_covariance[node].copy()
+    silent_s = (now - nodes.said_ns[node]) * 1e-9
+    move(said_mean, said_covariance, sensing.density[node], silent_s)
+    return fusion.divergence <= divergence(mean, covariance, said_mean, said_covariance)
+
+
+def hear(
+    activity: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    parts: Estimate,
+    results: Results,
+) -> int:
+    """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
+    node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
+    first, end = activities.received[activity], activities.received[activity + 1]
+    count = 0
+    for i in range(-1, end - first):
+        is_own = i < 0
+        source = activity if is_own else activities.message[first + i]
+        if not is_own and not results.sent[source]:
+            continue
+        mean, covariance = nodes.mean[node], nodes.covariance[node]
+        if not is_own or fusion.own_first:
+            mean, covariance = results.sent_mean[source], results.sent_covariance[source]
+        copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
+        late_s = (now - activities.time_ns[source]) * 1e-9
+        # what was new in a late one others may have passed on
+        new = 1.0 if not is_own and late_s <= 0.0 else 0.0
+        for row in range(size):
+            for column in range(size):
+                own = results.sent_independent[source, row, column]
+                parts.independent[count, row, column] = new * own
+        if late_s > 0.0:
+            move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
+        heard = one_of(parts, count)
+        if is_own or agrees(nodes.mean[node], nodes.covariance[node], heard, fusion.gate):
+            count += 1
+        else:
+            results.refused[first + i] = True
+    return count
 
 
 @cache
@@ -340,7 +401,7 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
     name, liar = parameters.rule, parameters.liar
     if liar is not None and liar not in sensors:
         raise BadInput(
-            f"liar = {liar} is none of the nodes {', '.join(map(str, sensors))}; name one of them"
+            f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; name one of them"
         )
     rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
     return Fusion(
@@ -445,11 +506,16 @@ def _schedule(
     ends = {}
     for end in ("sender_id", "receiver_id"):
         if not np.isin(links[end], numbers).all():
-            raise BadInput(f"topic /links: {end} names a node without a topic /nodeN/sensor")
+            raise BadInput(
+                f"topic /links: {end} names a node that has no topic /nodeN/sensor; record the topic, "
+                "or leave out the link"
+            )
         ends[end] = np.searchsorted(numbers, links[end])
     sent_ns, arrival_ns = links.stream.publish_time_ns, links["arrival_time_ns"]
     if np.any(arrival_ns < sent_ns):
-        raise BadInput("topic /links: a message arrives before it was sent; mend the link's clocks")
+        raise BadInput(
+            "topic /links: a message arrives before it was sent; correct the clocks of the link"
+        )
     arrived = links["lost"] == 0
     if centralised or name == ALONE:
         arrived = np.zeros(len(links), bool)
@@ -524,14 +590,17 @@ def _sensing(
             ) from None
         if part["value"].size != len(part) * len(seen):
             raise BadInput(
-                f"topic {topic.name}: its values do not have the {len(seen)} components named"
+                f"topic {topic.name}: its values do not have the {len(seen)} components that its "
+                "channel names; name as many as there are"
             )
         value = np.full((len(part), len(components)), np.nan)
         value[:, seen] = part["value"].reshape(len(part), len(seen))
         values.append(value)
         index.append(np.full(len(part), number))
     if not np.all(np.nan_to_num(variance, nan=1.0) > 0):
-        raise BadInput("a sensor's sigma is not positive; a perfect sensor makes covariances singular")
+        raise BadInput(
+            "a sensor's sigma is not positive, which makes covariances singular; give one above zero"
+        )
     return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
 
 
@@ -562,7 +631,7 @@ def state_of(prior: Topic) -> list[str]:
 
 
 NETWORK = Estimator(
-    "nodes that follow one thing and fuse what they send each other, by any fusion rule",
+    "nodes that track one target and fuse the estimates they send each other, by any fusion rule",
     "/prior, /links and, per node, /nodeN/sensor",
     NetworkParameters,
     _bind,

@@ -34,11 +34,11 @@ NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/att
 
 
 class PositionsParameters(Parameters):
-    """None: all biases are taken as zero."""
+    """There are none: all biases are taken as zero."""
 
 
 class BiasesParameters(Parameters):
-    """Biases that are known, such as `sensor_2_roll = 0`; all others are estimated."""
+    """Biases in deg that are known, such as `sensor_2_roll = 0`; all others are estimated."""
 
     known_bias_deg: dict[str, float] = {}
 

@@ -35,7 +35,12 @@ Advance = Callable[
 
 
 class InertialParameters(Parameters):
-    """See `inertial.InertialModel`: the same numbers for all logs."""
+    """Noise and averaging of inertial samples, the same for all logs.
+
+    The body rests for its first `rest_s`. An attitude of accelerometer and magnetometer is averaged
+    over `block_s` and has a standard deviation of `attitude_sigma_deg`; the gyro drifts by
+    `drift_sigma_deg` per square root of a second. Longer silences than `gap_s` are gaps.
+    """
 
     rest_s: NonNegativeFloat = 20.0
     block_s: PositiveFloat = 1.0
@@ -56,7 +61,7 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """Whether the gyro's mean over the rest is taken off."""
+    """With `unbiased` the gyro's mean over the rest is subtracted."""
 
     unbiased: bool = True
 

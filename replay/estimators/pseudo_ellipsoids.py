@@ -175,7 +175,7 @@ def most_room(ellipsoid: PseudoEllipsoid) -> float:
     most = float(ellipsoid.vector @ centre) - ellipsoid.constant
     error = ROUNDING * abs(ellipsoid.constant)
     if most < -error:
-        raise BadInput("the pairs' sets have no common point; one of their bounds is wrong")
+        raise BadInput("the sets of the pairs have no common point; give a larger bound")
     return max(most, error)
 
 

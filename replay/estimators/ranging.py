@@ -28,12 +28,12 @@ _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """Noise, bias and the height at which the state moves; None takes what the log's channels state.
+    """Noise, bias and height of the motion, and how the start is found.
 
-    The noise density of the acceleration is per square root of hertz. A range was measured
-    `range_delay_s` before its stamp. The start is sought by least squares in the first ranges, from
-    places `start_reach_m` to all sides of the anchors' middle, and is known to `start_sigma_m` and
-    `start_sigma_mps`.
+    `acceleration_density` is in m/s^2 per square root of hertz. A range was measured `range_delay_s`
+    before its stamp. The start is found by least squares in the ranges of the first `start_s`, from
+    positions `start_reach_m` to all sides of the anchors' middle; its standard deviations are
+    `start_sigma_m` and `start_sigma_mps`.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -48,7 +48,7 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """The same, and the noise density of the turn's acceleration, rad/s2 per square root of hertz."""
+    """`turn_acceleration_density` is in rad/s^2 per square root of hertz."""
 
     turn_acceleration_density: NonNegativeFloat | None = None
     start_sigma_m: PositiveFloat = 0.2
@@ -190,8 +190,8 @@ def first_ranges(
             delay_ns = round(parameters.range_delay_s / _NS)
             return int(time_ns[rows[begin]]) - delay_ns, stream["range_m"][chosen], of[:, :3], of[:, 3:]
     raise BadInput(
-        f"topic {stream.topic}: no {parameters.start_s:g} s of it have the ranges of {least} pairs of "
-        f"anchor and tag, to three anchors of {ANCHORS.topic}; start_s sets how long to take, or "
+        f"topic {stream.topic}: no span of {parameters.start_s:g} s has the ranges of {least} pairs of "
+        f"anchor and tag, to three anchors of {ANCHORS.topic}; make start_s longer, or "
         "give the log a prior"
     )
 

@@ -17,7 +17,7 @@ from replay.inference.model import Model, ModelParameters, Motion, Sensor
 
 
 class ReactorParameters(ModelParameters):
-    """Time step and variances; None takes what the log's channel states."""
+    """Time step, and variances per step."""
 
     step_s: PositiveFloat | None = None
     process_variance: NonNegativeFloat | None = None

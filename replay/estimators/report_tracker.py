@@ -43,13 +43,13 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """What is supposed of vessels, their receivers, and how many there are; the same for all.
+    """What is assumed of vessels and their receivers; the same for all.
 
-    The levels of noise, quiet ones first: density of the acceleration (m^2/s^3), sigmas of positions
-    and velocities. `forgetting` is how much of the levels' weights a report takes back to equal ones.
-    Of the vessels not met before `resting_share` rest. A vessel below `slow_mps` may be at rest, and
-    often repeats its last course, which then tells it from others within `course_width_deg`. A track
-    that is silent for `forget_s` is dropped.
+    There are several levels of noise, the smallest first: densities of the acceleration in m^2/s^3, and
+    standard deviations of positions and velocities. Each track weighs them; `forgetting` is how far a
+    report moves these weights back to equal ones. Of new vessels the share `resting_share` is at rest.
+    A vessel slower than `slow_mps` may be at rest and then often repeats its last course; within
+    `course_width_deg` this distinguishes it from others. A track that is silent for `forget_s` ends.
     """
 
     acceleration_density: FOUR = (1e-6, 1e-4, 1e-2, 1.0)
@@ -505,7 +505,7 @@ def settings_of(parameters: ReportTrackerParameters) -> Settings:
     for name in ("acceleration_density", "sigma_position_m", "sigma_velocity_mps"):
         levels = getattr(parameters, name)
         if max(levels) > levels[-1]:
-            raise BadInput(f"{name} {levels}: give the quiet levels first, the greatest last")
+            raise BadInput(f"{name} = {levels}: the levels must increase; give the smallest first")
     return Settings(
         np.array(parameters.acceleration_density),
         np.square(parameters.sigma_position_m),

@@ -69,7 +69,10 @@ def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
         return targets
     stage, (mean, covariance, mode) = targets.stage, targets.newborn
     if not is_flat(stage.model.kinds) or any(each.noises for each in stage.modes or (stage.motion,)):
-        raise BadInput(f"{where}: errors of sensors need a state without rotations, and additive noise")
+        raise BadInput(
+            f"{where}: errors of sensors need a model without rotations in its state and with additive "
+            "noise; take another"
+        )
     if errors.shared and stage.modes:
         raise BadInput(
             f"{where}: registration errors need targets of one motion; give mode=..., or "

@@ -69,13 +69,14 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
 class SetFilterParameters(SetParameters):
-    """Bounds of the errors; those that are None are what the channels state.
+    """Bounds of the errors; those that are none are what the channels state.
 
-    Over a span of T s odometry errs by at most `position_error_m` + T `position_error_mps`, seen from
-    the pose at its beginning, and turns by at most `heading_error_rad` + T `heading_error_radps` more or
-    less than it says. `bearing_bound_rad` is of single bearings, which tell the heading; `bound_deg` of
-    their differences. After `anchor_s` the set of now becomes the anchor. A part of it with more than
-    `most_edges` edges is replaced by a set with L = 8 around it.
+    Over a span of T s the position of the odometry is off by at most `position_error_m` + T
+    `position_error_mps`, seen from the pose at the beginning, and its heading by at most
+    `heading_error_rad` + T `heading_error_radps`. `bearing_bound_rad` is of single bearings, which
+    determine the heading, `bound_deg` of their differences. After `anchor_s` the current set becomes
+    the one that motion is counted from. A part of a set with more than `most_edges` edges is replaced
+    by a larger one of the form L = 8.
     """
 
     least_landmarks: Annotated[int, Field(ge=2)] = 2

@@ -37,11 +37,11 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """Which set, and from what; a bound, arena or maximum range that is None is the log's own.
+    """The form of the sets, and the bounds they come from; a bound that is none is the log's.
 
-    Bearings of one stamp give all their pairs. The arena is (low x, low y, high x, high y). Where nobody
-    states it, a robot is no farther from what it sees than the sensor's maximum range, which is the
-    longest that it measured where nobody states that either.
+    Bearings of one stamp give all their pairs. The arena is (low x, low y, high x, high y). Without
+    one, a robot is no farther from a landmark that it sees than `maximum_range_m`; without that either,
+    no farther than the longest range that its sensor measured.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"
@@ -119,7 +119,7 @@ def _maximum_range_m(stream: Stream, known: Known) -> float:
         return known.maximum_range_m
     if "range_m" not in stream.columns:
         raise BadInput(
-            f"topic {stream.topic}: nothing says where the robot can be: it measures no ranges and "
+            f"topic {stream.topic}: nothing bounds the robot's position: the topic has no ranges and "
             "states no maximum_range_m, and /landmarks states no arena_m; give "
             "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
         )
@@ -265,7 +265,7 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
         arena_m = _numbers(landmarks, "arena_m")
     if arena_m is not None and not (len(arena_m) == 4 and np.all(np.less(arena_m[:2], arena_m[2:]))):
         raise BadInput(
-            f"an arena of {arena_m} m; low x, low y, high x, high y are needed, as --set arena_m=[...] "
+            f"an arena of {arena_m} m; give low x, low y, high x, high y with --set arena_m=[...] "
             f"or in the metadata of {landmarks.name}"
         )
     range_m = parameters.maximum_range_m

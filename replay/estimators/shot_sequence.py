@@ -32,12 +32,13 @@ CUT = 3.0
 
 
 class MovingShooterParameters(ModelParameters):
-    """Noise and the air; None takes what the log's channels state.
+    """Noise of motion, sensors and air, and how the start is found.
 
-    Densities are per square root of hertz and of second. The start is sought in what is heard within
-    `start_s` of the first report, and is known to `start_sigma_m`, `start_sigma_mps` and
-    `start_sigma_rad`. `outlier_probability` is that of a wrong component of a report, which may then be
-    anything, a lead anything up to `longest_s`; only `particles:N` knows of it.
+    `acceleration_density` is in m/s^2 per square root of hertz, `trajectory_density` in rad per square
+    root of a second. The start is found in the reports of the first `start_s`, with the standard
+    deviations `start_sigma_m`, `start_sigma_mps` and `start_sigma_rad`. `outlier_probability` is that
+    of a wrong component of a report, which may then have any value, a lead any up to `longest_s`; only
+    `particles:N` uses it.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -153,8 +154,10 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
                 int(time_ns[begin]), mean, np.diag(sigma**2), "where its first shot fits best"
             )
     raise BadInput(
-        f"topic {reports.topic}: no {parameters.start_s:g} s of it have muzzle blasts of two sensors of "
-        f"{SENSORS.topic} that meet, and a shockwave; start_s sets how long to take, or give the log a "
+        f"topic {reports.topic}: no span of {parameters.start_s:g} s has muzzle blasts of two sensors "
+        "of "
+        f"{SENSORS.topic} whose directions meet, and a shockwave; make start_s longer, or give the log "
+        "a "
         "prior"
     )
 

@@ -27,10 +27,11 @@ BEST = 3
 
 
 class SoundSourceParameters(ModelParameters):
-    """The air and the start; None takes what the log's channels state.
+    """The air and the start.
 
-    The start is found by least squares, and is as uncertain as `start_sigma_m` says: it counts little
-    beside the differences. In a plane `height_sigma_m` is how far a source may be from that.
+    The start is found by least squares; its standard deviation is `start_sigma_m`, so large that it
+    counts little beside the differences. If all microphones have one height, `height_sigma_m` is the
+    standard deviation of the source's height from it.
     """
 
     speed_of_sound_mps: PositiveFloat | None = None

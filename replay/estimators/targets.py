@@ -33,7 +33,7 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """The power spectral density of the acceleration."""
+    """The power spectral density of the acceleration, in m^2/s^3."""
 
     acceleration_density: PositiveFloat = 0.1
 
@@ -82,7 +82,7 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
     name = parameters.model
     if name is None:
         if parameters.motion or parameters.mode:
-            raise BadInput(f"{where}: motion and mode are of a model; give model=... with them")
+            raise BadInput(f"{where}: motion and mode need a model; give model=... too")
         given: Mapping[str, Any] = {"acceleration_density": parameters.acceleration_density}
         model = TARGET
     else:
@@ -117,10 +117,12 @@ def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
 
 def _check(where: str, model: Model) -> None:
     if any(model.state.get(name) != "linear" for name in POSITION):
-        raise BadInput(f"{where}: has no position x_m, y_m, of which a tracker's sensors tell")
+        raise BadInput(
+            f"{where}: has no position x_m, y_m, which a tracker's sensors measure; take another model"
+        )
     if model.control is not None:
         raise BadInput(
-            f"{where}: is driven by {model.control.topic}, which nobody records of targets; take a "
+            f"{where}: is driven by {model.control.topic}, which is not recorded for targets; take a "
             "model without a control"
         )
 
@@ -146,7 +148,7 @@ def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats
             sigma[row] = sigma_mps
         elif np.isnan(sigma[row]):
             raise BadInput(
-                f"{where}: a detection does not tell {name}, and the model does not say how uncertain "
-                "it is at first; give it a start with its sigma"
+                f"{where}: a detection does not measure {name}, and the model does not say how "
+                "uncertain it is at first; give it a start with its sigma"
             )
     return mean, sigma

@@ -62,7 +62,7 @@ def make_heading_model(
 ) -> HeadingModel:
     """A checked model; BadInput where a covariance is not positive definite or a number not finite."""
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
-        raise BadInput("coupling and drift of a heading model must be finite, the drift two numbers")
+        raise BadInput("coupling and drift of a heading model must be finite, and the drift two numbers")
     covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
     return HeadingModel(
         float(coupling_rad), np.array(drift_rad, float), *map(np.ascontiguousarray, covariances)

@@ -27,7 +27,7 @@ def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
     """
     if targets.stage.modes or not targets.stage.motion.linear:
         raise BadInput(
-            f"estimator {tracker.name}: smoothed tracks are of targets with one linear motion; leave "
+            f"estimator {tracker.name}: smoothed tracks need a model with one linear motion; leave "
             "out smoothed, or take another model, or one of its modes"
         )
 

@@ -20,33 +20,27 @@ from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from recorders.errors import BadInput
-from recorders.log import Topic, make_stream, schemas
+from recorders.log import Topic, schemas
 from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Integers
 from replay.engine.blocks import Block, Ragged, gather, join
 from replay.engine.channels import stated
 from replay.engine.estimator import Bound, Estimator, Recursive
-from replay.engine.failures import reason_stream
-from replay.engine.results import innovation_stream, named
 from replay.estimators.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
 from replay.estimators.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
 from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
+from replay.estimators.track_outputs import track_outputs
 from replay.estimators.track_smoother import smoothing_tracks
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
 from replay.inference.settings import number_fields
 from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
-from replay.inference.tracks import NEVER, Tracks, no_tracks
+from replay.inference.tracks import Tracks, no_tracks
 
-UNUSED = (
-    "there is no room for more tracks; give --set most_tracks=...",
-    "the scan came after a younger one; give --late rewind:SECONDS",
-)
 # What sets apart the two that go by existence and have the associations of jpda.
 EXISTING: dict[str, dict[str, float]] = {
     "jipda": {},
@@ -63,28 +57,30 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 class TrackerParameters(Parameters):
     """How targets move, how tracks begin and end, and what sensors are like.
 
-    What is None is what the channel of a sensor's scans states; given here, it holds for all sensors.
-    `sensors` are those to use, such as ["radar", "lidar"]; where it is empty all are.
+    What is none is what the channel of a sensor's scans states; a value given here holds for all
+    sensors. `sensors` are those to use, such as ["radar", "lidar"]; if it is empty, all are used.
 
-    `model` is a registered one with a position, whose numbers `motion` gives by name; a model with modes
-    has all of them, or the one that `mode` names. Without it targets keep their velocity.
+    `model` is a registered model with a position, whose parameters `motion` gives by name. A model with
+    modes uses all of them, or the one that `mode` names. Without a model targets keep their velocity,
+    but for an acceleration of density `acceleration_density` (m^2/s^3).
 
-    Tracks begin with a detection outside all gates that is `birth_distance_m` from all confirmed tracks;
-    or, where there are `undetected_per_m2` targets that were never detected, with any that may be one of
-    these, by how probable that is. What becomes of them `management` says: "existence" goes by the
-    probability of their targets'; "hits" by `hits_needed` in the first `chances`; "score" by the
-    log-likelihood ratio of target and clutter, tested so that `false_confirmation` and
-    `missed_confirmation` are the probabilities of errors. With hits or score, a track's existence is
-    `birth_existence` until it is confirmed, and then 1. By existence, a track is told from
-    `confirming_existence` on until it falls below `keeping_existence`, and ends below
-    `ending_existence`. Where management is None, jipda and pmbm go by existence, the others by hits.
+    A track begins with a detection outside all gates that is `birth_distance_m` from all confirmed
+    tracks. With `undetected_per_m2`, the density of targets that were never detected, it begins with
+    any detection that may be one of these, by how probable that is.
 
-    With `registration_sigma_m` or `_rad`, a sensor has a constant error in all it measures, which the
-    tracks estimate together; with `correlated_sigma_m` or `_rad` one of its own for every track, which
-    is another one after `correlation_s`. Both are components of the tracks' states.
+    `management` decides which tracks are confirmed. "existence" uses the probability that the target
+    exists: a track is confirmed from `confirming_existence` on until it falls below
+    `keeping_existence`, and ends below `ending_existence`. "hits" needs `hits_needed` detections in the
+    first `chances`. "score" tests the log-likelihood ratio of target and clutter, so that
+    `false_confirmation` and `missed_confirmation` are the probabilities of its errors. With hits or
+    score the existence is `birth_existence` until a track is confirmed, and then 1. If management is
+    none, jipda and pmbm use existence, the others hits.
 
-    `smoothed` tracks are those of the end of the run, gone back over: each estimate then uses all of the
-    detections that its track ever had.
+    With `registration_sigma_m` or `_rad` a sensor has a constant error in all that it measures, which
+    all tracks estimate together. With `correlated_sigma_m` or `_rad` it has another error for every
+    track, which lasts for about `correlation_s`. Both are components of the tracks' states.
+
+    With `smoothed` the tracks are estimated again at the end of the run from all their detections.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
@@ -152,10 +148,12 @@ class TrackerParameters(Parameters):
         goes_by_existence = association in EXISTING
         given = values.get("management")
         if goes_by_existence and given not in (None, "existence"):
-            raise ValueError(f"{association} goes by existence; management = {given} goes with jpda")
+            raise ValueError(
+                f"{association} needs management = existence; management = {given} is for jpda"
+            )
         management = given or ("existence" if goes_by_existence else "hits")
         if values.get("undetected_per_m2") and management != "existence":
-            raise ValueError("undetected_per_m2 goes with management = existence")
+            raise ValueError("undetected_per_m2 needs management = existence")
         likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
         return {**likely, **EXISTING.get(association, {}), **values, "management": management}
 
@@ -189,13 +187,14 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
         ):
             raise BadInput(
-                f"topic {scan_name}: its sensor is where {origin} (fuselog.PositionFix) says, which is "
-                "not there; record the sensor's own position"
+                f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
+                "which is "
+                "missing; record the position of the sensor"
             )
     if rows and all(KINDS[kind].birth is None for kind in found.kinds):
         raise BadInput(
-            "only bearings: they begin no tracks, since they do not say how far a target is; take a "
-            "sensor of places, or of ranges with bearings, with them"
+            "bearings alone begin no tracks, since they do not measure how far a target is; add a "
+            "sensor of positions, or of ranges with bearings"
         )
     return found
 
@@ -208,7 +207,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
         if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
             raise BadInput(
                 f"topic {seen.name}: detections without scans; record {prefix}/scan "
-                f"({schemas.SCAN.full_name}), which says how many each scan has, also where that is none"
+                f"({schemas.SCAN.full_name}), which states how many each scan has, even if none"
             )
 
 
@@ -273,6 +272,10 @@ class Setup(NamedTuple):
         """The tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
+    def outputs(self, scans: Scans, told: Told, *, repeated: int = 0) -> list[Ragged]:
+        """The streams of what is said of these scans; see `track_outputs`."""
+        return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
+
 
 class State(NamedTuple):
     """What is carried from block to block: the last own positions, and the tracks.
@@ -295,7 +298,7 @@ def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list
     before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
     scans, fixes = _scans(before, block, setup)
     after, said = setup.track(before.tracks, scans)
-    outputs = [_outputs(setup, batch, told) for batch, told in said]
+    outputs = [setup.outputs(batch, told) for batch, told in said]
     return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
 
 
@@ -373,158 +376,16 @@ def _take(
     pending = in_time(pending, arrived)
     if repeated:
         head, said = setup.track(base, pending)
-        outputs = [_outputs(setup, *of_last(*said[-1]), repeated=repeated)]
+        outputs = [setup.outputs(*of_last(*said[-1]), repeated=repeated)]
     else:
         head, said = setup.track(head, arrived)
-        outputs = [_outputs(setup, batch, told) for batch, told in said]
+        outputs = [setup.outputs(batch, told) for batch, told in said]
     rows = np.arange(len(pending.time_ns))
     settled = pending.time_ns < pending.time_ns[-1] - back_ns
     if settled.any():
         base, _ = setup.track(base, take_scans(pending, rows[settled]))
         pending = take_scans(pending, rows[~settled])
     return Rewinding(base, pending, head), outputs
-
-
-def _outputs(setup: Setup, scans: Scans, told: Told, repeated: int = 0) -> list[Ragged]:
-    """Of every scan how many tracks there are, which, what was associated, and what was not done.
-
-    `repeated` is how many scans after a late one, the last of which these are of, were used again.
-    """
-    topic, found, model = f"/estimates/{setup.name}", setup.found, setup.tracker.stage.model
-    used = np.flatnonzero(told.confirmed != NEVER)
-    counts, time_ns = told.confirmed[used], scans.time_ns[used]
-    offsets = np.searchsorted(used, scans.offsets)
-    metadata = named(model.state)
-
-    def filled(column: NDArray, which: int) -> NDArray:
-        ends = told.end[:, which]
-        return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
-
-    ends = np.concatenate([[0], np.cumsum(told.end, axis=0)[:, 0]])
-    track_ns, rows = np.repeat(time_ns, counts), len(filled(told.number, 0))
-    pair = filled(told.pair, 1)
-    scan = pair[:, 1]
-    pair_ends = np.concatenate([[0], np.cumsum(told.end[:, 1])])
-    sensors = ",".join(found.sensors)
-    approximated = np.flatnonzero(told.approximated)
-    late = told.confirmed == NEVER
-    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
-    streams = (
-        (
-            make_stream(
-                f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=metadata, elements=counts
-            ),
-            offsets,
-        ),
-        (
-            make_stream(
-                f"{topic}/track",
-                schemas.TRACK_ESTIMATE,
-                track_ns,
-                metadata=metadata,
-                track_id=filled(told.number, 0),
-                mean=filled(told.mean, 0),
-                covariance=filled(told.covariance, 0).reshape(rows, model.tangent**2),
-            ),
-            ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/existence",
-                schemas.EXISTENCE,
-                track_ns,
-                existence=filled(told.existence, 0),
-            ),
-            ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/association",
-                schemas.ASSOCIATION,
-                scans.time_ns[scan],
-                metadata={"sensors": sensors},
-                track_id=pair[:, 0],
-                sensor_id=scans.sensor[scan],
-                scan_id=scans.number[scan],
-                detection=pair[:, 2],
-                probability=filled(told.associated, 1),
-            ),
-            pair_ends,
-        ),
-        (
-            make_stream(
-                f"{topic}/approximation",
-                schemas.APPROXIMATION,
-                scans.time_ns[approximated],
-                tracks=told.approximated[approximated],
-            ),
-            np.searchsorted(approximated, scans.offsets),
-        ),
-        (
-            reason_stream(
-                f"{topic}/unused",
-                schemas.SKIPPED,
-                scans.time_ns[unused],
-                np.where(late[unused], 1, 0),
-                UNUSED,
-            ),
-            np.searchsorted(unused, scans.offsets),
-        ),
-        (
-            make_stream(
-                f"{topic}/rewound",
-                schemas.REWOUND,
-                scans.time_ns[: min(repeated, 1)],
-                repeated=[repeated] * min(repeated, 1),
-            ),
-            np.minimum(scans.offsets, repeated),
-        ),
-    )
-    outputs = [Ragged(stream, bounds) for stream, bounds in streams]
-    if setup.tracker.stage.modes:
-        modes = make_stream(
-            f"{topic}/modes",
-            schemas.MODE_PROBABILITIES,
-            track_ns,
-            metadata=named(dict.fromkeys(model.modes or (), "linear")),
-            probability=filled(told.probability, 0),
-        )
-        outputs.append(Ragged(modes, ends))
-    of_pairs = pair, filled(told.associated, 1), filled(told.white, 1), filled(told.factor, 1)
-    return [*outputs, *_innovations(setup, scans, pair_ends, *of_pairs)]
-
-
-def _innovations(
-    setup: Setup,
-    scans: Scans,
-    ends: Integers,
-    pair: Integers,
-    probability: Floats,
-    white: Floats,
-    factor: Floats,
-) -> Iterator[Ragged]:
-    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
-    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
-    track, scan = pair[order, 0], pair[order, 1]
-    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
-    likeliest = np.sort(order[is_first])
-    for sensor, (kind, topic) in enumerate(zip(setup.found.kinds, setup.found.scans, strict=True)):
-        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
-        measured = KINDS[kind].measured
-        size = len(measured)
-        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
-        stream = innovation_stream(
-            f"/estimates/{setup.name}{topic.removesuffix('/scan')}/innovation",
-            scans.time_ns[pair[rows, 1]],
-            measured,
-            "",
-            target_id=pair[rows, 0],
-            accepted=np.ones(len(rows), np.int64),
-            innovation=np.einsum("nij,nj->ni", root, whitened),
-            covariance=root @ root.transpose(0, 2, 1),
-            squared=(whitened**2).sum(axis=1),
-        )
-        yield Ragged(stream, np.searchsorted(rows, ends))
 
 
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
@@ -564,13 +425,17 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     if not parameters.smoothed:
         return [tracking]
     if settings.errors.names:
-        raise BadInput(f"estimator {name}: errors of sensors are not smoothed; leave out one of both")
+        raise BadInput(
+            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
+            "of sensors"
+        )
     return [smoothing_tracks(tracking, targets)]
 
 
 TRACKER = Estimator(
     "tracks of many targets from the unordered scans of several sensors",
-    "per sensor .../scan and .../detection (places) or .../range_bearing, or .../bearing beside those",
+    "per sensor .../scan and .../detection (positions) or .../range_bearing, or .../bearing beside "
+    "those",
     TrackerParameters,
     _bind,
     variant="association",

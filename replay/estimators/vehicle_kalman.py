@@ -22,11 +22,11 @@ from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switc
 
 
 class VehicleParameters(ModelParameters):
-    """How the vehicle is supposed to move; None takes what its prior's channel states.
+    """How the vehicle moves, and the rates of change between its modes.
 
     A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used. The
-    last four are rates of changes between modes, per second: out of driving, back to it, from a
-    manoeuvre to standing, and from there to a manoeuvre.
+    four rates are per second: `manoeuvres_per_s` from driving to a manoeuvre, `settles_per_s` back,
+    `stops_per_s` from a manoeuvre to standing, `starts_per_s` from there to a manoeuvre.
     """
 
     turn_rate_radps: float | None = None

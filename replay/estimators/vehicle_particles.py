@@ -64,7 +64,10 @@ _choose = compiled(choose_systematically)
 
 
 class ParticlesParameters(Parameters):
-    """The method with its number of particles; the seed is mixed with each run's own first fixes."""
+    """The method with its number of particles.
+
+    Random numbers depend on `seed` and on the run's first fixes.
+    """
 
     method: str = "associations-60"
     seed: NonNegativeInt = 0

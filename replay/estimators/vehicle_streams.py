@@ -47,7 +47,7 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method, and from which scan on the sensor's pose may be found.
+    """The method, and the scan from which on the sensor's pose may be estimated.
 
     A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used.
     """

@@ -55,8 +55,10 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """What is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where the model does not let one of it, one stands twice, or has no sigma.
+    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
+    one that is asked for, one stands twice, or has no sigma.
     """
+    check_estimable(f"estimator {label}", model)
     asked = parameters.estimate or []
     options = {
         "estimate_sigma": parameters.estimate_sigma or {},
@@ -73,18 +75,18 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
         own = point_errors(where, model, asks)
         if not own and asks not in model.estimable:
             known = choices(asks, model.estimable)
-            raise BadInput(f"{where}: is no parameter that this model lets be estimated; {known}")
+            raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
-            raise BadInput(f"{where}: stands there twice; name it once")
+            raise BadInput(f"{where}: is named twice; name it once")
         sigma, drift, time_s = (given.get(asks) for given in options.values())
         if sigma is None:
             raise BadInput(
-                f"{where}: how well is it known beforehand? give its standard deviation, "
+                f"{where}: its uncertainty at the start is missing; give its standard deviation, "
                 f"estimate_sigma.{asks}=..."
             )
         if time_s is not None and model.estimable.get(asks) == "angle":
             raise BadInput(
-                f"{where}: is an angle, which has no mean to come back to; give "
+                f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
             )
         walk = Walk(sigma, drift or 0.0, time_s or np.inf)
@@ -93,6 +95,23 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
         else:
             named[asks] = walk
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
+
+
+def check_estimable(where: str, model: Model) -> None:
+    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
+    if not isinstance(model.estimable, Mapping):
+        raise BadInput(
+            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
+            'to kind, such as {"length_m": "linear"}'
+        )
+    known = number_fields(model.parameters)
+    for name, kind in model.estimable.items():
+        if name not in known:
+            raise BadInput(
+                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+            )
+        if kind not in ("linear", "angle"):
+            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
@@ -142,7 +161,10 @@ def begin(
     )
     for name, mean in zip(added.names, means, strict=True):
         if not np.isfinite(mean):
-            raise BadInput(f"estimator {label}: estimate = {name}: give its likely value, {name}=...")
+            raise BadInput(
+                f"estimator {label}: estimate = {name}: its value at the start is missing; give "
+                f"{name}=..."
+            )
     variances = np.array([walk.sigma**2 for walk in added.walks])
 
     def extended(prior: Ragged) -> Ragged:

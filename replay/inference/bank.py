@@ -42,11 +42,10 @@ AGREED = 0.1  # members become one where their means are on average so near, as 
 
 
 class BankParameters(UnscentedParameters, RegressionParameters):
-    """The filter of every member, and how many members a whole turn has.
+    """The filter of every member, and the number of members for a whole turn.
 
-    They lie side by side at such angles, each with half the distance for its standard deviation, so that
-    the sum of a row of them is smooth; a narrower prior has the fewer. One that is no wider than a
-    member is left whole.
+    Members lie side by side, and the standard deviation of each is half their distance, so that their
+    sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not cut.
     """
 
     filter: str = "ekf"

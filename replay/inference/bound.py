@@ -53,7 +53,7 @@ from replay.inference.steps import (
 
 
 class BoundParameters(MethodParameters):
-    """Whether filters or smoothers are bounded, and the longest gap over which truth is interpolated."""
+    """The bound of filters or of smoothers, and the longest gap over which the truth is interpolated."""
 
     of: Literal["filter", "smoother"] = "filter"
     gap_limit_s: PositiveFloat = 0.2
@@ -276,8 +276,8 @@ class BoundFilter(Filter):
         """The topics of a log that it starts from; raises BadInput where it has no truth."""
         if self.truth not in topics:
             raise BadInput(
-                f"estimator {self.name}: a bound is of the true states, and there is no topic "
-                f"{self.truth}; give a log that has it, such as a simulated one"
+                f"estimator {self.name}: a bound needs the true states, and there is no topic "
+                f"{self.truth}; give a log with a truth, such as a simulated one"
             )
         return (*super().whole(topics), self.truth)
 

@@ -17,6 +17,7 @@ from recorders.models.planar import wrap_angle
 from recorders.parameters import build
 from replay.engine.arrays import Floats, Function
 from replay.engine.tangent import WIDTHS, tangent_components
+from replay.inference.augmentation import check_estimable
 from replay.inference.generate import (
     Input,
     adding_noise,
@@ -99,6 +100,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
+        check_estimable("check_model", model)
         check_correction("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)

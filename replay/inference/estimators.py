@@ -243,7 +243,7 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
             fix = found.geodetic[0].name
             role = next(each.topic for each, of in found.sensors if of.name == fix)
             raise BadInput(
-                f"estimator {label}: {fix} is latitude and longitude, {topic.name} a position in "
+                f"estimator {label}: {fix} has latitudes and longitudes, {topic.name} positions in "
                 f"{topic.metadata.get('frame_id', 'a frame of its own')}, and no channel states where "
                 f"on earth that is (origin_latitude_deg, origin_longitude_deg); leave one of them out "
                 f"with --set topics.{role}= or --set topics.{sensor.topic}="

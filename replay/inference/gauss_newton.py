@@ -152,10 +152,8 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         trajectory, begin, end = memory.filter.samples[0], offsets[run], offsets[run + 1]
         ended.passes[run] = ended.converged[run] = 0
         best, damping, again, last = np.inf, plan.damping, False, False
-        taken, promised = (
-            0.0,
-            0.0,
-        )  # the damping of the last step, and a gain that it must not miss by far
+        # the damping of the last step, and a gain that it must not miss by far
+        taken, promised = 0.0, 0.0
         while begin < end:
             trajectory.damping[0] = damping
             well = go_forward(

@@ -58,9 +58,10 @@ LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many t
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
-    """The filter that every mode has; `smoothed_modes` asks for the modes' probabilities given all data.
+    """The filter of every mode.
 
-    These come at the end of a run, on a topic of their own; the state is not smoothed.
+    With `smoothed_modes` the probabilities of the modes given all data are written too, at the end of
+    the run and on a topic of their own; the state is not smoothed.
     """
 
     filter: str = "ekf"

@@ -30,12 +30,13 @@ from replay.inference.steps import Gaussian, Stage, Steps
 
 
 class IteratedParameters(SmootherParameters):
-    """Of `smoother:iterated`: where the search starts, how it is damped, what outliers cost.
+    """The start of the search, its damping, and the loss of outliers.
 
-    `start` is the extended filter smoothed once, the prior's mean moved along, or that mean everywhere.
-    `damping` is that of the first step: the information that holds a state where it is, in units of what
-    the start has of it; without any, Gauss-Newton is damped only where its cost would rise. With `huber`
-    and `cauchy` a measurement whose whitened residual is longer than `loss_scale` counts less.
+    `start` is smoother (the extended filter, smoothed once), motion (the prior's mean, moved along) or
+    prior (that mean at all stamps). `damping` is that of the first step, in units of the information at
+    the start; with 0, Gauss-Newton is damped only where its cost would rise. With the losses huber and
+    cauchy a measurement whose whitened residual is longer than `loss_scale` counts less. The search
+    ends after `iterations` at most.
     """
 
     start: Literal["smoother", "motion", "prior"] = "smoother"

@@ -59,15 +59,15 @@ SETTLED = 1e-12  # of the iterated update: the largest component of the last ste
 
 
 class MethodParameters(Parameters):
-    """What every method takes.
+    """Options of every method.
 
-    `every_s` asks for estimates every so often, beside those at the stamps of sensors; `mode` is the
-    motion to use of a model that has several. `estimate` names parameters that become part of the state:
-    each starts from its value with the standard deviation that `estimate_sigma` has for it, and drifts
-    at random by the density (per square root of a second) that `estimate_drift` has, by default not, and
-    comes back within about the time that `estimate_time_s` has: a first-order Gauss-Markov process.
-    `topics` says which topic of the log stands for one that the model asks for, such as
-    {pose = "/amcl_pose/pose"}; an empty name leaves a sensor out.
+    `every_s` asks for estimates at this interval too, besides those at the sensors' stamps. `mode` is
+    the motion to use of a model that has several. `estimate` names parameters that become part of the
+    state: each starts from its value with the standard deviation in `estimate_sigma`. It is constant,
+    or walks at random with the density in `estimate_drift` (its unit per square root of a second), or
+    returns to its value within about the time in `estimate_time_s`, as a first-order Gauss-Markov
+    process. `topics` says which topic of the log stands for one that the model asks for, such as {pose
+    = "/amcl_pose/pose"}; an empty name leaves a sensor out.
     """
 
     every_s: PositiveFloat | None = None
@@ -80,13 +80,13 @@ class MethodParameters(Parameters):
 
 
 class UnscentedParameters(MethodParameters):
-    """The unscented filter's spread: 3 - n is Julier's choice for a Gaussian, 0 the cubature filter."""
+    """`kappa` sets how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter."""
 
     kappa: float = 0.0
 
 
 class RegressionParameters(MethodParameters):
-    """The sampling's name, see `replay.sampling.names`; the seed is for randomised ones."""
+    """`sampling` is the name of a sampling, such as s2kf-50; `seed` is for random ones."""
 
     sampling: str = "ukf"
     seed: NonNegativeInt = 0
@@ -362,7 +362,7 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
     """
     name, _, variant = text.partition(":")
     if name not in FILTERS:
-        raise BadInput(f"'{name}' is no filter {use}; {choices(name, FILTERS)}")
+        raise BadInput(f"'{name}' is not a filter {use}; {choices(name, FILTERS)}")
     if variant and FILTERS[name].variant is None:
         raise BadInput(f"filter {name} has no variants; give '{method}:{name}' without ':{variant}'")
     return name, variant

@@ -26,23 +26,23 @@ FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 
 class ModelParameters(Parameters):
-    """Base of a model's parameters: numbers, which are run-time values of the compiled filter.
+    """Options of every model.
 
-    A parameter that is None is what the channels of the log state: a sensor's own first, then those of
-    control, prior and the other sensors.
+    A parameter that is none is what the channels of the log state: the sensor's own first, then those
+    of control, prior and the other sensors.
     """
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """A measurement is left out if its NIS lies beyond this quantile of chi-square; 1 takes all in."""
+    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
     gate_reopens_s: PositiveFloat | None = None
-    """The gate is open where a sensor's last measurement that was let in is older, so that a filter that
-    has lost its way, as in an outage, does not keep out all that would bring it back."""
+    """The gate is open for a sensor whose last accepted measurement is older, so that a filter that has
+    drifted, as in an outage, accepts what brings it back."""
     inflate_nis: PositiveFloat | None = None
-    """An innovation with a greater NIS counts with a larger covariance, by which it has this NIS."""
+    """An innovation with a greater NIS counts with a larger covariance, which gives it this NIS."""
     student_freedom: PositiveFloat | None = None
-    """Innovations count as if drawn from Student's distribution of so many degrees of freedom."""
+    """Innovations count as if they had Student's distribution with so many degrees of freedom."""
     switch_nis: PositiveFloat | None = None
-    """Above this NIS a measurement is switched off by degrees, as in dynamic covariance scaling."""
+    """Above this NIS a measurement counts less and less, as in dynamic covariance scaling."""
     sigma_fix_m: PositiveFloat | None = None
     """Standard deviation, in m, of each component of a fix that does not state its covariance."""
 
@@ -424,8 +424,8 @@ def check_state(where: str, model: Model) -> None:
     """Raise BadInput where a state's kinds are none."""
     if not are_kinds(model.kinds):
         raise BadInput(
-            f"{where}: a state of kinds {', '.join(model.kinds)}; known are linear, angle, axis (two "
-            "side by side) and quaternion (four side by side)"
+            f"{where}: a state of kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
+            "side by side) or quaternion (four side by side)"
         )
 
 
@@ -494,7 +494,7 @@ def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Flo
     if not (np.all(initial >= 0.0) and abs(initial.sum() - 1.0) < 1e-9):
         told = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
         raise BadInput(
-            f"{where}: the modes' initial probabilities are {told}; give numbers of zero or more "
+            f"{where}: the initial probabilities of the modes are {told}; give numbers of zero or more "
             "whose sum is one"
         )
     return rates, initial
@@ -505,18 +505,20 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
-        raise BadInput(f"{where}: measures a component of kind {unknown[0]}; known are linear and angle")
+        raise BadInput(f"{where}: measures a component of kind {unknown[0]}; give linear or angle")
     state, about = trial_state(model.kinds), (1.0,) * sensor.about_size
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
-        raise BadInput(f"{where}: says nothing of its noise; give `noise`, or `covariance`, a field")
+        raise BadInput(f"{where}: states no noise; give `noise`, or `covariance`, the field that has it")
     if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:
         raise BadInput(
-            f"{where}: the covariance {sensor.covariance} is of no vector; give `vector`, a field"
+            f"{where}: the covariance {sensor.covariance} needs the field that it is of; give `vector`"
         )
     if callable(sensor.covariance) and sensor.read is None:
-        raise BadInput(f"{where}: reads covariances of what it does not read; give `read` as well")
+        raise BadInput(
+            f"{where}: reads covariances of fields that it does not read; give `read` as well"
+        )
     if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
         _check(where, sensor.noise, (parameters,), wanted)

@@ -42,7 +42,7 @@ WEAK = 10.0  # priors
 
 
 class ObservabilityParameters(MethodParameters):
-    """How long a window is, by default the whole run, and scales by component instead of the prior's."""
+    """The length of a window, none for the whole run, and scales in place of the prior's."""
 
     window_s: PositiveFloat | None = None
     scales: dict[str, PositiveFloat] = {}
@@ -204,7 +204,7 @@ class Observability(IteratedSmoother):
         for name, scale in self.parameters.scales.items():
             if name not in self.components:
                 raise BadInput(
-                    f"estimator {self.name}: scale {name}: no such component; "
+                    f"estimator {self.name}: --scale {name}: the state has no such component; "
                     f"{choices(name, self.components)}"
                 )
             scales[:, self.components.index(name)] = scale

@@ -11,6 +11,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Integers
 from replay.engine.blocks import Ragged
 from replay.engine.compile import compiled
+from replay.engine.failures import reason_stream
 from replay.engine.philox import WORDS, fill_normals, run_key
 from replay.engine.results import ALL_WELL, named
 from replay.inference.filtering import Filter, State
@@ -37,10 +38,11 @@ MOST_PARTICLES = 1_000_000
 
 
 class ParticleParameters(MethodParameters):
-    """How many particles there are, and the seed, which is mixed with each run's own first measurement.
+    """The number of particles, and when they are resampled.
 
-    They are resampled where the effective number of them, 1 / sum w^2, is below that share of all. With
-    `cloud` every estimate comes with all particles, as a density.
+    That is where their effective number, 1 / sum w^2, is below the share `resample_below` of all. With
+    `cloud` every estimate comes with all its particles. Random numbers depend on `seed` and on the
+    run's first measurement.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000
@@ -131,7 +133,28 @@ class ParticleFilter(Filter):
         is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(happenings.offsets))
         waiting = None if is_ready.all() else of_rows(happenings, ~is_ready)
         ready = happenings if is_ready.all() else of_rows(happenings, is_ready)
-        return super().follow(after._replace(kept=waiting), ready)
+        after, made = super().follow(after._replace(kept=waiting), ready)
+        return after, [*made, *self.cautions(happenings.time_ns, first, len(place) - 1)]
+
+    def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
+        """On the topic `started` of runs that begin at these rows: which parameters cannot change."""
+        options = self.parameters
+        moving = {*(options.estimate_time_s or ())}
+        moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
+        constant = [name for name in options.estimate or () if name not in moving]
+        if not constant or not first:
+            return []
+        stream = reason_stream(
+            f"/estimates/{self.name}/started",
+            schemas.STARTED,
+            time_ns[[*first.values()]],
+            np.zeros(len(first), np.int64),
+            [
+                f"{', '.join(constant)} is constant, and particles have only the values that were drawn "
+                "at the start; give estimate_drift, or take a Gaussian filter such as ekf"
+            ],
+        )
+        return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
     def finish(self, state: State) -> list[Ragged]:
         """What waited for a control or a measurement that did not come; then the prior seeds the run."""

@@ -48,7 +48,7 @@ IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a te
 
 
 class SmootherParameters(UnscentedParameters, RegressionParameters):
-    """The filter that goes forward, and after `lag=` how far the way back reaches: `ekf:lag=500ms`.
+    """The filter that goes forward, perhaps with a lag, as in `ekf:lag=500ms`.
 
     Without a lag every estimate uses the whole run; with one, the messages up to so much later.
     """
@@ -74,7 +74,7 @@ def parse_forward(text: str) -> Forward:
     found = re.fullmatch(rf"(\d+)({'|'.join(UNITS_NS)})", lag)
     if found is None or int(found[1]) == 0:
         raise BadInput(
-            f"lag={lag} is no lag; give a whole number above zero and its unit, one of "
+            f"lag={lag} is not a lag; give a whole number above zero and its unit, one of "
             f"{', '.join(UNITS_NS)}, as in smoother:ekf:lag=500ms"
         )
     return Forward(name, variant, int(found[1]) * UNITS_NS[found[2]])

@@ -6,7 +6,7 @@ that each track has each detection (`association`); what is left over may begin 
 says which tracks are those of targets, and which end (`track_management`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from replay.inference.association import ASSOCIATIONS
 from replay.inference.gaussian import copy_gaussian
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.imm import Belief, interacting_steps
+from replay.inference.model import Model
 from replay.inference.motion_steps import linear_motion, nothing
 from replay.inference.scanning import (
     BY_SCAN,
@@ -149,42 +150,88 @@ def choosing(functions: list[Function], arguments: str) -> Function:
     return function_of("\n".join(lines), **{f"function_{k}": each for k, each in enumerate(functions)})
 
 
+class Births(NamedTuple):
+    """How detections begin tracks, by kind of sensors.
+
+    Attributes:
+        begins: whether those of a kind do.
+        number: of a kind that does, its number in `birth`.
+        birth: (number, detection, origin, parameters) -> see `ScanSensor.birth`.
+    """
+
+    begins: tuple[bool, ...]
+    number: tuple[int, ...]
+    birth: Function
+
+
+def births_of(kinds: Sequence[ScanSensor]) -> Births:
+    """The births of these kinds of sensors."""
+    begins = tuple(kind.birth is not None for kind in kinds)
+    births = [kind.birth for kind in kinds if kind.birth is not None]
+    number = tuple(sum(begins[:k]) for k in range(len(kinds)))
+    return Births(begins, number, choosing(births, "detection, origin, parameters"))
+
+
+def place_of(model: Model) -> tuple[int, int]:
+    """Where the position stands in the state."""
+    names = list(model.state)
+    return names.index("x_m"), names.index("y_m")
+
+
+def corner_of(model: Model) -> tuple[int, int]:
+    """Where the position stands in the tangent space."""
+    tangent = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+    return tangent.index("x_m"), tangent.index("y_m")
+
+
 def tracking(tracker: Tracker, read: Function) -> Function:
     """The loop over the scans of one run, for `replay.engine.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
-    stage, kinds = tracker.stage, tracker.kinds
-    model, modes = stage.model, tracker.sizes[0]
-    names = list(model.state)
-    x, y = names.index("x_m"), names.index("y_m")
-    has_velocity = "vx_mps" in names and "vy_mps" in names
-    velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
-    tangent = [name for name, _ in tangent_components(names, model.kinds)]
-    corner = tangent.index("x_m"), tangent.index("y_m")
-    steps, belief_of, associate = moving(stage), believing(stage), ASSOCIATIONS[tracker.association]
-    predict, estimate = steps.predict, steps.estimate
-    wait, judge, is_over = MANAGEMENTS[tracker.management]
-    observe = choosing(
-        [observing(model, kind) for kind in kinds],
-        "track, mode, mean, covariance, origin, parameters, memory",
-    )
-    compare = choosing([comparing(kind) for kind in kinds], "track, mode, detection, memory")
-    update = choosing(
-        [updating(model, kind) for kind in kinds], "track, mode, detections, mean, covariance, memory"
-    )
-    detection_of = choosing([kind.detection for kind in kinds], "target, origin, parameters")
-    clutter_of = choosing([kind.clutter for kind in kinds], "detection, parameters")
-    begins = tuple(kind.birth is not None for kind in kinds)
-    shared_at, shared = tracker.shared
-    births = [kind.birth for kind in kinds if kind.birth is not None]
-    correlate = nothing
-    if shared_at < model.size:
-        correlations = [correlating(model, kind, corner) for kind in kinds if kind.birth is not None]
-        correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
-    birth_number = tuple(sum(begins[:k]) for k in range(len(kinds)))
-    birth = choosing(births, "detection, origin, parameters")
-    read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
+    stage, associate = tracker.stage, ASSOCIATIONS[tracker.association]
+    advance, weigh, take_in = advancing(tracker), weighing(tracker), taking_in(tracker)
+    end_tracks, begin_tracks = ending(tracker), beginning(tracker)
+    tell_pairs, tell_tracks = telling_pairs(tracker.sizes[0]), telling_tracks(stage)
+
+    def follow(
+        run: int,
+        scans: Scans,
+        settings: Floats,
+        newborn: Newborn,
+        tracks: Tracks,
+        told: Told,
+        memory: Memory,
+    ) -> None:
+        """Take one run through its scans."""
+        for scan in range(scans.offsets[run], scans.offsets[run + 1]):
+            p = read(settings, scans.sensor[scan])
+            if scans.time_ns[scan] < tracks.time_ns[run]:
+                continue
+            advance(run, scans.time_ns[scan], tracks, p, memory)
+            count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
+            weigh(run, scan, count, scans, tracks, p, memory)
+            used = tracks.used[run]
+            told.approximated[scan] = associate(
+                memory.weights, used, count, memory.probability, memory.association
+            )
+            for detection in range(count):
+                memory.left[detection] = 1.0
+                for place in range(used):
+                    memory.left[detection] -= memory.probability[place, 1 + detection]
+            tell_pairs(run, scan, count, tracks, told, memory)
+            take_in(run, scan, count, scans, tracks, p, memory)
+            end_tracks(run, tracks, p)
+            told.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
+            tell_tracks(run, scan, tracks, told, memory)
+
+    return follow
+
+
+def advancing(tracker: Tracker) -> Function:
+    """`advance(run, time_ns, tracks, p, memory)`: the prediction of all tracks."""
+    belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
+    wait, _, _ = MANAGEMENTS[tracker.management]
 
     def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: Memory) -> None:
         """Predict all tracks."""
@@ -195,6 +242,22 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 predict(place, belief, memory.shift, duration_s, p, 0, memory.motion)
                 wait(run, place, duration_s, tracks, p)
         tracks.time_ns[run] = time_ns
+
+    return advance
+
+
+def weighing(tracker: Tracker) -> Function:
+    """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
+    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    observe = choosing(
+        [observing(model, kind) for kind in kinds],
+        "track, mode, mean, covariance, origin, parameters, memory",
+    )
+    compare = choosing([comparing(kind) for kind in kinds], "track, mode, detection, memory")
+    detection_of = choosing([kind.detection for kind in kinds], "target, origin, parameters")
+    clutter_of = choosing([kind.clutter for kind in kinds], "detection, parameters")
+    begins, birth_number, birth = births_of(kinds)
+    read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
 
     def detectable(run: int, place: int, kind: int, origin: Any, tracks: Tracks, p: Any) -> float:
         """How probable it is that a sensor detects a track's target."""
@@ -244,6 +307,18 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     total += memory.likelihood[place, mode, detection]
                 weights.detected[place, detection] *= total
 
+    return weigh
+
+
+def taking_in(tracker: Tracker) -> Function:
+    """`take_in(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
+    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    update = choosing(
+        [updating(model, kind) for kind in kinds], "track, mode, detections, mean, covariance, memory"
+    )
+    _, judge, _ = MANAGEMENTS[tracker.management]
+    begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
+
     def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: Memory) -> None:
         """Update a track's Gaussians and the probabilities of its modes by its associations."""
         for mode in range(modes):
@@ -278,6 +353,17 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         if shared > 0:
             pool_errors(run, shared_at, tracks, memory.pool)
 
+    return take_in
+
+
+def ending(tracker: Tracker) -> Function:
+    """`end_tracks(run, tracks, p)`: which tracks are over."""
+    names = list(tracker.stage.model.state)
+    x, y = place_of(tracker.stage.model)
+    has_velocity = "vx_mps" in names and "vy_mps" in names
+    velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
+    _, _, is_over = MANAGEMENTS[tracker.management]
+
     def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
         """Whether an older confirmed track is about where this confirmed one is, and moves alike."""
         for other in range(place if tracks.is_confirmed[run, place] else 0):
@@ -299,6 +385,19 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 drop(run, place, tracks)
             else:
                 place += 1
+
+    return end_tracks
+
+
+def beginning(tracker: Tracker) -> Function:
+    """`begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
+    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
+    (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
+    begins, birth_number, birth = births_of(kinds)
+    correlate, read_pair = nothing, tuple_of(2)
+    if shared_at < model.size:
+        correlations = [correlating(model, kind, corner) for kind in kinds if kind.birth is not None]
+        correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
         """Whether a confirmed track is too near for another one to begin."""
@@ -374,6 +473,12 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 tracks.updated_ns[run, place, sensor] = NEVER
         return turned_away
 
+    return begin_tracks
+
+
+def telling_pairs(modes: int) -> Function:
+    """`tell_pairs(run, scan, count, tracks, told, memory)`: the associations of confirmed tracks."""
+
     def tell_pairs(run: int, scan: int, count: int, tracks: Tracks, told: Told, memory: Memory) -> None:
         """Tell which detections went to confirmed tracks."""
         for place in range(tracks.used[run]):
@@ -393,6 +498,13 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                     copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
                     told.end[run, 1] = row + 1
 
+    return tell_pairs
+
+
+def telling_tracks(stage: Stage) -> Function:
+    """`tell_tracks(run, scan, tracks, told, memory)`: the confirmed tracks."""
+    belief_of, estimate = believing(stage), moving(stage).estimate
+
     def tell_tracks(run: int, scan: int, tracks: Tracks, told: Told, memory: Memory) -> None:
         """Tell the confirmed tracks as they are now."""
         belief = belief_of(run, tracks)
@@ -407,38 +519,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 told.end[run, 0] = row + 1
                 told.confirmed[scan] += 1
 
-    def follow(
-        run: int,
-        scans: Scans,
-        settings: Floats,
-        newborn: Newborn,
-        tracks: Tracks,
-        told: Told,
-        memory: Memory,
-    ) -> None:
-        """Take one run through its scans."""
-        for scan in range(scans.offsets[run], scans.offsets[run + 1]):
-            p = read(settings, scans.sensor[scan])
-            if scans.time_ns[scan] < tracks.time_ns[run]:
-                continue
-            advance(run, scans.time_ns[scan], tracks, p, memory)
-            count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
-            weigh(run, scan, count, scans, tracks, p, memory)
-            used = tracks.used[run]
-            told.approximated[scan] = associate(
-                memory.weights, used, count, memory.probability, memory.association
-            )
-            for detection in range(count):
-                memory.left[detection] = 1.0
-                for place in range(used):
-                    memory.left[detection] -= memory.probability[place, 1 + detection]
-            tell_pairs(run, scan, count, tracks, told, memory)
-            take_in(run, scan, count, scans, tracks, p, memory)
-            end_tracks(run, tracks, p)
-            told.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
-            tell_tracks(run, scan, tracks, told, memory)
-
-    return follow
+    return tell_tracks
 
 
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.

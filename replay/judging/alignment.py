@@ -74,7 +74,8 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
             "two apart in the plane" if align in ("yaw", "se2") else "three that are not in one line"
         )
         raise BadInput(
-            f"{where}: {len(estimate_m)} poses do not tell the {align} alignment; it needs {needed}, or "
+            f"{where}: {len(estimate_m)} poses do not determine the {align} alignment, which needs "
+            f"{needed}; add poses, or "
             "give another alignment"
         )
     scale = 1.0
@@ -129,7 +130,8 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
         mean[:, column] = wrap_angle(mean[:, column] + yaw_rad)
     if is_flat and alignment.rotation[2, 2] < LEAST_COSINE:
         raise BadInput(
-            f"topic {estimates.topic}: is planar, and the alignment turns it out of its plane; take se2"
+            f"topic {estimates.topic}: is planar, and the alignment would turn it out of its plane; "
+            "give --align se2"
         )
     quaternion = Rotation.from_matrix(alignment.rotation).as_quat(scalar_first=True)
     for kind, columns_of in things(kinds):

@@ -50,7 +50,7 @@ def gospa(
     positive, the order is below 1, or alpha is not in (0, 2].
     """
     if not 0.0 < alpha <= 2.0:
-        raise BadInput(f"alpha {alpha:g}: GOSPA wants one above 0 and up to 2")
+        raise BadInput(f"alpha {alpha:g}: give one above 0 and up to 2")
     costs = _assigned_costs(estimates, truths, cutoff, order)
     pairs = costs.pairs
     if alpha == 2.0:
@@ -93,13 +93,18 @@ def _assigned_costs(estimates: ArrayLike, truths: ArrayLike, cutoff: float, orde
     from scipy.spatial.distance import cdist
 
     if not (0.0 < cutoff < np.inf and 1.0 <= order < np.inf):
-        raise BadInput(f"cutoff {cutoff:g}, order {order:g}: a positive cutoff and an order from 1 on")
+        raise BadInput(
+            f"cutoff {cutoff:g}, order {order:g}: give a positive cutoff, and an order from 1 on"
+        )
     first, second = _points(estimates, "estimates"), _points(truths, "truths")
     if len(first) == 0 or len(second) == 0:
         nobody = np.empty(0, np.int64)
         return _Costs(len(first), len(second), np.empty(0), nobody, nobody)
     if first.shape[1] != second.shape[1]:
-        raise BadInput(f"estimates have {first.shape[1]} components, truths {second.shape[1]}")
+        raise BadInput(
+            f"estimates have {first.shape[1]} components and truths {second.shape[1]}; give both in "
+            "the same"
+        )
     costs = np.minimum(cdist(first, second), cutoff) ** order
     estimate, truth = linear_sum_assignment(costs)
     return _Costs(len(first), len(second), costs[estimate, truth], estimate, truth)
@@ -110,5 +115,7 @@ def _points(points: ArrayLike, what: str) -> Floats:
     if found.size == 0:
         return np.empty((0, 0))
     if found.ndim != 2 or not np.isfinite(found).all():
-        raise BadInput(f"{what}: expected finite points (n, d), got shape {found.shape}; drop NaN")
+        raise BadInput(
+            f"{what}: expected finite points (n, d), found shape {found.shape}; leave out NaN"
+        )
     return found

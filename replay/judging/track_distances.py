@@ -159,7 +159,7 @@ def hota(
     is not positive.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive one")
+        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
     levels = np.atleast_1d(np.asarray(thresholds, float))
     first, second = _tracks(estimates, truths)
     similarity = np.nan_to_num(np.maximum(0.0, 1.0 - _distances(first, second) / cutoff))
@@ -186,7 +186,7 @@ def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float) -> float:
     assigned to, so that they are most; NaN where there is no point. Raises BadInput as `hota`.
     """
     if not 0.0 < cutoff < np.inf:
-        raise BadInput(f"cutoff {cutoff:g}: give a positive one")
+        raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
     first, second = _tracks(estimates, truths)
     together = (_distances(first, second) < cutoff).sum(axis=0)
     points = int(_present(first).sum() + _present(second).sum())

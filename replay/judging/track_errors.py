@@ -77,13 +77,19 @@ def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PE
             of[topic.schema_name].append(topic.name)
     scans, truths = (source.read(topics) for topics in of.values())
     if not scans or not truths:
-        raise BadInput(f"{source.name}: tracks are judged by scans and truths, and it lacks one of them")
+        raise BadInput(
+            f"{source.name}: has no scans or no truths, and tracks are judged by both; give a log with "
+            "them"
+        )
     last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
     last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
     first_ns = source.epoch_ns + round(settle_s * 1e9)
     at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
     if not len(at_ns):
-        raise BadInput(f"{source.name}: ends within {settle_s:g} s, before tracks are judged")
+        raise BadInput(
+            f"{source.name}: ends within {settle_s:g} s, and tracks are judged after these; give a "
+            "longer log"
+        )
     places = [
         [np.interp(at_ns - first_ns, truth.publish_time_ns - first_ns, axis) for axis in place.T]
         for truth in truths.values()

@@ -108,7 +108,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     """
     for each in (estimate, truth):
         if not len(each):
-            raise BadInput(f"{each.name}: holds no poses; give a trajectory that has some")
+            raise BadInput(f"{each.name}: has no poses; give a trajectory with poses")
     offset_s = comparison.time_offset_s
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
@@ -143,8 +143,8 @@ def associate(
     if times is None or true_times is None:
         if len(estimate) != len(truth):
             raise BadInput(
-                f"{(estimate if times is None else truth).name}: has no stamps, so that poses belong "
-                f"together by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
+                f"{(estimate if times is None else truth).name}: has no stamps, so that poses are "
+                f"paired by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
                 f"{len(truth)}: give both with stamps"
             )
         return estimate, truth
@@ -163,7 +163,7 @@ def associate(
         first, last = times[[0, -1]] * 1e-9
         true_first, true_last = true_times[[0, -1]] * 1e-9
         raise BadInput(
-            f"{estimate.name}: no stamps in common with {truth.name} within {limit_s:g} s: it is from "
+            f"{estimate.name}: has no stamps within {limit_s:g} s of those of {truth.name}: it is from "
             f"{first:.3f} to {last:.3f} s, the truth from {true_first:.3f} to {true_last:.3f} s; give "
             "files of one run, a wider limit, or a time offset"
         )
@@ -221,7 +221,7 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
     if len(ends) < 2:
         length = steps.sum() * (1e-9 if unit == "s" else 1.0)
         raise BadInput(
-            f"{estimate.name}: the way that has truth is {length:.6g} {unit} long; give a smaller delta "
+            f"{estimate.name}: the part with truth is {length:.6g} {unit} long; give a smaller delta "
             f"than {comparison.delta:g}"
         )
     return np.array(ends[:-1]), np.array(ends[1:])
@@ -302,7 +302,8 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
         speed = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
         if len(speed) < 2 or np.ptp(speed) <= 1e-6 * speed.max():
             raise BadInput(
-                f"{trajectory.name}: its speed never changes, so no offset can be found; give it in s"
+                f"{trajectory.name}: its speed never changes, so that no time offset can be found; "
+                "give the offset in s"
             )
         speeds.append(speed - speed.mean())
     offset_s = float(times[1][0] - times[0][0] + _best_lag(*speeds) * step_s)

@@ -53,11 +53,13 @@ def lcd_distance(points: Array, weights: Array | None = None) -> float:
         BadInput: the shapes do not fit, a value is not finite, or the weights do not sum to 1.
     """
     if points.ndim != 2 or 0 in points.shape or not np.isfinite(points).all():
-        raise BadInput(f"the samples must be finite and (count, dimension); got shape {points.shape}")
+        raise BadInput(
+            f"the samples must be finite and of shape (count, dimension); found {points.shape}"
+        )
     if weights is None:
         weights = np.full(len(points), 1 / len(points))
     if weights.shape != points.shape[:1] or not abs(weights.sum() - 1) < 1e-9:
-        raise BadInput(f"{len(points)} samples need as many weights, and these must sum to 1")
+        raise BadInput(f"{len(points)} samples need as many weights, whose sum must be 1")
     return lcd_distance_and_gradient(points, weights)[0]
 
 

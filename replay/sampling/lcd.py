@@ -79,7 +79,7 @@ def check_count(dimension: int, count: int, symmetric: bool) -> None:
     """Raise BadInput where `count` samples in `dimension` dimensions cannot have covariance I."""
     least = 2 * dimension if symmetric else dimension + 1
     if dimension < 1:
-        raise BadInput(f"a sample set needs a dimension of 1 or more, got {dimension}")
+        raise BadInput(f"a sample set needs a dimension of 1 or more, found {dimension}")
     if count < least:
         kind = "symmetric samples" if symmetric else "samples"
         raise BadInput(
@@ -97,5 +97,5 @@ def moment_corrected(points: Array) -> Array:
     centred = points - points.mean(axis=0)
     variances, axes = np.linalg.eigh(centred.T @ centred / len(points))
     if not variances[0] > 1e-12 * variances[-1]:
-        raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions")
+        raise BadInput(f"{len(points)} samples span fewer than {points.shape[1]} dimensions; give more")
     return centred @ (axes / np.sqrt(variances)) @ axes.T

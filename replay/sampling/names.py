@@ -47,7 +47,7 @@ class Sampling(BaseModel, ABC):
             BadInput: the dimension is below 1, or this sampling cannot serve it.
         """
         if dimension < 1:
-            raise BadInput(f"{self}: a sampling needs a dimension of 1 or more, got {dimension}")
+            raise BadInput(f"{self}: a sampling needs a dimension of 1 or more, found {dimension}")
         return self._at(dimension, report)
 
     @abstractmethod
@@ -131,7 +131,7 @@ def parse_sampling(name: str) -> Sampling:
     if match is None or family is None:
         known = ", ".join(FAMILIES)
         raise BadInput(
-            f"'{name}' is no sampling; write one of {known}, as in gf-25 or s2kf-50:symmetric"
+            f"'{name}' is not a sampling; give one of {known}, as in gf-25 or s2kf-50:symmetric"
         )
     given = [option.partition("=") for option in match["options"].split(":")[1:]]
     pairs = [(key, value or "true") for key, _, value in given]
@@ -139,7 +139,7 @@ def parse_sampling(name: str) -> Sampling:
         pairs.append((family.number or "number", match["number"]))
     values = dict(pairs)
     if len(values) < len(pairs):
-        raise BadInput(f"sampling '{name}' says something twice; say it once")
+        raise BadInput(f"sampling '{name}' has an option twice; give it once")
     try:
         return family.model_validate(values)
     except ValidationError as error:

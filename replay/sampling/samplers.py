@@ -67,7 +67,7 @@ def unscented(dimension: int, kappa: float = 0.5) -> Samples:
     spread = dimension + kappa
     if not spread > 0:
         raise BadInput(
-            f"kappa = {kappa} leaves no spread in {dimension} dimensions; take more than {-dimension}"
+            f"kappa = {kappa} gives no covariance in {dimension} dimensions; give more than {-dimension}"
         )
     weights = np.full(2 * dimension + 1, 1 / (2 * spread))
     weights[0] = kappa / spread

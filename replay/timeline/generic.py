@@ -79,7 +79,8 @@ def draw(canvas: Canvas, scene: Scene) -> Board:
     if not scene.outputs and not any(scene.source.topics[topic].messages for topic in topics):
         held = ", ".join(f"{each.name} ({each.encoding})" for each in scene.source.topics.values())
         raise BadInput(
-            f"{scene.source.name}: nothing to draw: no protobuf messages with numeric fields; it holds "
+            f"{scene.source.name}: has nothing to draw, no protobuf messages with numeric fields; its "
+            "topics are "
             f"{held or 'no topics'}"
         )
     turn_up(canvas)

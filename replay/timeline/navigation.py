@@ -44,8 +44,8 @@ ANGLES = ("roll", "pitch", "yaw")
 # What is plotted in one view, by the ends of the components' names.
 BIASES = (("gyro_bias_", "Gyro bias"), ("accelerometer_bias_", "Accelerometer bias"))
 FORWARD: tuple[Colour, ...] = ((230, 60, 40), (0, 158, 115), (0, 114, 178))
-# Ellipsoids along a path, which overlap to a tube.
-TUBE = 300
+# Ellipsoids along a path, which overlap to a tube: at most so many, so far apart for their size.
+TUBE, TUBE_STEP = 300, 0.5
 
 
 class Body(NamedTuple):
@@ -190,6 +190,12 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
     """Ellipsoids of two standard deviations along the path; as wires, for a viewer may be in one."""
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
+    reach = SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[rows])[:, -1].clip(0.0))
+    kept = [0]
+    for row, here in enumerate(place[rows]):
+        if np.linalg.norm(here - place[rows[kept[-1]]]) > TUBE_STEP * reach[kept[-1]]:
+            kept.append(row)
+    rows = rows[kept]
     values, vectors = np.linalg.eigh(covariance[rows])
     vectors[np.linalg.det(vectors) < 0, :, 0] *= -1.0  # a rotation, no reflection
     canvas.fix(

@@ -58,7 +58,7 @@ class Drawing:
     ) -> None:
         if save is None and connect is None:
             raise BadInput(
-                "a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both"
+                "a timeline needs a destination: give --save FILE.rrd, --connect URL, or both"
             )
         self._source, self._focus, self._save = source, focus, save
         self._sides = sides
@@ -124,7 +124,7 @@ class Drawing:
     def _draw(self, recording: rr.RecordingStream, scene: Scene, *, is_still: bool = False) -> None:
         if self._focus is not None and self._focus not in scene.cases:
             known = choices(self._focus, scene.cases)
-            raise BadInput(f"nothing called '{self._focus}' to show; {known}")
+            raise BadInput(f"--focus {self._focus}: nothing in this log has that name; {known}")
         canvas = _canvas(scene, recording, self._kept.outputs.values(), is_still)
         layout = self._timeline.draw(canvas, scene)
         if self._sides:

@@ -41,7 +41,7 @@ def open_recording(
     goes away; then no file is left.
     """
     if save is None and connect is None:
-        raise BadInput("a timeline needs a place to go: give --save FILE.rrd, --connect URL, or both")
+        raise BadInput("a timeline needs a destination: give --save FILE.rrd, --connect URL, or both")
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if connect is not None:
         _require_receiver(connect)
@@ -79,7 +79,9 @@ def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | Non
         failure = error
     is_closed = _close(recording, _FLUSH_S if failure is None else _GIVEN_UP_S)
     if connect is not None and not _answers(connect):  # which a flush does not always notice
-        raise BadInput(f"--connect {connect}: the receiver went away; start it again") from failure
+        raise BadInput(
+            f"--connect {connect}: the connection to the receiver was lost; start it again"
+        ) from failure
     if failure is not None or not is_closed:
         why = failure or "Rerun does not end"
         raise BadInput(f"{save or connect}: the timeline could not be written ({why})") from failure

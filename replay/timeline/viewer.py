@@ -60,7 +60,7 @@ def screenshot(
     """
     _require_timeline(rrd)
     if not png.parent.is_dir():
-        raise BadInput(f"{png}: its folder does not exist; create it first")
+        raise BadInput(f"{png}: the folder does not exist; make it first")
     with scratch_folder("fuselog-viewer") as folder, whole_file(png, parents=False) as new:
         window = f"{size[0]}x{size[1]}"
         with listen(folder, "--headless", "--hide-welcome-screen", "--window-size", window) as listener:
@@ -85,7 +85,7 @@ def view(rrd: Path) -> None:
     """
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        raise BadInput("there is no screen to show a timeline on; use --screenshot FILE.png")
+        raise BadInput("there is no screen to show a timeline on; give --screenshot FILE.png")
     options = [str(rrd), "--port", str(_free_port()), "--bind", "127.0.0.1"]
     with scratch_folder("fuselog-viewer") as folder:
         with _running(folder, options, _private_environment(folder)) as process:
@@ -222,7 +222,7 @@ def _require_timeline(rrd: Path) -> None:
     except OSError as error:
         raise BadInput(f"{rrd}: cannot be read ({error.strerror})") from None
     if magic != b"RRF2":
-        raise BadInput(f"{rrd}: not a timeline; give an .rrd file")
+        raise BadInput(f"{rrd}: is not a timeline; give an .rrd file")
 
 
 def _load(client: ViewerClient, rrd: Path) -> None:

@@ -11,7 +11,8 @@ In a page stands a comment, a template, and below it what it gives, up to `<!-- 
 `{NAME[KEY]:FORMAT}` is a metric of the experiment NAME, `{NAME[KEY][0]}` an entry of one that is a list,
 `{NAME.claims}` its table of claims, `{NAME.counted}` how many there are of each verdict, and
 `{NAME.verdicts}` the same in numbers alone. `{speed[WHAT]:.0f}` is how many times faster than a peer
-`make bench` found fuselog to be at WHAT, and `{speed.machine}` where.
+`make bench` found fuselog to be at WHAT, and `{speed.machine}` where. `{catalogue.data_sets}` is the
+table of public data and their experiments, `{catalogue.mappings}` that of the mappings that ship.
 """
 
 import json
@@ -22,8 +23,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
+from pipeline.catalog import scenarios
 from pipeline.claims import Verdict
+from pipeline.experiment import load_experiment, shipped
 from pipeline.results import MetricValue, Result, read_result
+from recorders.importers.tables.mapping import read_mapping
+from recorders.importers.tables.mapping import shipped as shipped_mappings
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
@@ -89,6 +94,36 @@ class Speed:
         return float(self._ratios[what].partition(" ")[0])
 
 
+class Catalogue:
+    """What ships for real data, by its own descriptions."""
+
+    @property
+    def data_sets(self) -> str:
+        """The table of data with the experiments that import them."""
+        experiments: dict[str, list[str]] = {}
+        for name in sorted(shipped("experiments")):
+            of = load_experiment(name, {}, {})[1].import_
+            if of is not None:
+                experiments.setdefault(of.parameters.get("mapping", of.source), []).append(name)
+        summaries = {entry.name: entry.what for entry in scenarios()} | _mappings()
+        rows = [
+            f"| {summaries[source]} | `fuselog run {first} --data PATH`"
+            f"{''.join(f'; `{name}`' for name in others)} |"
+            for source, (first, *others) in sorted(experiments.items())
+        ]
+        return "\n".join(["| data | experiments |", "|---|---|", *rows])
+
+    @property
+    def mappings(self) -> str:
+        """The table of the mappings that ship."""
+        rows = [f"| `{name}` | {summary} |" for name, summary in _mappings().items()]
+        return "\n".join(["| name | for |", "|---|---|", *rows])
+
+
+def _mappings() -> dict[str, str]:
+    return {name: read_mapping(name).summary for name in shipped_mappings()}
+
+
 def store(folder: Path) -> Path:
     """Keep what a result folder holds of claims, metrics and settings; not where its data lay."""
     result: Result = read_result(folder)
@@ -116,5 +151,5 @@ def speed() -> Speed:
 
 def rendered(page: str) -> str:
     """The text of a page with everything that is made from results made anew."""
-    known = {**stored(), "speed": speed()}
+    known = {**stored(), "speed": speed(), "catalogue": Catalogue()}
     return _BLOCK.sub(lambda block: f"{block[1]}{block[2].format_map(known)}\n{block[4]}", page)

@@ -9,6 +9,7 @@ import pytest
 from pipeline.claims import Claim
 from pipeline.experiment import load_experiment, shipped
 from pipeline.results import Outcome, result_folder, write_outcome
+from recorders.importers.tables.mapping import shipped as shipped_mappings
 from tests.bench import __main__ as bench
 from tests.claims import pages
 from tests.docs.reference import reference
@@ -90,3 +91,15 @@ def test_a_benchmark_is_kept_beside_the_others(tmp_path: Path, monkeypatch: pyte
     said = pages.rendered(f"<!-- results\n{template}\n-->\n<!-- end -->")
     assert f"-->\n5 and 4.2, {bench.machine()}\n" in said
     assert "cores" in bench.machine()
+
+
+def test_the_data_sets_are_all_there() -> None:
+    """Every experiment that imports data stands once in the table, every mapping in that of mappings."""
+    catalogue = pages.Catalogue()
+    imports = [name for name in shipped("experiments") if load_experiment(name, {}, {})[1].import_]
+    named = re.findall(r"`(?:fuselog run )?([a-z0-9-]+)(?: --data PATH)?`", catalogue.data_sets)
+    assert sorted(named) == sorted(imports)
+    assert re.findall(r"^\| `(.*?)`", catalogue.mappings, re.MULTILINE) == shipped_mappings()
+    page = (pages.ROOT / "docs" / "your-log.md").read_text(encoding="utf-8")
+    assert catalogue.data_sets in page
+    assert catalogue.mappings in page

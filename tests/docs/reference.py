@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline import catalog
 from pipeline.catalog import Entry
 from recorders.log.schemas import SCHEMAS, Field, Schema
-from recorders.parameters import describe
+from recorders.parameters import describe, explain
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
 from tests.bench.__main__ import COLUMNS
@@ -31,7 +31,8 @@ ROOMS = {
 KINDS: dict[str, tuple[Callable[[], list[Entry]], str]] = {
     "scenarios": (
         catalog.scenarios,
-        "What can be recorded or imported. `--set NAME=VALUE` changes a parameter.",
+        "What can be recorded or imported. `--set NAME=VALUE` changes a parameter, whose name "
+        "ends in its unit, such as `_m` or `_radps`.",
     ),
     "models": (
         catalog.models,
@@ -156,6 +157,8 @@ def _section(entry: Entry) -> Iterator[str]:
             [f"`{each.name}`", _value(each.default), each.accepts, each.meaning] for each in parameters
         ]
         lines = table(["parameter", "default", "accepts", "meaning"], rows)
+        for place, text in explain(entry.parameters).items() if entry.parameters else ():
+            lines += [*([f"**`{place}`**", ""] if place else []), *text.splitlines(), ""]
         yield from ["", f'??? note "{len(rows)} parameters"', "", *(f"    {line}" for line in lines)]
     yield ""
 

@@ -5,7 +5,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import fuselog as fl
 from tests.docs.test_worked_pages import WORKED
@@ -13,7 +15,7 @@ from tests.docs.test_worked_pages import WORKED
 DOCS = Path(__file__).parents[2] / "docs"
 WORKED_THROUGH = {each if isinstance(each, str) else each.values[0] for each in WORKED}
 BY_OTHERS = {"python", "your-estimator", "your-model"}  # tests/pipeline
-HERE = {"compare", "many-runs"}
+HERE = {"compare", "many-runs", "your-model-more"}
 
 
 def python_of(name: str) -> list[str]:
@@ -54,3 +56,14 @@ def test_the_golden_of_compare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     names["MINE"] = {"kind": "ekf", "sigma_range_m": 0.5}
     with pytest.raises(AssertionError, match=r"drive\.mcap"):
         names["test_my_estimator"]()
+
+
+def test_the_correction_of_your_model_more() -> None:
+    """A heading corrected by a quarter turn turns the velocity with it; a small step adds to each."""
+    names: dict[str, Any] = {}
+    [code] = python_of("your-model-more")
+    exec(code, names)
+    turned = names["turn_with_heading"]((1.0, 2.0, 0.0, 3.0, 0.0), (0.0, 0.0, np.pi / 2, 0.0, 0.0))
+    assert_allclose(turned, (1.0, 2.0, np.pi / 2, 0.0, 3.0), atol=1e-12)
+    moved = names["turn_with_heading"]((1.0, 2.0, 0.0, 0.0, 0.0), (0.1, 0.2, 0.3, 0.4, 0.5))
+    assert_allclose(moved, (1.1, 2.2, 0.3, 0.4, 0.5))

@@ -39,6 +39,24 @@ def test_what_is_named_is_there(name: str) -> None:
         assert "gliders" in path or (ROOT / path).exists(), path
 
 
+def test_the_lanes_run_every_test_once() -> None:
+    """Those that `make test` starts side by side."""
+    (started,) = re.findall(r"^\t\$\(MAKE\) -j\d (.*)", MAKEFILE, re.MULTILINE)
+    lanes = [
+        re.findall(rf"^{lane}: .*\n\t\$\(BIN\)/pytest (.*)", MAKEFILE, re.MULTILINE)[0].split()
+        for lane in started.removesuffix(" lint").split()
+    ]
+
+    def runs(lane: list[str], path: Path) -> bool:
+        left_out = [each.removeprefix("--ignore=") for each in lane if each.startswith("--ignore=")]
+        taken = [each for each in lane if not each.startswith("-")] or ["tests"]
+        above = {path.as_posix(), *(each.as_posix() for each in path.parents)}
+        return bool(above.intersection(taken)) and not above.intersection(left_out)
+
+    for path in ROOT.glob("tests/**/test_*.py"):
+        assert sum(runs(lane, path.relative_to(ROOT)) for lane in lanes) == 1, path
+
+
 def test_ci_runs_the_two_commands_everywhere() -> None:
     workflow: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text("utf-8"))
     job = workflow["jobs"]["commands"]

@@ -129,7 +129,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(tmp_path, worked_off, monkeypat
         with pytest.raises(KeyboardInterrupt):
             run(place)
     assert not place.exists()
-    assert "keeps 1 finished cells; the same command goes on from there" in caplog.text
+    assert "keeps 1 finished cells; the same command continues with the others" in caplog.text
     half = unfinished(place) / f".{'0' * 64}.bin.abc.part"  # killed while a cell was being kept
     half.mkdir()
     (half / "fuselog.lock").touch()
@@ -180,7 +180,7 @@ def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off)
     def hopeless():
         yield Team(Dying(deaths=True), 1)
 
-    with pytest.raises(BadInput, match="runs 0 to 127: the process that worked on them died 3 times"):
+    with pytest.raises(BadInput, match="runs 0 to 127: the process that computed them died 3 times"):
         run(tmp_path / "other", hopeless)
 
 
@@ -282,13 +282,13 @@ def test_what_is_not_ours_stays(tmp_path):
     unfinished(place).mkdir()
     note = unfinished(place) / "thesis.txt"
     note.write_text("years of work")
-    with pytest.raises(BadInput, match=r"holds thesis\.txt, which is not fuselog's; move it away"):
+    with pytest.raises(BadInput, match=r"holds thesis\.txt, which fuselog did not write; move it away"):
         run(place, runs=130)
     assert note.read_text() == "years of work"
     note.unlink()
     with kept_cells(place) as kept:
         kept.begin()
-        with pytest.raises(BadInput, match="another fuselog is at work on this"):
+        with pytest.raises(BadInput, match="another fuselog command is working on it"):
             run(place, runs=130)
 
 
@@ -301,7 +301,7 @@ def test_a_metric_that_cannot_be_pickled_is_bad_input(monkeypatch, tmp_path):
         return done
 
     monkeypatch.setattr(campaigns.Cell, "work_off", unpicklable)
-    with pytest.raises(BadInput, match="what a metric keeps cannot go to another process"):
+    with pytest.raises(BadInput, match="what a metric keeps cannot be sent to another process"):
         run(tmp_path / "result", runs=130)
 
 
@@ -327,7 +327,7 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     out = ["--out", str(tmp_path / "result")]
     begin = ["run", "landmarks", "--runs", "130", *out]
     assert main([*begin, "--workers", "2", "--scheduler", "local:2"]) == 2
-    assert "the scheduler has its own; give one" in capsys.readouterr().err
+    assert "a scheduler has its own workers; give one" in capsys.readouterr().err
     assert main([*begin, "--workers", "0"]) == 2
     capsys.readouterr()
     assert main(["run", "ispace", "--workers", "2", *out]) == 2

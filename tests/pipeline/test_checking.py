@@ -145,7 +145,7 @@ def test_a_third_party_tests_its_own_estimator(
     golden = tmp_path / "mine.golden.xz"
     runs = {"seed 4": fl.record("landmarks", seed=4, duration_s=3.0)}
     mine = {"mine": {"kind": "ekf", "sigma_range_m": 0.1}}
-    with pytest.raises(fl.BadInput, match="there is no such golden"):
+    with pytest.raises(fl.BadInput, match="no such golden"):
         assert_golden(runs, golden, mine)
     monkeypatch.setenv("FUSELOG_UPDATE_GOLDENS", "1")
     assert_golden(runs, golden, mine)
@@ -168,14 +168,20 @@ def test_bad_input(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) ->
         lzma.compress(lzma.decompress(golden.read_bytes()).replace(b'"format":1', b'"format":2'))
     )
     for arguments, sentence in (
-        ((log, "--against", newer), "a newer fuselog wrote it (format 2, this one reads 1)"),
-        ((log, "--against", note), "is no golden, or damaged"),
+        (
+            (log, "--against", newer),
+            "a newer version of fuselog wrote it (format 2, this version reads 1)",
+        ),
+        ((log, "--against", note), "is not a golden, or is damaged"),
         ((log, "--against", note, "--update", "-e", "ekf"), "exists and is not a golden"),
-        ((log, "--against", tmp_path / "none.golden.xz"), "there is no such golden; --update writes it"),
-        ((log, "--against", tmp_path / "none.golden.xz", "--update"), "say what its golden is of"),
-        ((other, "--against", golden), "what is recorded or imported has changed"),
-        ((tmp_path / "empty", "--against", golden), "holds no logs to replay"),
-        ((log, "--against", golden, "-e", "ukf"), "give other settings with --update"),
+        ((log, "--against", tmp_path / "none.golden.xz"), "no such golden; --update writes it"),
+        (
+            (log, "--against", tmp_path / "none.golden.xz", "--update"),
+            "name the estimators that the golden is to have",
+        ),
+        ((other, "--against", golden), "the recorded or imported data have changed"),
+        ((tmp_path / "empty", "--against", golden), "has no logs to replay"),
+        ((log, "--against", golden, "-e", "ukf"), "to change that, add --update"),
         ((log, "--against", golden, "--update", "--tolerance", "mean"), "expected PATTERN=RELATIVE"),
         ((log, "--against", golden, "--junit", note), "give a name that ends in .xml"),
     ):

@@ -417,7 +417,7 @@ def test_two_runs_into_one_folder_do_not_mix(fuselog: Fuselog) -> None:
     with result_folder(Path("r")) as theirs:
         said = fuselog("run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--out", "r")
         assert said.code == 2
-        assert "another fuselog is writing it" in said.err
+        assert "another fuselog command is writing it" in said.err
         assert theirs.exists()
 
 
@@ -497,3 +497,21 @@ def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> Non
     assert told["ukf"] == {**told["ekf"], "kappa": 1.0}
     said = fuselog("run", log, "-e", "ukf", "--parameters", "--out", "d").out
     assert "kappa" in said
+
+
+@pytest.mark.usefixtures("here")
+def test_parameters_that_a_log_states_are_shown_with_their_channel(
+    world: Path, fuselog: Fuselog
+) -> None:
+    """What is given counts, else what the log says: with the noise of its recording."""
+    replay = ("replay", str(world / "noisy.mcap"), "-e", "ekf", "--out", "a.mcap")
+    printed = fuselog(*replay, "--parameters").out
+    assert re.search(r"^ sigma_range_m +1\.0 \(/robot1/range_bearing\)", printed, re.MULTILINE)
+    assert "ekf, from the log" in printed
+    given = fuselog(*replay, "--set", "sigma_range_m=0.5", "--json").json
+    assert given["parameters"]["ekf"]["sigma_range_m"] == 0.5
+    assert given["parameters_of_log"]["ekf"].keys() >= {"sigma_bearing_rad", "turn_noise_density"}
+    assert "sigma_range_m" not in given["parameters_of_log"]["ekf"]
+    model = fuselog("models", "robot").out
+    assert re.search(r"^ sigma_range_m +from the log ", model, re.MULTILINE)
+    assert re.search(r"^ inflate_nis +number", model, re.MULTILINE)

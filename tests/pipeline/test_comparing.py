@@ -163,11 +163,11 @@ def test_different_truths_are_said(estimates: Path) -> None:
     [
         (["LOG"], "name two estimators"),
         (["LOG", "-e", "ekf"], "has only ekf"),
-        (["ESTIMATES", "LOG", "-e", "ekf"], "is a log without estimates; fuselog replay makes them"),
+        (["ESTIMATES", "LOG", "-e", "ekf"], "is a log without estimates; make them with fuselog replay"),
         (["ESTIMATES", "-e", "ekf", "-e", "ukff"], "did you mean 'ukf'"),
         (["ONE", "TWO", "-e", "ekf"], "have no run in common"),
-        (["EMPTY", "ESTIMATES"], "holds no estimates logs"),
-        (["ESTIMATES", "TEXT", "-e", "ekf"], "a trajectory file is of one run"),
+        (["EMPTY", "ESTIMATES"], "has no estimates logs"),
+        (["ESTIMATES", "TEXT", "-e", "ekf"], "a trajectory file has one run"),
     ],
 )
 def test_bad_input(

@@ -296,12 +296,16 @@ def test_the_command_the_report_and_the_timeline_say_the_same(
 
 
 def test_bad_input_is_refused_with_a_sentence(tmp_path: Path, run: fl.MemorySource) -> None:
-    with pytest.raises(fl.BadInput, match="dead-reckoning gives no innovations, by which it could be"):
+    with pytest.raises(
+        fl.BadInput, match="dead-reckoning gives no innovations, and a diagnosis needs them"
+    ):
         fl.diagnose(run, "dead-reckoning")
     with pytest.raises(fl.BadInput, match="name the estimator to diagnose with -e"):
         fl.diagnose(run)
     with pytest.raises(fl.BadInput, match="one estimator is diagnosed at a time"):
         fl.diagnose(run, {"ekf": {}, "ukf": {}})
+    with pytest.raises(fl.BadInput, match="2 logs: one log is diagnosed at a time; give one, such as"):
+        fl.diagnose([run, run], "ekf")  # type: ignore[arg-type]
     log = tmp_path / "run.mcap"
     fl.write(log, run)
 

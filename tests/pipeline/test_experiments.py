@@ -89,7 +89,7 @@ def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fu
     again = pd.read_parquet(tmp_path / "again/tables/errors/ekf-robot1.parquet")
     pd.testing.assert_frame_equal(again, errors[errors["run"] == 0].reset_index(drop=True))
     said = fuselog(*judged)
-    assert (said.code, "--errors: goes into a result folder" in said.err) == (2, True)
+    assert (said.code, "--errors: errors are written into a result folder" in said.err) == (2, True)
 
 
 def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
@@ -454,12 +454,12 @@ def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["drive-1.mcap"], "say what to replay it with, such as -e ekf"),
+        (["drive-1.mcap"], "name the estimators to replay it with, such as -e ekf"),
         (["drive-1.mcap", "landmarks", "-e", "ekf"], "give logs alone"),
         (["drive-1.mcap", "-e", "ekf", "--runs", "3"], "give logs alone"),
-        (["drive-9.mcap", "-e", "ekf"], "no log is called drive-9.mcap"),
+        (["drive-9.mcap", "-e", "ekf"], "no log has the name drive-9.mcap"),
         (["landmarks", "-e", "ekf"], "one experiment runs at a time"),
-        (["drives.toml", "--data", "nowhere"], "no log is called nowhere"),
+        (["drives.toml", "--data", "nowhere"], "no log has the name nowhere"),
         (["drives.toml", "--runs", "3"], "as many runs as there are"),
         (["drive-1.mcap", "-e", "ekf", "--set", "ekf.gate=1"], "no parameter 'gate'"),
     ],
@@ -477,3 +477,22 @@ def test_bad_input_to_a_run_of_logs_is_one_sentence(
     assert said.code == 2
     assert sentence in said.err
     assert sorted(drives.iterdir()) == before
+
+
+def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed(
+    fuselog: Fuselog, tmp_path: Path
+) -> None:
+    """By hand: 2.776 standard errors to either side, Student's quantile of five runs."""
+    out = tmp_path / "five"
+    run = ("run", "landmarks", "--set", "duration_s=2", "--logs", "0", "--out", out)
+    printed = fuselog(*run, "--runs", "5").out
+    found = pd.read_parquet(out / "tables" / "runs.parquet").groupby("estimator")["nees"]
+    for mean, error in zip(found.mean(), found.sem(), strict=True):
+        low, high = mean - 2.7764 * error, mean + 2.7764 * error
+        expected = f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim 3"
+        assert expected in printed
+    fuselog("report", out, "-o", tmp_path / "five.html")
+    assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
+    assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, result.json"
+    assert {path.name for path in out.iterdir()} == {"figures", "tables", "timeline.rrd", "result.json"}
+    assert "nees_mean_over_runs" not in fuselog(*run, "--runs", "4").out

@@ -97,7 +97,10 @@ def test_nothing_is_replaced(world: Path, fuselog: Fuselog) -> None:
         (("-o", "own.txt", "--topic", TRUTH), ("own.txt", "exists", "another name")),
         (("-o", "own.csv", "--topic", TRUTH), ("own.csv", "ends in .txt")),
         (("--topic", "/robot1/trth"), ("no topic /robot1/trth", "did you mean '/robot1/truth'")),
-        (("--topic", "/robot1/odometry"), ("/robot1/odometry", "no estimate and no truth", "csv")),
+        (
+            ("--topic", "/robot1/odometry"),
+            ("/robot1/odometry", "neither an estimate nor a truth", "csv"),
+        ),
         (("--to", "tmu"), ("'tmu'", "'kitti'")),
     ):
         said = fuselog(*command, *options)

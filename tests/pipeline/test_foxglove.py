@@ -199,7 +199,7 @@ def test_what_has_no_message_and_a_place_that_is_taken_are_refused(fuselog: Fuse
     write_log("air.mcap", seen()[-1:])
     said = fuselog("export", "air.mcap", "--to", "foxglove")
     assert said.code == 2
-    assert "air.mcap: holds nothing that Foxglove can show; export it as csv" in said.err
+    assert "air.mcap: has nothing that Foxglove can show; export it as csv" in said.err
     assert [each.name for each in Path().iterdir()] == ["air.mcap"]
     write_log("own.mcap", seen())
     Path("taken.mcap").write_text("a note")

@@ -53,6 +53,6 @@ def test_a_grade_that_is_not_there_and_a_drive_without_outage_are_named(fuselog,
     command = ["run", "imu-grades", "--out", str(tmp_path / "out"), "--set"]
     assert "no grade 'golden'; there are consumer" in fuselog(*command, f"options.{limit}").err
     assert (
-        "0 outages; give one"
+        "0 outages; give exactly one"
         in fuselog(*command, "gnss.outages_s=[]", "--set", "duration_s=12.0", "--set", "runs=1").err
     )

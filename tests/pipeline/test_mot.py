@@ -67,7 +67,7 @@ def test_tracks_and_truths_frame_by_frame(fuselog: Fuselog) -> None:
 
 def test_what_is_no_track_is_refused(fuselog: Fuselog) -> None:
     for options, words in (
-        (("--topic", "/radar/scan"), "holds neither tracks nor a truth in the plane"),
+        (("--topic", "/radar/scan"), "has neither tracks nor a truth in the plane"),
         (("--topic", "/radar/scn"), "did you mean '/radar/scan'"),
     ):
         said = fuselog("export", "run.mcap", "--to", "mot", *options)
@@ -77,4 +77,6 @@ def test_what_is_no_track_is_refused(fuselog: Fuselog) -> None:
     said = fuselog("export", "none.mcap", "--to", "mot")
     assert (said.code, "no tracks and no truths in the plane" in said.err) == (2, True)
     assert fuselog("export", "run.mcap", "--to", "mot").code == 0
-    assert "exists, and export replaces nothing" in fuselog("export", "run.mcap", "--to", "mot").err
+    assert (
+        "exists, and fuselog export replaces no file" in fuselog("export", "run.mcap", "--to", "mot").err
+    )

@@ -327,7 +327,7 @@ def test_what_belongs_to_a_result_is_no_output(here: Path) -> None:
         "replay log.mcap -e ekf -o result/estimates/run-0000.mcap",
         "view log.mcap --save result/timeline.rrd",
     ):
-        _check_refusal(run_here(*arguments.split()), here, _state(here), "belongs to the result")
+        _check_refusal(run_here(*arguments.split()), here, _state(here), "is part of the result")
 
 
 def test_two_outputs_are_two_files(here: Path) -> None:

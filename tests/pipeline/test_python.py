@@ -205,6 +205,10 @@ def test_a_replay_says_what_the_command_says(
             case = done.metrics["case"].map(lambda name: f".{name}" if name else "")
             keys = done.metrics["estimator"] + "." + done.metrics["quantity"] + case
             assert dict(zip(keys, done.metrics["value"], strict=True)) == told["metrics"]
+            stated = done.metrics.assign(key=keys).dropna(subset=["low", "high"])
+            intervals = stated[["low", "high"]].to_numpy().tolist()
+            assert dict(zip(stated["key"], intervals, strict=True)) == told["bounds"]
+            assert {"nees", "nis_per_component"} <= set(stated["quantity"])
             for run, estimates in enumerate(done.estimates):
                 there = fl.open(f"{run}.estimates.mcap")
                 assert set(there) == set(estimates)
@@ -272,11 +276,14 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda _: fl.import_("mrclam", "nope"), "nope: no such file or folder"),
         (lambda _: fl.run("landmark"), "did you mean 'landmarks'"),
         (lambda _: fl.run("landmarks", set={"robot": 2}), "--set robot: no such entry"),
-        (lambda _: fl.write("a.mcap", [1]), "a.mcap: give streams"),
+        (lambda _: fl.write("a.mcap", [1]), "a.mcap: there is nothing to write; give streams"),
         (lambda _: fl.estimators["ekff"], "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(object(), "ekff"), "no method 'ekff'; did you mean 'ekf'"),
         (lambda _: fl.modelled(robot(), "ekf:9"), "method ekf has no variants; give 'ekf' without ':9'"),
-        (lambda _: fl.modelled(robot(), "smoother:ekg"), "method smoother:ekg: 'ekg' is no filter that"),
+        (
+            lambda _: fl.modelled(robot(), "smoother:ekg"),
+            "method smoother:ekg: 'ekg' is not a filter that",
+        ),
         (lambda _: fl.modelled(robot(), "lrkf:s2kf"), "sampling 's2kf': count: is missing"),
         (
             lambda _: fl.modelled(robot(), "particles:0"),
@@ -289,6 +296,10 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda runs: fl.replay(runs, "ekff"), "no estimator 'ekff'; did you mean 'ekf'"),
         (lambda runs: fl.replay(runs, {"ekf": {"sigma": 1}}), "estimator ekf: no parameter 'sigma'"),
         (lambda runs: fl.replay(runs, {"a": print}), "estimator a is builtin_function_or_method"),
+        (
+            lambda runs: fl.replay(runs, {"kind": fl.modelled(robot(), "ekf"), "sigma_range_m": 0.1}),
+            'kind, sigma_range_m: these look like settings of one estimator; give them a label: {"mine": ',
+        ),
         (lambda runs: fl.replay(runs, [print]), "an estimator is builtin_function_or_method"),
         (lambda runs: fl.replay(runs, ["ekf", {"ekf": {}}]), "estimator ekf is given twice"),
         (lambda runs: fl.replay(runs, []), "no estimators to replay"),
@@ -299,7 +310,7 @@ def test_a_model_of_ones_own_has_every_method(method: str, recordings: list[fl.M
         (lambda runs: fl.replay(runs, "ekf", start_s=float("nan")), "start_s is nan"),
         (
             lambda runs: fl.replay(runs, "ekf", start_s=9.0),
-            "nothing in this span; the log goes from 0 to 4 s",
+            "no messages in this span; the log goes from 0 to 4 s",
         ),
         (lambda runs: fl.replay(runs, "ekf", start_s=1.0), "--start-from truth"),
     ],
@@ -382,7 +393,7 @@ def test_a_figure_shows_a_case() -> None:
     done = fl.replay(fl.record("landmarks", robots=2, **SHORT), "ekf")
     assert done.figure("robot2").get_suptitle().startswith("robot2, 1 run")
     assert done.figure().get_suptitle().startswith("robot1, 1 run")
-    with pytest.raises(fl.BadInput, match="nothing called 'robot3' was judged"):
+    with pytest.raises(fl.BadInput, match="nothing with the name 'robot3' was judged"):
         done.figure("robot3")
 
 

@@ -36,7 +36,7 @@ def test_published_errors_are_found_again_to_four_digits(navigation: Path, case:
         assert space is None or found[1] == pytest.approx(space, abs=5e-5)
     assert printed(folder)["LS_2d"] == pytest.approx(published["LS"][0], abs=5e-5)
     elsewhere = Window.model_validate({"begin": {"x_above_m": 1e3}})
-    with pytest.raises(BadInput, match="does not go through the window; set options"):
+    with pytest.raises(BadInput, match="does not cross the window; set options"):
         scored_truth(of, elsewhere, 0.5)
 
 

@@ -302,9 +302,9 @@ def _make_older(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
-        (_lose, ("figures/errors-robot", "is missing; run it again")),
+        (_lose, ("figures/errors-robot", "is missing; run the experiment again")),
         (_garble, ("figures/errors-robot", "panels.0.title")),
-        (_make_older, ("result.json", "an older fuselog wrote it (format 0")),
+        (_make_older, ("result.json", "an older version of fuselog wrote it (format 0")),
     ],
 )
 def test_a_damaged_or_older_result_is_one_sentence(
@@ -363,7 +363,7 @@ def test_a_chart_is_described_once_and_drawn_as_it_is_described() -> None:
     [legend] = left.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["95 %", "a", "good"]
     for wrong in (lambda: curve("a", [0], [0, 1]), lambda: band("a", [0], [0], [0, 1])):
-        with pytest.raises(ValueError, match="of one length"):
+        with pytest.raises(ValueError, match="have one length"):
             wrong()
 
 

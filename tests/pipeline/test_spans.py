@@ -113,7 +113,7 @@ def test_a_start_after_the_prior_says_from_what(run_log: Path, fuselog: Fuselog)
     start = ["replay", run_log, "-e", "ekf", "--start", "30", "-o", "late.mcap"]
     said = fuselog(*start)
     assert said.code == 2
-    assert all(words in said.err for words in ("/robot1/prior", "30 s older", "--start-from truth"))
+    assert all(words in said.err for words in ("/robot1/prior", "30 s before", "--start-from truth"))
     assert not Path("late.mcap").exists()
     for origin in ("truth", run_log.with_name("estimates.mcap")):
         metrics = fuselog(*start, "--start-from", origin, "--json").json["metrics"]
@@ -179,7 +179,7 @@ def test_a_start_by_arrival_is_compared_with_the_priors_arrival(
     two_clocks: Path, fuselog: Fuselog
 ) -> None:
     late = ["replay", two_clocks, "-e", "ekf", "--arrival-order", "--start", "2", "-o", "late.mcap"]
-    assert "2 s older" in fuselog(*late).err
+    assert "2 s before" in fuselog(*late).err
     assert fuselog(*late, "--start-from", "truth").code == 0
     first_ns = stamps_of("late.mcap")[0]
     assert WALL + 2 * SECOND <= first_ns < WALL + 2.2 * SECOND
@@ -257,7 +257,7 @@ def test_the_library_refuses_an_old_prior_too(run_log: Path) -> None:
     assert log.run is not None
     late = LogSource(log, start_ns=log.run.epoch_ns + 30 * SECOND)
     part = Part([late], estimates=[(Path("late.mcap"), run_log)])
-    with pytest.raises(BadInput, match="30 s older than its span"):
+    with pytest.raises(BadInput, match="30 s before the span"):
         replay_parts([part], {"ekf": {}}, gap_limit_s=0.2)
     assert not list(Path().iterdir())
 
@@ -282,7 +282,7 @@ def test_a_view_shows_a_span_of_a_log_and_of_estimates(fuselog: Fuselog) -> None
         assert "/map/landmarks" in read(Path(f"{log}.rrd"), static=True)
     refused = fuselog("view", "run.mcap", "--start", "9", "--save", "none.rrd")
     assert refused.code == 2
-    assert "nothing in this span; the log goes from 0 to 4 s" in refused.err
+    assert "no messages in this span; the log goes from 0 to 4 s" in refused.err
     assert not Path("none.rrd").exists()
 
 

@@ -59,7 +59,7 @@ def test_a_robot_lies_about_its_start_and_must_be_there(robots):
     moved = _lying(robots, options).streams["/robot3/prior"]["mean"]
     assert moved - robots.streams["/robot3/prior"]["mean"] == pytest.approx(np.array([[2.5, 0, 0]]))
     assert _robots(robots, options) == [1, 2, 3]
-    with pytest.raises(BadInput, match=r"options.leaving = 5 is none of the robots 1, 2, 3"):
+    with pytest.raises(BadInput, match=r"options.leaving = 5 is not one of the robots 1, 2, 3"):
         _robots(robots, CooperativeStressOptions())
 
 

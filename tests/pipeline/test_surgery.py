@@ -234,6 +234,6 @@ def test_a_log_without_a_unit_or_with_several_is_refused(tmp_path: Path, log: Pa
     fl.constrain("both.mcap", "out.mcap", unit="/other/inertial")
     with pytest.raises(fl.BadInput, match=r"out.mcap: has a topic /other/standing"):
         fl.constrain("out.mcap", "again.mcap", unit="/other/inertial")
-    with pytest.raises(fl.BadInput, match="standing_hz and rolling_hz are zero"):
+    with pytest.raises(fl.BadInput, match="standing_hz and rolling_hz are both zero"):
         fl.constrain("one.mcap", "none.mcap", settings={"standing_hz": 0.0})
     assert not Path("none.mcap").exists()

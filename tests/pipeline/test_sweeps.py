@@ -90,7 +90,7 @@ def test_the_door_sweeps_as_the_command_does(tmp_path):
         ("robots=0:1:log3", "LOW above 0"),
         ("robots=1:2:x", "N from 2 on"),
         ("robots=1,1", "each once"),
-        ("duration_s=1:2:200000", "100000 are the most"),
+        ("duration_s=1:2:200000", "the most are 100000"),
     ],
 )
 def test_what_cannot_be_swept_is_bad_input(over, sentence, tmp_path, capsys):

@@ -46,9 +46,9 @@ def test_a_guessed_mapping_works_as_it_is(
     assert 'units.turn_rate_radps = "deg/s"   # the largest is 2' in text
     assert "# not taken:" in text
     assert "photo.jpg" in text
-    assert "readme.md: has no times" in text
+    assert "readme.md: has no column of times" in text
     again = fuselog("import", "table", str(drive), "--guess", "-o", str(mapping))
-    assert (again.code, "give another name, or remove it yourself" in again.err) == (2, True)
+    assert (again.code, "give another name, or remove the file yourself" in again.err) == (2, True)
     assert fuselog("import", "table", str(drive), "--mapping", str(mapping), "-o", str(out)).code == 0
     log = fl.open(out)
     assert set(log) == {"/imu/inertial", "/gnss/fix", "/gnss/values"}

@@ -4,6 +4,7 @@ import os
 import pickle
 import re
 import shlex
+import shutil
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
@@ -181,7 +182,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
             "--free sigma_rnge_m: no parameter 'sigma_rnge_m'; did you mean 'sigma_range_m'",
         ),
         ("gate_probability", {}, "--free gate_probability: "),
-        ("mode", {}, "--free mode: parameter 'mode' is no number"),
+        ("mode", {}, "--free mode: parameter 'mode' is not a number"),
         ([], {}, "--free: name at least one"),
         (["sigma_range_m"] * 2, {}, "--free sigma_range_m: is named twice"),
         (
@@ -194,7 +195,7 @@ def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource
         (
             "sigma_range_m",
             {"bounds": {"sigma_bearing_rad": (0.1, 1)}},
-            "--bound sigma_bearing_rad: is not",
+            "--bound sigma_bearing_rad: this parameter is not",
         ),
         (
             "sigma_range_m",
@@ -273,6 +274,7 @@ def test_the_worked_example_of_the_page(
     for (_, expected), (_, values) in zip(shown, printed, strict=True):
         assert [*map(float, values.split())] == pytest.approx([*map(float, expected.split())], rel=2e-3)
     assert re.search("logs held out: .*: better", told[2].out)
+    assert "(of 1 log, gate open; in the tables: the mean per log, with the gate)" in told[2].out
     result = read_result(Path("out/tune"))
     for label in ("tuned", "tuned-held-out"):
         assert result.metrics[f"{label}.nis_per_component.robot1"] == pytest.approx(1.0, abs=0.1)
@@ -307,7 +309,8 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     refused = fuselog("replay", world / "log.mcap", "-e", "ukf", "--settings", tuned, "-o", tmp_path)
     assert (refused.code, refused.err) == (
         2,
-        f"fuselog: {tuned}: has settings of ekf, and a settings file has a table for each estimator "
+        f"fuselog: {tuned}: has settings of ekf, which is not replayed; a settings file has a table "
+        "for each estimator "
         "that is replayed: ukf\n",
     )
     tune = (
@@ -323,12 +326,39 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     for options, sentence in (
         (("--bound", "sigma_range_m=1"), "--bound sigma_range_m=1: expected NAME=LOW:HIGH"),
         (("--by", "luck"), "Invalid value for '--by'"),
-        (("--settings", world / "garbled.toml"), "is not readable as TOML"),
+        (("--settings", world / "garbled.toml"), "cannot be read as TOML"),
     ):
         refused = fuselog(*tune, *options)
         assert (refused.code, len(refused.err.splitlines())) == (2, 1)
         assert sentence in refused.err
     assert not (tmp_path / "out").exists()
+
+
+def test_logs_that_were_meant_to_be_held_out_are_not_tuned_on(
+    world: Path, fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of `--validate test/*.mcap` the shell makes many words, of which the option takes the first."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("train/0", "train/1", "test/2", "test/3", "test/2.estimates"):
+        log = tmp_path / f"{name}.mcap"
+        log.parent.mkdir(exist_ok=True)
+        shutil.copy(world / "log.mcap", log)
+    tune = ("tune", "-e", "ekf", "--free", "sigma_range_m", "train/0.mcap", "train/1.mcap")
+    leaking = fuselog(*tune, "--validate", "test/2.mcap", "test/3.mcap")
+    assert (leaking.code, leaking.err) == (
+        2,
+        "fuselog: test/3.mcap: would be tuned on, while test/2.mcap beside it is held out; to hold out "
+        "several, give --validate the folder, or once before each log\n",
+    )
+    both = fuselog(*tune, "--validate", "train/1.mcap")
+    assert (both.code, "train/1.mcap: would be tuned on and held out" in both.err) == (2, True)
+    assert not Path("out").exists()
+    held_out = fuselog("tune", "train", "-e", "ekf", "--free", "sigma_range_m", "--validate", "test")
+    assert (held_out.code, held_out.err) == (0, "")
+    assert held_out.out.startswith(
+        "tuned on 2 logs, train/0.mcap to train/1.mcap; held out: 2 logs, test/2.mcap to test/3.mcap\n"
+    )
+    assert len(read_result(Path("out/tune")).settings["held_out"]) == 2
 
 
 @pytest.fixture(scope="module")
@@ -404,7 +434,7 @@ def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
     class Own(ScalarParameters):
         """Parameters that only this function knows."""
 
-    with pytest.raises(fl.BadInput, match="level: cannot go to another process"):
+    with pytest.raises(fl.BadInput, match="level: cannot be sent to another process"):
         fl.tune(
             source(np.ones(5)),
             {"level": fl.modelled(replace(SCALAR, parameters=Own), "ekf")},

@@ -89,7 +89,7 @@ def test_noise_is_as_stated() -> None:
     [
         ("optical-los", {"bias_deg": [(1.0, 1.0, 1.0)]}, "bias_deg has 1 rows for 3 sensors"),
         ("optical-los", {"sigma_rad": 0.0}, "sigma_rad"),
-        ("acoustic-shots", {"interval_s": 0.1}, "fire less often"),
+        ("acoustic-shots", {"interval_s": 0.1}, "give a longer interval_s"),
         ("acoustic-shots", {"mach_number": 1.0}, "mach_number"),
     ],
 )

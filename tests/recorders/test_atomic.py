@@ -64,7 +64,7 @@ def test_the_last_whole_one_of_two_writers_wins(tmp_path):
         assert place.read_text() == "second"
     assert contents(tmp_path) == {"f": "first"}
     with (
-        pytest.raises(BadInput, match="another fuselog is writing it"),
+        pytest.raises(BadInput, match="another fuselog command is writing it"),
         whole_folder(tmp_path / "r", refuse),
     ):
         fill(tmp_path / "r")
@@ -178,7 +178,7 @@ def test_a_leftover_is_known_by_more_than_its_name(tmp_path, caplog):
         new.write_text("new")
     assert contents(tmp_path) == {**before, "f": "new"}
     assert len(caplog.messages) == 3
-    assert all("it stays as it is" in message for message in caplog.messages)
+    assert all("it is left as it is" in message for message in caplog.messages)
 
 
 def test_errors_of_the_disk_say_where_and_others_go_through(tmp_path):

@@ -96,8 +96,8 @@ def test_the_published_scenarios(autoferry: Path):
         ([scan(3, 0, [[1.0], [2.0]])], TRUTH, "measurement is not"),
         ([scan(2, 0, [], ownship=(1.0,))], TRUTH, "ownshipPosition is not 2 numbers"),
         ([scan(2, -START_S - 1, [])], TRUTH, "seconds since 1970"),
-        ([], TRUTH, "no list of entries"),
-        (SCANS, [[target(1, 0, 1, 1)], [target(1, 0, 1, 2)]], "two places at one time"),
+        ([], TRUTH, "not a list of entries"),
+        (SCANS, [[target(1, 0, 1, 1)], [target(1, 0, 1, 2)]], "two positions at one time"),
         (SCANS, [[{"targetID": 1.5, "time": 0, "position": [0, 0, 0]}]], "targetID is 1.5"),
     ],
 )
@@ -107,7 +107,7 @@ def test_what_is_not_as_published_is_named(tmp_path: Path, scans, truth, said: s
 
 
 def test_other_places_are_refused(tmp_path: Path):
-    with pytest.raises(BadInput, match=r"no files .*give the folder of one"):
+    with pytest.raises(BadInput, match=r"no files .* expected one; give the folder of one"):
         import_run("autoferry", tmp_path, {})
     write(tmp_path)
     with pytest.raises(BadInput, match="give the folder of one"):

@@ -251,7 +251,7 @@ def test_a_tail_of_zeros_is_lost_and_counted(tmp_path):
     raw = path.read_bytes()
     end = messages_by_chunk(raw)[1][0]
     path.write_bytes(raw[:end] + bytes(5000))
-    assert "it was cut off: its last 5000 bytes hold no whole record; 2 whole chunks are" in refusal(
+    assert "it was cut off: its last 5000 bytes are not a whole record; 2 whole chunks are" in refusal(
         path
     )
 
@@ -330,7 +330,7 @@ def test_what_is_joined_to_a_log_is_refused_or_named(tmp_path, first, second):
     path.write_bytes(one)
     honest = everything(path)[2]
     path.write_bytes(one + two)
-    left_out = f"it ends at byte {len(one)}, and the {len(two)} bytes behind that"
+    left_out = f"it ends at byte {len(one)}, and the {len(two)} bytes after that"
     assert left_out in refusal(path)
     log, _, found = everything(path, recover=True)
     assert left_out in log.loss_statement
@@ -347,7 +347,7 @@ def test_bytes_between_data_and_summary_are_not_left_out_in_silence(tmp_path):
     path = tmp_path / "gap.mcap"
     path.write_bytes(raw[:start] + struct.pack("<BQ", 6, 41) + bytes(41) + body + footer + raw[-8:])
     assert f"its data end at byte {start} and its summary begins at byte {start + 50}" in refusal(path)
-    assert "is left out" in open_log(path, recover=True).loss_statement
+    assert "are left out" in open_log(path, recover=True).loss_statement
 
 
 @pytest.mark.parametrize("summary", [True, False])
@@ -404,7 +404,7 @@ def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
     raw[-8:] = bytes(8)
     path.write_bytes(raw)
     statement = open_log(path, recover=True).loss_statement
-    assert statement.endswith(f"its last {len(raw) - second} bytes hold no whole record")
+    assert statement.endswith(f"its last {len(raw) - second} bytes are not a whole record")
 
 
 @pytest.mark.parametrize(
@@ -413,14 +413,14 @@ def test_recover_without_a_summary_says_how_many_bytes_it_cannot_read(tmp_path):
         ({"parameters": "[1]"}, "parameters is [1], expected an object"),
         ({"parameters": "[" * 100_000}, "it is nested more than 50 levels deep"),
         ({"parameters": '{"a":' * 60 + "1" + "}" * 60}, "it is nested more than 50 levels deep"),
-        ({"parameters": '{"a": 1e999}'}, "it holds 1e999, which is no number of JSON"),
-        ({"parameters": '{"a": NaN}'}, "it holds NaN, which is no number of JSON"),
+        ({"parameters": '{"a": 1e999}'}, "it has 1e999, which is not a JSON number"),
+        ({"parameters": '{"a": NaN}'}, "it has NaN, which is not a JSON number"),
         ({"seed": '"x"'}, 'seed is "x", expected a whole number or null'),
         ({"seed": "true"}, "seed is true, expected a whole number or null"),
         ({"seed": "-3"}, "seed is negative"),
-        ({"seed": "1" * 5000}, "it holds a whole number of more than 4300 digits"),
+        ({"seed": "1" * 5000}, "it has a whole number of more than 4300 digits"),
         ({"run": "0.5"}, "run is 0.5, expected a whole number"),
-        ({"epoch_ns": str(2**63)}, "epoch_ns is past the year 2262"),
+        ({"epoch_ns": str(2**63)}, "epoch_ns is after the year 2262"),
         ({"notes": "3"}, "notes is 3, expected an object"),
         ({"notes": '{"a": 3}'}, "notes are not all texts"),
         ({"notes": "{"}, "Expecting property name"),
@@ -440,8 +440,8 @@ def test_run_metadata_of_wrong_types_are_told(changes, sentence):
 def test_a_log_of_another_format_is_refused_and_one_of_before_formats_is_read(tmp_path, monkeypatch):
     path = tmp_path / "run.mcap"
     for stated, sentence in {
-        "2": "a newer fuselog wrote it (format 2, this one reads 1); update fuselog",
-        "0": "an older fuselog wrote it (format 0, this one reads 1); write it again",
+        "2": "a newer version of fuselog wrote it (format 2, this version reads 1); update fuselog",
+        "0": "an older version of fuselog wrote it (format 0, this version reads 1); write it again",
         '"x"': 'format is "x", expected a whole number',
     }.items():
         monkeypatch.setattr(RunMetadata, "to_record", lambda _, f=stated: {**RECORD, "format": f})

@@ -104,7 +104,7 @@ def test_places_that_cannot_hold_a_log_are_told(tmp_path):
     for path in (tmp_path / "file" / "run.mcap", tmp_path, tmp_path / ("x" * 300)):
         with pytest.raises(BadInput, match=r"cannot be written|is a folder"):
             write_log(path, [scans()])
-    with pytest.raises(BadInput, match="compression 'gzip' is none of zstd, lz4, none"):
+    with pytest.raises(BadInput, match="compression 'gzip' is not one of zstd, lz4, none"):
         write_log(tmp_path / "run.mcap", [scans()], compression="gzip")
     assert names_in(tmp_path) == ["file"]
 
@@ -149,19 +149,22 @@ def test_a_part_left_by_a_kill_is_readable_with_recover(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"publish_time_ns": [-1, 20]}, "publish_time is negative or past the year 2262; shift the run"),
-        ({"log_time_ns": [10, -20]}, "log_time is negative"),
+        (
+            {"publish_time_ns": [-1, 20]},
+            "publish_time is before 1970 or after the year 2262; shift the run",
+        ),
+        ({"log_time_ns": [10, -20]}, "log_time is before 1970"),
         ({"log_time_ns": [10]}, "log_time has 1 values for 2 messages"),
-        ({"publish_time_ns": [[10, 20]]}, r"publish_time_ns wants 1 axis, got shape \(1, 2\)"),
+        ({"publish_time_ns": [[10, 20]]}, r"publish_time_ns needs 1 axis, and has shape \(1, 2\)"),
         (
             {"publish_time_ns": [0.1 * 3 * 1e9, 20]},
-            r"holds 300000000\.0+6, which int64 cannot keep; round it",
+            r"holds 300000000\.0+6, which int64 cannot hold; round the values",
         ),
-        ({"publish_time_ns": [np.nan, 20]}, "publish_time_ns holds nan, which int64 cannot keep"),
+        ({"publish_time_ns": [np.nan, 20]}, "publish_time_ns holds nan, which int64 cannot hold"),
         ({"publish_time_ns": [np.datetime64("2020-01-01"), 20]}, "publish_time_ns"),
         ({"publish_time_ns": ["a", "b"]}, "publish_time_ns is not numeric"),
-        ({"scan_id": [-1, 2]}, "field scan_id holds -1, which uint32 cannot keep"),
-        ({"scan_id": [1, 2**32]}, "field scan_id holds 4294967296, which uint32 cannot keep"),
+        ({"scan_id": [-1, 2]}, "field scan_id holds -1, which uint32 cannot hold"),
+        ({"scan_id": [1, 2**32]}, "field scan_id holds 4294967296, which uint32 cannot hold"),
         ({"scan_id": [1]}, "field scan_id has 1 values for 2 messages"),
         ({"scan_id": [None, 2]}, "field scan_id is not numeric"),
         ({"speed": [1, 2]}, "fuselog.Scan has the fields sensor_time_ns, scan_id, detections; got"),
@@ -202,7 +205,8 @@ def test_a_stream_changed_after_it_was_made_is_checked_again(tmp_path):
         ({"metadata": {"frame": "map"}}, "changes its metadata between blocks"),
         (
             {"schema": schemas.TRUTH_STATE, "state": [[1.0]]},
-            "is fuselog.VectorMeasurement and cannot become fuselog.TruthState; use another topic",
+            "has fuselog.VectorMeasurement already and cannot take fuselog.TruthState; use another "
+            "topic",
         ),
         (
             {
@@ -210,7 +214,7 @@ def test_a_stream_changed_after_it_was_made_is_checked_again(tmp_path):
                     "VectorMeasurement", "Ours is another.", (Field("sensor_time_ns", "time_ns"),)
                 )
             },
-            "is fuselog.VectorMeasurement and cannot become fuselog.VectorMeasurement",
+            "has fuselog.VectorMeasurement already and cannot take fuselog.VectorMeasurement",
         ),
     ],
 )
@@ -226,7 +230,7 @@ def test_a_topic_keeps_its_schema_widths_and_metadata(tmp_path, later, sentence)
         with pytest.raises(BadInput, match=f"topic /v .*{sentence}"):
             log.write([second])
     assert_same(read_streams(open_log(tmp_path / "run.mcap"), ["/v"])["/v"], first)
-    with pytest.raises(BadInput, match="a topic comes twice among /v, /v"):
+    with pytest.raises(BadInput, match="a topic is given twice among /v, /v"):
         write_log(tmp_path / "run.mcap", [first, first])
 
 

@@ -76,12 +76,12 @@ def test_equal_stamps_stay_in_the_order_of_the_file(small: Path):
         (None, "missing"),
         ("", "no data rows"),
         ("# only a comment\n", "no data rows"),
-        ("1 2 3 4 5 6 7\n", "expected . columns, found 7"),
+        ("1 2 3 4 5 6 7\n", "has 7 columns, expected ."),
         ("1 2 3\n1 2 3 4 5 6\n", "cannot be read as columns"),
         (b"\xff\xfe\x00", "cannot be read as columns"),
-        ("words", "is word, no number"),
-        ("nan", "is nan, no number"),
-        ("short", "is nan, no number"),
+        ("words", "is word, expected a number"),
+        ("nan", "is nan, expected a number"),
+        ("short", "is nan, expected a number"),
     ],
 )
 def test_missing_and_malformed_files_are_told_by_name(
@@ -111,19 +111,19 @@ def test_folders_that_are_no_set_are_told(small: Path, tmp_path: Path):
         imported(tmp_path / "nowhere")
     for path in small.glob("Robot1_*"):
         path.unlink()
-    with pytest.raises(BadInput, match=r"no RobotN_\*\.dat files"):
+    with pytest.raises(BadInput, match=r"has no files RobotN_\*\.dat"):
         imported(small)
     (small / "Robot1_Odometry.dat").mkdir()
-    with pytest.raises(BadInput, match=r"Robot1_Groundtruth\.dat: missing"):
+    with pytest.raises(BadInput, match=r"Robot1_Groundtruth\.dat: no such file"):
         imported(small)
 
 
 @pytest.mark.parametrize(
     ("name", "row", "words"),
     [
-        ("Robot1_Odometry.dat", "-5.0 0.1 0.1", "row 3, column 1 is -5.0, no time in seconds"),
-        ("Robot1_Odometry.dat", "1e300 0.1 0.1", "row 3, column 1 is 1e.300, no time"),
-        ("Landmark_Groundtruth.dat", "8.5 1 2 0 0", "row 3, column 1 is 8.5, no whole number"),
+        ("Robot1_Odometry.dat", "-5.0 0.1 0.1", "row 3, column 1 is -5.0, expected a time in seconds"),
+        ("Robot1_Odometry.dat", "1e300 0.1 0.1", "row 3, column 1 is 1e.300, expected a time"),
+        ("Landmark_Groundtruth.dat", "8.5 1 2 0 0", "row 3, column 1 is 8.5, expected a whole number"),
         ("Barcodes.dat", "-3 17", "row 4, column 1 is -3"),
         ("Robot1_Measurement.dat", "1248444175.4 1.5 1 1", "row 5, column 2 is 1.5"),
     ],

@@ -95,5 +95,5 @@ def test_a_seed_gives_the_same_streams_and_way_points_are_passed():
     assert_array_equal(place[0], points[0])
     for point in points:
         assert np.linalg.norm(place - point, axis=1).min() < 0.1
-    with pytest.raises(BadInput, match="way_points_m has 2 points; give three or more"):
+    with pytest.raises(BadInput, match="way_points_m has 2 points; give three points or more"):
         streams(way_points_m=points[:2])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build, describe, merge, parse_settings
+from recorders.parameters import Parameters, build, describe, explain, merge, parse_settings
 from recorders.parsing import parse_json, read_toml
 from replay.estimators.landmarks import ROBOT
 
@@ -133,9 +133,9 @@ def test_the_nearest_name_is_offered_else_all() -> None:
         ("a={" + ".".join("b" * 100_000) + "=1}", "it is nested more than 50 levels deep"),
         (
             "a=" + "1" * 5000,
-            "--set a: the value cannot be used: it holds a whole number of more than 4300",
+            "--set a: the value cannot be used: it has a whole number of more than 4300",
         ),
-        (".".join("a" * 100_000) + "=1", "...: names more than 50 tables, one in another"),
+        (".".join("a" * 100_000) + "=1", "...: has more than 50 names with dots between"),
     ],
     ids=["brackets", "tables", "dotted key", "digits", "name"],
 )
@@ -149,7 +149,7 @@ def test_a_file_that_no_parser_stands_is_told(tmp_path: Path) -> None:
     path = tmp_path / "deep.toml"
     for text in ("a = " + "[" * 100_000, "a = " + "1" * 5000, ".".join("a" * 100_000) + " = 1"):
         path.write_text(text)
-        with pytest.raises(BadInput, match=r"deep\.toml: is not readable as TOML \(it "):
+        with pytest.raises(BadInput, match=r"deep\.toml: cannot be read as TOML \(it "):
             read_toml(path)
     path.write_text("a = " + "[" * 49 + "]" * 49 + '\nb = "' + "many words. " * 100 + '"')
     assert read_toml(path)["b"].startswith("many words. ")
@@ -157,5 +157,27 @@ def test_a_file_that_no_parser_stands_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["NaN", "[-Infinity]", '{"a": 1e999}'])
 def test_what_json_has_no_number_for_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="which is no number of JSON"):
+    with pytest.raises(ValueError, match="which is not a JSON number"):
         parse_json(text)
+
+
+def test_what_types_say_of_their_parameters() -> None:
+    """Also what they inherit, and nested tables by their names, alike ones together."""
+
+    class Base(Parameters):
+        """Of all sensors."""
+
+        rate_hz: float = 1.0
+
+    class Sensor(Base):
+        """Of this one."""
+
+    class Robot(Parameters):
+        left: Sensor = Sensor()
+        right: Sensor = Sensor()
+        more: list[Base] = []
+
+    assert explain(Robot) == {
+        "left., right.": "Of all sensors.\n\nOf this one.",
+        "more.": "Of all sensors.",
+    }

@@ -256,7 +256,10 @@ def test_poses_that_are_the_truth(tmp_path: Path) -> None:
     assert_allclose(truth["state"], [[3, 4, 5, 0.5, np.cos(half), 0, 0, np.sin(half)]], atol=1e-12)
     level: list[Sent] = [*sent, ("/level", START_NS, make("std_msgs/msg/Float64", data=0.75))]
     other = write_bag(tmp_path / "other", "mcap", level, make.store)
-    for name, words in (("/level", "truth = /level: has no poses"), ("/mocap", "has no topic /mocap")):
+    for name, words in (
+        ("/level", "truth = /level: this topic has no poses"),
+        ("/mocap", "has no topic /mocap"),
+    ):
         with pytest.raises(BadInput, match=words):
             imported(other, truth=name)
 
@@ -432,7 +435,7 @@ def test_a_split_bag_is_one_log(form: str, tmp_path: Path) -> None:
     (folder / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": about}))
     numbers, notes = counted(folder)
     assert numbers == list(range(100))
-    assert notes["lost (1)"].endswith(f"drive_11.{suffix}: is missing, of which metadata.yaml tells")
+    assert notes["lost (1)"].endswith(f"drive_11.{suffix}: is missing, although metadata.yaml names it")
 
 
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
@@ -587,7 +590,7 @@ stamp = "at"
     assert wheels.components == ["left_mps", "right_mps", "a", "b", "c"]
     assert wheels.publish_time_ns.tolist() == [START_NS - 1000, START_NS - 999, START_NS - 998]
     mapping.write_text(text.replace("factors = { value = 2.0 }", 'units = { value = "km/h" }'))
-    assert "the unit 'km/h' does not fit: a is a mere number" in refusal(path, mapping=str(mapping))
+    assert "the unit 'km/h' does not fit: a has no unit" in refusal(path, mapping=str(mapping))
     in_units = 'units = { value = ["km/h", "cm/s", "", "", ""] }\nwhere = { "left.speed" = 3.5 }'
     mapping.write_text(text.replace("factors = { value = 2.0 }", in_units))
     wheels = imported(path, mapping=str(mapping))[0]["/wheels"]
@@ -597,7 +600,7 @@ stamp = "at"
         (
             '"left.speed"',
             '"left.sped"',
-            f"the mapping of {name}: the type has no number 'left.sped'; did you mean",
+            f"the mapping of {name}: this type has no numeric field 'left.sped'; did you mean",
         ),
         (
             "VectorMeasurement",
@@ -623,7 +626,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     turned = bag("turned", ("/pose", make(pose, pose__orientation=[0.0, 0.0, 0.0, 0.5])))
     assert "topic /pose: its quaternions: the vector at (0,) has length 0.5" in refusal(turned)
     far = bag("far", ("/gps", make("sensor_msgs/msg/NavSatFix", latitude=90.5)))
-    assert refusal(far) == "topic /gps: a latitude is 90.5 deg, beyond 90"
+    assert refusal(far) == "topic /gps: a latitude is 90.5 deg, beyond 90; check the column and its unit"
     scan = bag("scan", ("/scan", make("sensor_msgs/msg/LaserScan")), ("/pose", make(pose)))
     assert refusal(scan, topics="/scan") == (
         "topic /scan cannot be taken: it is sensor_msgs/msg/LaserScan; describe it with "
@@ -654,7 +657,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(tmp_path: Path) -> Non
     assert "no transform has the frame 'bas'" in refusal(hole, transforms=["map:bas"])
     assert "expected a pair of frames" in refusal(hole, transforms="map")
     (tmp_path / "empty").mkdir()
-    assert refusal(tmp_path / "empty").startswith("holds no bag; give a .bag, .db3 or .mcap file")
+    assert refusal(tmp_path / "empty").startswith("has no bag in it; give a .bag, .db3 or .mcap file")
     for name in ("a.bag", "a.db3", "a.mcap", "a.txt"):
         (tmp_path / name).write_text("no bag at all" * 10)
         assert refusal(tmp_path / name)

@@ -110,7 +110,8 @@ def _truncate(path: Path) -> None:
 BAD = {
     "rates": (
         lambda f: write(f / "b.wav", samples_of("b.wav"), 16000),
-        "b.wav: has 16000 samples a second, a.wav has 8000; bring all of an array to one rate",
+        "b.wav: has 16000 samples per second, a.wav has 8000; resample all files of an array to one "
+        "rate",
     ),
     "stereo": (
         lambda f: write(f / "b.wav", np.stack([samples_of("b.wav")] * 2, axis=1)),
@@ -128,24 +129,24 @@ BAD = {
     ),
     "one begin": (
         lambda f: write(f / "b.wav", samples_of("b.wav"), begin="2024-05-01T06:00:00+00:00"),
-        "a.wav does not say when it began",
+        "a.wav lacks the comment recording_start_time",
     ),
     "no zone": (
         lambda f: write(f / "b.wav", samples_of("b.wav"), begin="2024-05-01T06:00:00"),
         "b.wav: recording_start_time has no time zone",
     ),
-    "no places": (lambda f: (f / "coords.csv").unlink(), "no table says where microphones are"),
+    "no places": (lambda f: (f / "coords.csv").unlink(), "has no table of the microphones' positions"),
     "a place": (
         lambda f: (f / "coords.csv").write_text("file,x,y\na.wav,0,north"),
-        "coords.csv: a.wav: its place is no number",
+        "coords.csv: a.wav: its position is not two numbers",
     ),
     "twice": (
         lambda f: (f / "coords.csv").write_text("file,x,y\na.wav,0,0\na.wav,1,1"),
-        "coords.csv: a.wav: stands there twice",
+        "coords.csv: a.wav: is listed twice",
     ),
     "times": (
         lambda f: (f / "heard.csv").write_text("file,start_time,end_time,owl\na.wav,2,1,1"),
-        "heard.csv: start_time and end_time must be numbers of s",
+        "heard.csv: start_time and end_time must be in s",
     ),
 }
 
@@ -159,7 +160,7 @@ def test_what_cannot_be_used_is_named(folder, what):
 
 
 def test_a_band_beyond_the_samples_is_named(folder):
-    with pytest.raises(BadInput, match="no more than 4000"):
+    with pytest.raises(BadInput, match="at most 4000"):
         read(folder, band_hz=[300, 5000])
 
 

@@ -230,7 +230,7 @@ delay_s = 0.5
     assert notes["raw.csv: rows without a time are left out"] == "1"
     assert "files not taken" not in notes
     (tmp_path / "raw.csv.tag").write_bytes(b"no tag")
-    with pytest.raises(BadInput, match="is no time tag of RTKLIB"):
+    with pytest.raises(BadInput, match="is not a time tag of RTKLIB"):
         imported(tmp_path / "raw.csv", tagged)
 
 
@@ -253,7 +253,7 @@ noise = { position_m = 0.5 }
     assert_allclose(streams["/fix"]["position_m"], places + noise, rtol=1e-15)
     assert notes["/fix: messages with simulated noise, position_m: 0.5"] == "4"
     assert (streams["/fix"]["position_m"] != imported(text, mapping)[0]["/fix"]["position_m"]).all()
-    with pytest.raises(BadInput, match="noise is of position, which `fields` does not have"):
+    with pytest.raises(BadInput, match="`noise` names position, which `fields` does not have"):
         imported(text, mapping.replace("{ position_m = 0.5", "{ position = 0.5"))
 
 
@@ -267,7 +267,7 @@ def test_recordings_of_one_format_differ_in_mounting_and_delays(imported: Callab
     assert (found.log_time_ns - found.publish_time_ns).tolist() == [500000000] * 2
     with pytest.raises(BadInput, match=r"delays_s: the mapping has no topic '/inertia'; did you mean"):
         imported(ROWS, mapping, delays_s={"/inertia": 0.5})
-    with pytest.raises(BadInput, match="mounting_deg: the mapping turns no stream"):
+    with pytest.raises(BadInput, match="mounting_deg: no stream of the mapping has a mounting"):
         imported(ROWS, INERTIAL, mounting_deg=[0, 0, 180])
 
 
@@ -283,7 +283,9 @@ def test_recordings_are_found_below_a_folder(tmp_path: Path) -> None:
     both = [tmp_path / "a" / "path_2", tmp_path / "path_10"]
     assert recordings_in(mapping, tmp_path) == both
     assert recordings_in(mapping, both[1]) == both[1:]
-    with pytest.raises(BadInput, match=r"no folder there has the files .* \(GT.csv, IMU_{unit}.csv\)"):
+    with pytest.raises(
+        BadInput, match=r"neither it nor a folder in it has the files .* \(GT.csv, IMU_{unit}.csv\)"
+    ):
         recordings_in(mapping, tmp_path / "part")
 
 
@@ -574,18 +576,18 @@ BAD = [
     (ROWS, INERTIAL, '"ax"', '"foo"', "table.csv: has no column 'foo'; there are: time, ax"),
     (ROWS, INERTIAL, '"g"', '"m/s"', "the unit 'm/s' does not fit: specific_force_mps2 is in m/s^2"),
     (ROWS, INERTIAL, '"g"', '"gee"', "no unit 'gee'; there are: m, mm"),
-    (ROWS, INERTIAL, '"time"', '"note"', "column note holds no numbers"),
+    (ROWS, INERTIAL, '"time"', '"note"', "column note has cells that are not numbers"),
     (ROWS, INERTIAL, '"ax"', '"note"', "table.csv: column note holds 'a'; expected numbers"),
     (ROWS, INERTIAL, "InertialSample", "Inertial", "did you mean 'InertialSample'?"),
     (ROWS, INERTIAL, "turn_rate_radps = [", "turn_rate = [", "InertialSample has no field 'turn_rate'"),
-    (ROWS, INERTIAL, ', "gz"]', "]", "field turn_rate_radps is given 2 numbers; expected 3"),
+    (ROWS, INERTIAL, ', "gz"]', "]", "field turn_rate_radps is given 2 columns; expected 3"),
     ("t,lat,lon,h\n1,90.5,8,0\n", FIX, "", "", "a latitude is 90.5 deg, beyond 90"),
     ("t,lat,lon,h\n1,x,8,0\n", FIX, "", "", "column lat holds 'x'; expected numbers"),
-    ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row of it has a time"),
-    ("t,lat,lon,h\n1,,8,0\n", FIX, "", "", "nothing of it could be imported"),
-    ("t,lat,lon,h\n-1,1,8,0\n", FIX, "", "", "column t: a stamp is before 1970 or beyond"),
+    ("t,lat,lon,h\n,1,8,0\n", FIX, "", "", "table.csv: no row has a time that can be read"),
+    ("t,lat,lon,h\n1,,8,0\n", FIX, "", "", "none of its rows could be imported"),
+    ("t,lat,lon,h\n-1,1,8,0\n", FIX, "", "", "column t: a stamp is before 1970 or after"),
     ("t,lat,lon,h\n", FIX, "", "", "table.csv: has a header line but no rows"),
-    ("", FIX, "", "", "table.csv: holds no rows"),
+    ("", FIX, "", "", "table.csv: has no rows"),
     ("t,w,x,y,z\n1,1,1,0,0\n", FIX, FIX[FIX.index("geodetic") :], """
 [[tables.streams]]
 topic = "/truth"
@@ -626,7 +628,7 @@ def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> 
     assert notes["files not taken"] == "readme.txt"
     again, _ = imported(folder / "imu_left.csv", mapping, folder / "imu_right.csv")
     assert list(again) == list(streams)
-    with pytest.raises(BadInput, match="is none of the mapping's files"):
+    with pytest.raises(BadInput, match="is not one of the files that the mapping names"):
         imported(folder / "imu_left.csv", mapping, folder / "readme.txt")
     with pytest.raises(BadInput, match="has no file"):
         imported(tmp_path, mapping.replace("imu_{side}", "gnss_{side}"))

@@ -63,15 +63,15 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "format_", "words"),
     [
-        ("", None, ("holds no poses", "TUM, KITTI or EuRoC")),
-        ("1 2 3\n", None, ("line 1 is no pose", "3 columns", "tum has 8 numbers")),
+        ("", None, ("has no poses", "TUM, KITTI or EuRoC")),
+        ("1 2 3\n", None, ("line 1 is not a pose", "3 columns", "tum has 8 numbers")),
         (TUM + "1305031104 4 5 6 0 0 0\n", None, ("line 5 has 7 columns", "8 numbers")),
-        (TUM + "1305031104 4 5 six 0 0 0 1\n", None, ("line 5 is no pose", "'six'")),
-        (TUM + "1305031104 4 5 nan 0 0 0 1\n", None, ("line 5 holds a value that is not finite",)),
+        (TUM + "1305031104 4 5 six 0 0 0 1\n", None, ("line 5 is not a pose", "'six'")),
+        (TUM + "1305031104 4 5 nan 0 0 0 1\n", None, ("line 5 has a value that is not finite",)),
         (TUM + "1305031104 4 5 6 0 0 0 2\n", None, ("line 5", "quaternion", "not of unit length")),
         (TUM + "1305031104000000 4 5 6 0 0 0 1\n", None, ("line 5", "beyond the year 2262", "in s")),
-        (KITTI + "1 0 0 4 0 2 0 5 0 0 1 6\n", None, ("line 3", "matrix that is no rotation")),
-        (KITTI + "1 0 0 4 0 1 0 5 0 0 -1 6\n", None, ("line 3", "matrix that is no rotation")),
+        (KITTI + "1 0 0 4 0 2 0 5 0 0 1 6\n", None, ("line 3", "matrix that is not a rotation")),
+        (KITTI + "1 0 0 4 0 1 0 5 0 0 -1 6\n", None, ("line 3", "matrix that is not a rotation")),
         (KITTI, "tum", ("line 1 has 12 columns", "tum has 8 numbers")),
         (TUM, "tmu", ("no trajectory format 'tmu'", "did you mean 'tum'")),
     ],
@@ -88,7 +88,10 @@ def test_what_is_no_trajectory_is_told_by_its_line(
 
 def test_what_is_no_text_is_told(tmp_path: Path) -> None:
     (tmp_path / "poses").write_bytes(b"\x89MCAP0\r\n\xff")
-    for place, words in ((tmp_path / "poses", "is no text"), (tmp_path / "none", "No such file")):
+    for place, words in (
+        (tmp_path / "poses", "is not a text file"),
+        (tmp_path / "none", "No such file"),
+    ):
         with pytest.raises(BadInput, match=words):
             read_trajectory(place)
 

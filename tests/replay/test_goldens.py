@@ -112,7 +112,7 @@ def test_what_is_missing_or_new_or_late_is_found(golden: Golden) -> None:
 def test_another_cpu_gets_more_but_the_same_input_is_asked_for(golden: Golden) -> None:
     found = golden_of("landmarks")
     found["runs"]["landmarks"]["input"] = "another"
-    with pytest.raises(BadInput, match="recorded or imported has changed"):
+    with pytest.raises(BadInput, match="recorded or imported data have changed"):
         list(differences("landmarks", golden, found))
     found["arithmetic"] = "another"
     streams_of(found)[POSE]["columns"]["mean"]["kept"][7][0] *= 1 + 1e-9

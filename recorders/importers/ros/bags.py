@@ -79,10 +79,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
     bag = Bag(
         path,
         [],
-        [f"{each}: is missing, of which metadata.yaml tells" for each in paths if each not in there],
+        [f"{each}: is missing, although metadata.yaml names it" for each in paths if each not in there],
     )
     if not there:
-        raise BadInput(f"{path}: holds no bag; {_WANTED}")
+        raise BadInput(f"{path}: has no bag in it; {_WANTED}")
     for entry in about.get("topics_with_message_count") or []:
         bag.stated[entry["topic_metadata"]["name"]] += int(entry["message_count"])
     bag.is_packed = str(about.get("compression_mode") or "").lower() == "message"
@@ -90,7 +90,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         for each in there:
             bag.files.append(_open_file(each, scratch))
         if len({type(each) for each in bag.files}) > 1:
-            raise BadInput(f"{path}: holds bags of several formats; give one of them")
+            raise BadInput(f"{path}: has bags of several formats in it; give one of them")
         yield bag
 
 
@@ -109,7 +109,7 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
         return SqliteFile(place)
     if place.suffix in (".bag", ".active"):
         return Ros1File(place)
-    raise BadInput(f"{path}: is no bag; {_WANTED}")
+    raise BadInput(f"{path}: is not a bag; {_WANTED}")
 
 
 def _unpacked(batch: Batch) -> Batch:

@@ -67,7 +67,7 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
         _check_truth(bag, parameters.truth, found.readers)
     if not found.readers:
         listed = ", ".join(f"{topic} ({why})" for topic, why in sorted(found.not_taken.items()))
-        raise BadInput(f"{bag.path}: holds nothing that can be imported: {listed or 'no topics'}")
+        raise BadInput(f"{bag.path}: has no topic that can be imported: {listed or 'no topics'}")
     return found
 
 
@@ -123,7 +123,7 @@ def _check_truth(bag: Bag, topic: str, readers: Mapping[Connection, Reader]) -> 
     """Raise BadInput where the topic of the truth has no poses."""
     reader = next((each for of, each in readers.items() if of.topic == topic), None)
     if not reader or not reader.taken or not any("pose" in kind for kind in reader.taken.kinds):
-        raise BadInput(f"{bag.path}: truth = {topic}: has no poses; name a topic that has some")
+        raise BadInput(f"{bag.path}: truth = {topic}: this topic has no poses; name one that has")
 
 
 def _reader(
@@ -134,7 +134,7 @@ def _reader(
     where = f"{parameters.mapping}: the mapping of {name}"
     is_transforms = name in TRANSFORM_TYPES
     if connection.encoding not in ("cdr", "ros1"):
-        return f", in the encoding '{connection.encoding}', which is none of ROS"
+        return f", in the encoding '{connection.encoding}', which is not one of ROS"
     if mapping is None and not is_transforms and name not in TYPES:
         return ""
     try:
@@ -146,7 +146,9 @@ def _reader(
         known = kind.fields()
         for path in mapping.paths():
             if path not in known and not any(part.isdigit() for part in path.split(".")):
-                raise BadInput(f"{where}: the type has no number '{path}'; {choices(path, known)}")
+                raise BadInput(
+                    f"{where}: this type has no numeric field '{path}'; {choices(path, known)}"
+                )
         return Reader(kind, taken(mapping, where), mapping.stamp, mapping.frame, is_static=False)
     is_static = connection.topic.endswith("_static")
     return Reader(kind, TYPES.get(name), STAMP, FRAME, is_static)

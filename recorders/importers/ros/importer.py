@@ -183,7 +183,7 @@ class _Import:
             self._clocks.check(self.path, self._parameters.clock_tolerance_s)
         if not self._streams.messages:
             facts = "; ".join(f"{key}: {fact}" for key, fact in self.notes().items())
-            raise BadInput(f"{self.path}: nothing of it could be imported: {facts}")
+            raise BadInput(f"{self.path}: none of its topics could be imported: {facts}")
 
     def notes(self) -> dict[str, str]:
         """What the bag had, by subject."""

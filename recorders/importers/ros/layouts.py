@@ -203,7 +203,7 @@ class _Walk:
         self._walk("", (Nodetype.NAME, name))
         behind = len(self._raw) - self._position
         if not 0 <= behind < (4 if self._is_cdr else 1):
-            raise Undecodable(f"it has {behind} bytes more than its definition {name} says")
+            raise Undecodable(f"it has {behind} bytes more than its definition {name} describes")
         return self._found
 
     def _walk(self, path: str, description: Any) -> None:

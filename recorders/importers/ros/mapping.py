@@ -59,7 +59,9 @@ def taken(mapping: MessageMapping, where: str) -> Taken:
         def read(path: str) -> NDArray:
             if path not in messages.layout.numbers:
                 known = list(messages.layout.numbers)
-                raise BadInput(f"{where}: the message has no number '{path}'; {choices(path, known)}")
+                raise BadInput(
+                    f"{where}: this message has no numeric field '{path}'; {choices(path, known)}"
+                )
             return messages.numbers(path)
 
         def holds(path: str, values: Sequence[Source]) -> NDArray[np.bool_]:

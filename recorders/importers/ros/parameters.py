@@ -21,15 +21,16 @@ Names = Annotated[list[str], BeforeValidator(_as_list)]
 
 
 class RosParameters(Parameters):
-    """Which topics are taken, and by which clock.
+    """Which topics are imported, and by which clock.
 
-    `clock` says what the publish time is: the message's header, or the bag. Without `topics` all are
-    taken that can be. `transforms` names pairs of frames, "map:base_link", whose poses are composed of
-    what TF has; without any, every transform that is sent is taken as it is. `names` gives what stands
-    in place of the namespace in the streams of a topic: {"/amcl_pose" = "/robot1"}. The poses of the
-    topic `truth` are what estimates are compared with, as the stream `truth`. `mapping` is a TOML file
-    for messages of one's own. `distribution` says whose definitions hold where the bag has none.
-    Headers that differ by more than `clock_tolerance_s` from one another's clock are of several clocks.
+    `clock` is the one that gives the publish time: that of the message's header, or the bag's. `topics`
+    are those to import; without any, all that can be. `transforms` are pairs of frames such as
+    "map:base_link", whose poses are composed from TF; without any, every transform is imported as it
+    was sent. `names` replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic
+    under /robot1. The poses of the topic `truth` become the stream `truth`, with which estimates are
+    compared. `mapping` is a TOML file for messages of your own. `distribution` has the definitions of
+    messages that the bag does not define. Headers that differ by more than `clock_tolerance_s` are
+    refused as those of several clocks.
     """
 
     clock: Clock = "header"

@@ -84,7 +84,9 @@ class Ros1File:
     def _index(self, file: BinaryIO) -> None:
         """Find the chunks, and the connections behind them; where these are missing, in the chunks."""
         if file.read(len(_MAGIC)) != _MAGIC:
-            raise BadInput(f"{self.path}: is no bag of ROS 1, format 2.0; rosbag migrates older ones")
+            raise BadInput(
+                f"{self.path}: is not a bag of ROS 1 in format 2.0; convert an older one with rosbag fix"
+            )
         size = file.seek(0, 2)
         position = len(_MAGIC)
         has_index = False
@@ -92,7 +94,8 @@ class Ros1File:
             record = _record_at(file, position, size)
             if record is None:
                 self.losses.append(
-                    f"{self.path}: it was cut off: its last {size - position} bytes hold no whole record"
+                    f"{self.path}: it was cut off: its last {size - position} bytes are not a whole "
+                    "record"
                 )
                 break
             position = record.begin + record.length
@@ -149,7 +152,7 @@ class Ros1File:
                 data, found = opened
                 if found.end < len(data):
                     lost = len(data) - found.end
-                    self.losses.append(f"{place}: its last {lost} bytes hold no whole message")
+                    self.losses.append(f"{place}: its last {lost} bytes are not a whole message")
                 for number, connection in chosen.items():
                     rows = (found.kinds == _MESSAGE) & (found.connections == number)
                     if rows.any():
@@ -198,7 +201,7 @@ def _opened(read: tuple[_Record, bytes]) -> tuple[NDArray[np.uint8], _Scanned] |
     record, raw = read
     compression = record.header.get("compression", b"")
     if compression not in _DECOMPRESS:
-        return f"its compression {compression.decode(errors='replace')} is none of none, bz2 and lz4"
+        return f"its compression {compression.decode(errors='replace')} is not one of none, bz2 and lz4"
     try:
         data = np.frombuffer(_DECOMPRESS[compression](raw), np.uint8)
     except (OSError, EOFError, RuntimeError, ValueError) as error:

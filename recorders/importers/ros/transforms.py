@@ -194,7 +194,7 @@ def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
         if frame not in above and frame not in above.values():
             frames = sorted({each for link in links for each in link})
             raise BadInput(
-                f"no transform has the frame '{frame}'; there are {', '.join(frames) or 'none'}"
+                f"no transform has the frame '{frame}'; the frames are {', '.join(frames) or 'none'}"
             )
     up, down = _ancestors(parent, above), _ancestors(child, above)
     common = next((frame for frame in up if frame in down), None)

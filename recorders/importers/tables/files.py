@@ -146,7 +146,7 @@ def _open_text(
                 comments.append(text.lstrip("#% "))
             skipped += 1
         else:
-            raise BadInput(f"{path}: holds no rows; give a table with some")
+            raise BadInput(f"{path}: has no rows; give a table with rows")
         following = file.readline().decode("utf-8")
     # the first line may be cut, as that of a logger whose file began in the middle of one
     whole = following.strip() or text
@@ -156,7 +156,7 @@ def _open_text(
     if has_header or (has_header is None and not any(map(_is_value, cells))):
         named, skipped = cells, skipped + 1
         if not following.strip():
-            raise BadInput(f"{path}: has a header line but no rows; give a table with some")
+            raise BadInput(f"{path}: has a header line but no rows; give a table with rows")
     else:
         named = _cells(comments[-1], delimiter) if comments else []
         named = named if len(named) == width else []
@@ -184,7 +184,9 @@ def _is_value(cell: str) -> bool:
 def _unique(names: Sequence[str], width: int, path: Path) -> list[str]:
     """Names of columns; such as are empty, come again or are lacking are numbers from 1 on."""
     if len(names) > width:
-        raise BadInput(f"{path}: {len(names)} columns are named, and its rows have {width}")
+        raise BadInput(
+            f"{path}: `columns` names {len(names)} columns, and the rows have {width}; name each once"
+        )
     counts = Counter(names)
     padded = [*names, *[""] * (width - len(names))]
     return [name if name and counts[name] == 1 else str(number) for number, name in enumerate(padded, 1)]
@@ -260,7 +262,10 @@ def _open_rtklib(path: Path) -> Table:
             if words and words[0] in ("GPST", "UTC", "JST"):
                 named = ["date", "time", *words[1:]]
     if not named:
-        raise BadInput(f"{path}: has no header line of RTKLIB, which begins with '%  GPST'")
+        raise BadInput(
+            f"{path}: has no header line of RTKLIB, which begins with '%  GPST'; give the .pos file as "
+            "RTKLIB writes it"
+        )
     return _open_text(path, named, False, None, ".")
 
 
@@ -278,7 +283,7 @@ def _open_parquet(path: Path) -> Table:
 
     first = next(read(dict.fromkeys(columns, False)), None)
     if first is None:
-        raise BadInput(f"{path}: holds no rows; give a table with some")
+        raise BadInput(f"{path}: has no rows; give a table with rows")
     return Table(path, list(first), read)
 
 
@@ -293,7 +298,7 @@ def _open_json(path: Path) -> Table:
 
     first = next(read({}), None)
     if first is None:
-        raise BadInput(f"{path}: holds no rows; give one JSON object in a line")
+        raise BadInput(f"{path}: has no rows; give one JSON object per line")
     return Table(path, list(first), read)
 
 
@@ -313,7 +318,9 @@ def _open_npz(path: Path) -> Table:
     sizes = {name: array.shape for name, array in flat.items()}
     if not flat or len(set(sizes.values())) > 1 or next(iter(flat.values())).ndim != 1:
         told = ", ".join(f"{name} {arrays[name].shape}" for name in arrays) or "none"
-        raise BadInput(f"{path}: its arrays are no columns of one length: {told}")
+        raise BadInput(
+            f"{path}: its arrays are not columns of one length ({told}); save arrays of the same length"
+        )
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         for begin in range(0, len(next(iter(flat.values()))), _BLOCK_ROWS):

@@ -96,7 +96,11 @@ def guess(paths: Sequence[Path]) -> str:
             except BadInput as error:
                 notes.append(str(error))
     if not tables:
-        raise BadInput(notes[0] if len(notes) == 1 else f"{paths[0]}: holds no table among its files")
+        raise BadInput(
+            notes[0]
+            if len(notes) == 1
+            else f"{paths[0]}: has no table among its files; give a folder or files of tables"
+        )
     head = [
         "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
@@ -128,7 +132,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     table = open_table(path)
     batch = next(table.batches((), table.columns), None)
     if batch is None:
-        raise BadInput(f"{path}: holds no rows")
+        raise BadInput(f"{path}: has no rows")
     batch = {column: cells[:_ROWS] for column, cells in batch.items()}
     columns, texts = [], []
     for column in table.columns:
@@ -140,8 +144,8 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
     time, used, told = _time(batch, columns, texts)
     if not columns or (not used and len(columns[0].values) < _FEWEST):
         raise BadInput(
-            f"{path}: has no times, and no columns of {_FEWEST} numbers or more; write a mapping "
-            "by hand, as docs/your-log.md says"
+            f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
+            "mapping by hand, as docs/your-log.md says"
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):

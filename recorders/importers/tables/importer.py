@@ -28,10 +28,10 @@ from recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, a name (walk) or a file (own.toml), and more files and folders that it is of.
+    """The mapping, by its name (walk) or file (own.toml), and what differs between recordings.
 
-    Recordings of one format differ in `mounting_deg` and, by topic, `delays_s`, which take the place of
-    what the mapping says; `seed` is that of its noise.
+    `more` are further files and folders. `mounting_deg`, and `delays_s` by topic, replace what the
+    mapping states; `seed` is that of the noise that a mapping adds.
     """
 
     mapping: str = ""
@@ -74,7 +74,10 @@ def _blocks(
         if (first := source.first_ns()) is not None
     }
     if not firsts:
-        raise BadInput(f"{paths[0]}: no row of it has a time; nothing can be imported")
+        raise BadInput(
+            f"{paths[0]}: no row has a time that can be read, so that nothing can be imported; check "
+            "`time` in the mapping"
+        )
     told.epoch_ns = min(firsts.values())
     _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)
     origin = mapping.origin or next(filter(None, (source.first_fix() for source in sources)), None)
@@ -90,7 +93,7 @@ def _blocks(
             heapq.heappush(queue, (sources[number].reached_ns, number))
     if not any(source.messages.total() for source in sources):
         facts = "; ".join(f"{topic}: {fact}" for topic, fact in counts) or "it has no rows"
-        raise BadInput(f"{paths[0]}: nothing of it could be imported: {facts}")
+        raise BadInput(f"{paths[0]}: none of its rows could be imported: {facts}")
     told.notes.update(_notes(sources, plane, mapping))
     told.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
     not_taken = {other.name for other in others} - {source.tag_name for source in sources}
@@ -113,7 +116,9 @@ def _constant(own: ConstantStream, time_ns: int) -> Stream:
     """The messages that stand in a mapping."""
 
     def read_none(source: str, *_: object) -> NDArray:
-        raise BadInput(f"{own.topic}: '{source}' is no number; constants have no columns")
+        raise BadInput(
+            f"{own.topic}: '{source}' is not a number; constants have no columns to read from"
+        )
 
     found = mapped(own.mapping, 1, read_none, read_none, own.topic)
     columns = {name: checked(own.topic, name, column) for name, column in found.columns.items()}

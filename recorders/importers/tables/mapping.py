@@ -81,7 +81,7 @@ class TableStream(StreamMapping):
     @model_validator(mode="after")
     def _has_fields_of_noise(self) -> Self:
         if unknown := self.noise.keys() - self.fields.keys():
-            raise ValueError(f"noise is of {', '.join(sorted(unknown))}, which `fields` does not have")
+            raise ValueError(f"`noise` names {', '.join(sorted(unknown))}, which `fields` does not have")
         return self
 
 
@@ -158,7 +158,10 @@ def read_mapping(name: str) -> LogMapping:
     if not name.endswith(".toml"):
         known = shipped()
         if name not in known:
-            raise BadInput(f"no mapping '{name}'; {choices(name, known)}; a file of yours ends in .toml")
+            raise BadInput(
+                f"no mapping '{name}'; {choices(name, known)}; a mapping of your own is a file whose "
+                "name ends in .toml"
+            )
         with resources.as_file(_SHIPPED / f"{name}.toml") as file:
             return build(LogMapping, read_toml(file), f"mapping {name}")
     found = build(LogMapping, read_toml(path), name)
@@ -186,7 +189,10 @@ def adapted(
         if topic not in topics:
             raise BadInput(f"delays_s: the mapping has no topic '{topic}'; {choices(topic, topics)}")
     if mounting_deg is not None and all(stream.mounting_deg is None for stream in streams):
-        raise BadInput("mounting_deg: the mapping turns no stream; state the mounting of one in it")
+        raise BadInput(
+            "mounting_deg: no stream of the mapping has a mounting to replace; write mounting_deg into "
+            "the mapping first"
+        )
 
     def changed(stream: TableStream) -> TableStream:
         update: dict[str, object] = {"delay_s": delays_s.get(stream.topic, stream.delay_s)}
@@ -211,7 +217,9 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
             folders.append(folder)
     if not folders:
         patterns = ", ".join(table.files for table in mapping.tables if not table.optional)
-        raise BadInput(f"{place}: no folder there has the files of the mapping ({patterns})")
+        raise BadInput(
+            f"{place}: neither it nor a folder in it has the files that the mapping names ({patterns})"
+        )
     return folders
 
 
@@ -242,12 +250,12 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], lis
                 others.append(file)
             else:
                 patterns = ", ".join(table.files for table in mapping.tables)
-                raise BadInput(f"{file}: is none of the mapping's files ({patterns})")
+                raise BadInput(f"{file}: is not one of the files that the mapping names ({patterns})")
     for table in mapping.tables:
         if not table.optional and not any(each.table is table for each in found):
             where = ", ".join(map(str, paths))
             raise BadInput(
-                f"{where}: has no file {table.files}, which the mapping needs; give it too, or set "
+                f"{where}: has no file {table.files}, which the mapping needs; add it, or set "
                 "optional = true for its table"
             )
     return found, others

@@ -53,13 +53,17 @@ def _onto_map(projection: str) -> Any:
         from pyproj.exceptions import CRSError
     except ImportError:
         raise BadInput(
-            f"projection {projection}: needs pyproj; pip install 'fuselog[maps]', or leave it out and "
-            "have the tangent plane"
+            f"projection {projection}: needs pyproj; pip install 'fuselog[maps]', or leave the "
+            "projection out to use the tangent plane"
         ) from None
     try:
         crs = CRS.from_user_input(projection)
     except CRSError:
-        raise BadInput(f"no projection '{projection}'; give one such as EPSG:25832") from None
+        raise BadInput(
+            f"pyproj knows no projection '{projection}'; give one such as EPSG:25832"
+        ) from None
     if not crs.is_projected:
-        raise BadInput(f"projection {projection}: is none; give one with east and north, as EPSG:25832")
+        raise BadInput(
+            f"projection {projection}: has no east and north in m; give one that has, such as EPSG:25832"
+        )
     return Transformer.from_crs("EPSG:4326", crs, always_xy=True)

@@ -119,7 +119,7 @@ class Rows:
             except ValueError:
                 name = self._filled(source)
                 raise BadInput(
-                    f"{self.path}: {source} of its name is '{name}'; expected a number"
+                    f"{self.path}: {source} in its file name is '{name}'; expected a number"
                 ) from None
         column = self.table.column(source)
         cells = batch[column]
@@ -128,7 +128,9 @@ class Rows:
         try:
             return cells.cast(pa.float64()).to_numpy(zero_copy_only=False)
         except pa.ArrowInvalid:
-            raise BadInput(f"{self.path}: column {column} holds what is no number") from None
+            raise BadInput(
+                f"{self.path}: column {column} has cells that are not numbers; give a column of numbers"
+            ) from None
 
     def _read_ns(self, batch: Batch, clock: TimeMapping) -> Stamps:
         return stamps_ns(clock, batch, self.count, _size(batch), str(self.path))

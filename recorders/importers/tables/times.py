@@ -53,9 +53,9 @@ class TimeMapping(Parameters):
     @model_validator(mode="after")
     def _check(self) -> "TimeMapping":
         if bool(self.columns) == (self.rate_hz is not None):
-            raise ValueError("give either the column that has the time, or rate_hz")
+            raise ValueError("give either `column`, which has the times, or `rate_hz`")
         if len(self.columns) > 1 + bool(self.week) and self.unit != "date":
-            raise ValueError('several columns make a date; give unit = "date", or one column')
+            raise ValueError('several columns together are a date; give unit = "date", or one column')
         try:
             _date_ns(self.zero)
         except ValueError:
@@ -107,8 +107,8 @@ def stamps_ns(
     shifted = np.where(known, found + mapping.zero_ns, NOT_A_TIME)
     if np.any(shifted[known] < 0):
         raise BadInput(
-            f"{label}: a stamp is before 1970 or beyond the year 2262; give the unit, and in zero the "
-            "date that it counts from"
+            f"{label}: a stamp is before 1970 or after 2262; check `unit`, and give in `zero` the "
+            "date that the times count from"
         )
     return shifted
 
@@ -130,7 +130,9 @@ def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
                 cells = texts.cast(pa.float64())
             except pa.ArrowInvalid as error:
                 said = str(error).splitlines()[0]
-                raise BadInput(f'{label} holds no numbers ({said}); dates need unit = "date"') from None
+                raise BadInput(
+                    f'{label} has cells that are not numbers ({said}); dates need unit = "date"'
+                ) from None
         else:
             # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
             scaled = exact.cast(pa.decimal128(38, digits))
@@ -157,7 +159,7 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
     except ValueError as error:
         said = str(error).splitlines()[0]
         raise BadInput(
-            f"{label} holds no dates ({said}); give their format, or the unit of numbers"
+            f"{label} has cells that are not dates ({said}); give their `format`, or the unit of numbers"
         ) from None
     return dates.dt.tz_localize(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
 
@@ -192,14 +194,19 @@ def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter
     try:
         data = tag.read_bytes()
     except OSError as error:
-        raise BadInput(f"{tag}: {error.strerror}; {path.name} needs it for its start") from None
+        raise BadInput(f"{tag}: {error.strerror}; {path.name} needs it to know its first time") from None
     if not data.startswith(b"TIMETAG RTKLIB") or len(data) < 84:
-        raise BadInput(f"{tag}: is no time tag of RTKLIB; {path.name} needs one for its start")
+        raise BadInput(
+            f"{tag}: is not a time tag of RTKLIB, which {path.name} needs to know its first time"
+        )
     seconds, fraction = struct.unpack_from("<Id", data, 64)
     last_ms = np.frombuffer(data, "<u4", (len(data) - 76) // 8 * 2, 76)[-2]
     every = np.concatenate([ticks[ticks != NOT_A_TIME] for ticks in ticks_ns] or [np.empty(0, np.int64)])
     if len(every) < 2 or every.max() <= every[0]:
-        raise BadInput(f"{path}: its counter does not go on; {tag.name} cannot tell its times")
+        raise BadInput(
+            f"{path}: its counter does not increase, so that {tag.name} does not give its times; give "
+            "the file as RTKLIB wrote it"
+        )
     rate = float(last_ms) * 1e6 / float(every.max() - every[0])
     cut_ns = int(every[-1]) if every[-1] < every.max() else NOT_A_TIME
     return Counter(int(every[0]), seconds * 10**9 + round(fraction * 1e9), rate, cut_ns)

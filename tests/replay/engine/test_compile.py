@@ -303,8 +303,8 @@ def test_only_a_folder_of_this_user_alone_is_used(
     monkeypatch.delattr(os, "getuid")
     assert found_in_the_cache()
     assert caplog.messages == [
-        f"the cache {kernels} is not used: other users may write to it; chmod go-w mends that",
-        f"the cache {kernels.parent} is not used: other users may write to it; chmod go-w mends that",
+        f"the cache {kernels} is not used: other users may write to it; chmod go-w forbids them",
+        f"the cache {kernels.parent} is not used: other users may write to it; chmod go-w forbids them",
         f"the cache {kernels.parent} is not used: another user owns it; set FUSELOG_CACHE to your own",
     ]
 
@@ -488,13 +488,13 @@ def test_two_closures_of_one_function_stay_two():
 def test_what_cannot_be_compiled_is_told_in_one_sentence():
     typed: dict[str, Callable] = {}
     exec("def typed(value): return value", typed)
-    with pytest.raises(BadInput, match="the source of typed is not at hand"):
+    with pytest.raises(BadInput, match="the source of typed cannot be found"):
         compile_over_runs(kernel_of(typed["typed"]))
-    with pytest.raises(BadInput, match="is no `def` function; kernels are made of these"):
+    with pytest.raises(BadInput, match="is not a `def` function, of which kernels are made"):
         compile_over_runs(kernel_of(lambda value: value))
-    with pytest.raises(BadInput, match=r"uses 'scale', a ndarray, .* hand it in as an argument"):
+    with pytest.raises(BadInput, match=r"uses 'scale', a ndarray, .* pass it as an argument"):
         compile_over_runs(kernel_of(scaled_by(np.ones(3))))
-    with pytest.raises(BadInput, match=r"the module recorders.log.loops: import what it needs of it by"):
+    with pytest.raises(BadInput, match=r"the module recorders.log.loops: import what it needs by"):
         compile_over_runs(through_a_module)
     with pytest.raises(BadInput, match="kernel 'one' does not compile: No implementation of function"):
         compile_over_runs(kernel_of(twice))(1, "text")

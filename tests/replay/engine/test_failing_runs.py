@@ -287,7 +287,7 @@ def test_reasons_may_hold_anything_and_are_merged() -> None:
     expected = ["one; two", 'a "quote"', "three", "one; two"]
     assert sentences_of(gather(parts).stream) == expected
     old = make_stream("/f", schemas.FAILURE, [1], metadata={"reasons": "one; two"}, reason=[1])
-    with pytest.raises(BadInput, match=r"/f: its reasons are no JSON list .* replay the log again"):
+    with pytest.raises(BadInput, match=r"/f: its reasons are not a JSON list .* replay the log again"):
         sentences_of(old)
     unknown = make_stream("/f", schemas.FAILURE, [1], metadata={"reasons": '["a"]'}, reason=[7])
     joined = gather([unknown, parts[0]]).stream

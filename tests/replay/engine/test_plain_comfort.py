@@ -2,6 +2,8 @@
 
 import logging
 import os
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -305,7 +307,7 @@ def test_all_runs_at_once_are_one_call() -> None:
     out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
     assert seen == [2]
     assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(BadInput, match="give follow or follow_all"):
+    with pytest.raises(BadInput, match="neither follow nor follow_all is given"):
         recursive("none", **given)
 
 
@@ -324,3 +326,24 @@ def test_long_compiling_is_said_once(
         compile_over_runs(tracked)(2, *arguments)
     said = [record.getMessage() for record in caplog.records]
     assert said == [f"compiling {tracked.__module__}.tracked, once"]
+
+
+@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
+def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
+    """On standard error, as nothing else is there; not where the program logs in its own way."""
+    code = (
+        "import sys, logging, replay.engine.keeping as keeping, numpy as np\n"
+        "from replay.engine.compile import compiled\n"
+        "keeping._PATIENCE_S = 0.0\n"
+        "if sys.argv[1:]: logging.basicConfig()\n"
+        "from recorders.models.planar import wrap_angle\n"
+        "for x in (1.0, 1): compiled(wrap_angle)(x)\n"
+    )
+    environment = {**os.environ, "FUSELOG_CACHE": str(tmp_path)}
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code, *options], env=environment, capture_output=True, text=True
+        ).stderr
+        for options in ([], ["logs"])
+    ]
+    assert said == ["fuselog: compiling recorders.models.planar.wrap_angle, once\n", ""]

@@ -127,7 +127,7 @@ def test_a_sighting_on_the_very_spot_changes_nothing(mode, monkeypatch):
 
 
 def test_an_anchor_that_is_not_there_is_refused():
-    with pytest.raises(BadInput, match="anchor 3 is none of the robots 1, 2"):
+    with pytest.raises(BadInput, match="anchor 3 is not one of the robots 1, 2"):
         bind("cooperative:ci", [two_robots()], {})
 
 

@@ -197,13 +197,13 @@ def test_bad_input_is_named():
     good = source(simulate(0, scans=3))
     scan = good.streams["/sensor/scan"]
     lost = {**good.streams, "/sensor/detection": good.streams["/sensor/detection"].take(slice(1, None))}
-    with pytest.raises(BadInput, match="scan 0 says"):
+    with pytest.raises(BadInput, match="scan 0 states"):
         collect(replay([type(good)(lost, good.run, "x")], bind("gm-phd", [good], {})))
     with pytest.raises(BadInput, match="does not state variance_m2"):
         settings_of(PhdParameters(), scan_of({}))
     with pytest.raises(BadInput, match="'detection_probability' is 0"):
         settings_of(PhdParameters(), scan_of({**STATED, "detection_probability": "0"}))
-    with pytest.raises(BadInput, match="priors for 2 components"):
+    with pytest.raises(BadInput, match="priors are more than 2 components"):
         collect(replay([good], bind("gm-phd", [good], {"most_components": 2})))
     line = make_stream(
         "/sensor/detection", schemas.DETECTION, scan.publish_time_ns, scan_id=[0, 1, 2],

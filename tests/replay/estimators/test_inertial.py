@@ -165,5 +165,5 @@ def test_bad_input_is_told():
     _, samples = simulate(1.0, 8)
     with pytest.raises(BadInput, match="must be positive"):
         run_inertial_filter(InertialModel(block_s=0.0), start_inertial_filter(1), samples)
-    with pytest.raises(BadInput, match="give a time"):
+    with pytest.raises(BadInput, match="give for each a time"):
         run_inertial_filter(MODEL, start_inertial_filter(1), samples._replace(rate=samples.rate[:-1]))

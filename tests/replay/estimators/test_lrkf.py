@@ -242,7 +242,7 @@ def test_bad_input_is_refused_in_one_sentence():
         estimates([bad], ["lrkf:ukf"])
     with pytest.raises(BadInput, match="take 3 or more"):
         bind("lrkf:s2kf-2", [source], {})
-    with pytest.raises(BadInput, match="no sampling"):
+    with pytest.raises(BadInput, match="not a sampling"):
         bind("lrkf:foo", [source], {})
     with pytest.raises(BadInput, match="no variants"):
         bind("analytic:s2kf-50", [source], {})

@@ -78,7 +78,7 @@ def test_interacting_modes_err_less_than_each_single_motion() -> None:
         rivals = means if columns == (0, 2) else modes
         assert own.mean() < (1.0 - gain) * min(rivals.values())
         worth.append(round(100 * (1.0 - own.mean() / min(modes.values()))))
-    page = (Path(__file__).parents[3] / "docs" / "your-model.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "your-model-more.md").read_text(encoding="utf-8")
     position, velocity = worth
     printed = (
         f"position errs {position} % less than in the best single mode and the velocity {velocity} %"

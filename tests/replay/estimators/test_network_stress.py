@@ -103,5 +103,5 @@ def test_a_liar_is_believed_without_a_gate_and_refused_with_one(room):
 
 
 def test_a_liar_that_is_no_node_is_refused(room):
-    with pytest.raises(BadInput, match="liar = 9 is none of the nodes 1, 2, 3, 4"):
+    with pytest.raises(BadInput, match="liar = 9 is not one of the nodes 1, 2, 3, 4"):
         replayed(room, ci={"liar": 9})

@@ -115,7 +115,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"estimate": ["range_m[3:3]"]}, "expected NUMBER or FIRST:END in the brackets"),
     ({"estimate": ["bearing_rad[0]"]}, "measures bearing_rad about the points of 0 maps"),
     ({"estimate": ["range_m[0]"]}, r"estimate_sigma.range_m\[0\]="),
-    ({**ANCHORS, "estimate": ["range_m[0:6]", "range_m[2]"]}, r"range_m\[2\]: stands there twice"),
+    ({**ANCHORS, "estimate": ["range_m[0:6]", "range_m[2]"]}, r"range_m\[2\]: is named twice"),
     ({"estimate_time_s": {"bias_range_m": 1.0}}, "estimate_time_s.bias_range_m: `estimate` lacks"),
 ]
 
@@ -212,7 +212,7 @@ def test_a_pose_is_found_in_the_first_ranges_whatever_its_heading() -> None:
 
 def test_a_start_that_ranges_do_not_tell_is_refused_with_what_is_needed() -> None:
     source = recorded(duration_s=5.0, anchors_m=[[0, 5, 2], [5, 0, 2]])
-    with pytest.raises(BadInput, match=r"/trolley/ranges: no 1 s of it have the ranges of 3 pairs"):
+    with pytest.raises(BadInput, match=r"/trolley/ranges: no span of 1 s has the ranges of 3 pairs"):
         find_position(maps(source), RangingParameters(**FOUND))
 
 

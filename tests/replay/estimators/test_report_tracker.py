@@ -183,7 +183,7 @@ def test_silent_tracks_are_dropped_and_numbers_stay():
 
 
 def test_levels_in_another_order_are_refused():
-    with pytest.raises(BadInput, match="quiet levels first"):
+    with pytest.raises(BadInput, match="give the smallest first"):
         bind(
             "report-tracker", [source(straight((0, 0), (1, 0), 9.0))], {"sigma_position_m": (9, 3, 2, 1)}
         )

@@ -129,5 +129,5 @@ def test_errors_that_cannot_be_estimated_are_said(uncompiled: None):
     motion = {"turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.3}
     with pytest.raises(BadInput, match="registration errors need targets of one motion; give mode="):
         replay(source, model="vehicle", motion=motion)
-    with pytest.raises(BadInput, match="errors of sensors are not smoothed"):
+    with pytest.raises(BadInput, match="errors of sensors cannot be smoothed"):
         replay(source, smoothed=True)

@@ -186,7 +186,7 @@ def test_a_robot_outside_the_arena_is_counted_apart_from_a_broken_guarantee(sour
 
 
 def test_bearings_alone_need_an_arena_or_a_range():
-    with pytest.raises(BadInput, match=r"measures no ranges .* --set maximum_range_m"):
+    with pytest.raises(BadInput, match=r"has no ranges .* --set maximum_range_m"):
         judged([beyond(None)], ("exact",), bound_deg=4.0)
     with pytest.raises(BadInput, match="low x, low y, high x, high y"):
         judged([beyond(0.1)], ("exact",), bound_deg=4.0, arena_m=(1, 1, 0, 2))

@@ -71,5 +71,5 @@ def test_a_log_in_which_nothing_is_tracked(uncompiled: None):
 
 def test_modes_are_not_smoothed(uncompiled: None):
     source = log(sensor("radar", RADAR, range(3), [[(0.0, 0.0)]] * 3))
-    with pytest.raises(BadInput, match="smoothed tracks are of targets with one linear motion"):
+    with pytest.raises(BadInput, match="smoothed tracks need a model with one linear motion"):
         replay(source, smoothed=True, model="vehicle", motion=MOTION)

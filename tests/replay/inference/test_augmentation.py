@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 import fuselog as fl
 from pipeline.ensemble import record_ensemble, replay_ensemble
+from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
 from replay.engine.blocks import gather
@@ -19,7 +20,7 @@ from replay.inference.augmentation import augmented
 from replay.inference.checking import check_model
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 from tests.replay.inference import vehicle_a
-from tests.replay.inference.replays import outputs
+from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import (
     RANGE_BEARING,
     SPEED,
@@ -152,6 +153,42 @@ def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
         assert chi2.ppf(0.005, 3 * runs) < nees < chi2.ppf(0.995, 3 * runs)
     without = replay_ensemble(sources, {"ekf": {}}, gap_limit_s=0.2).metrics()
     assert without["ekf.nees.robot1"] > 30
+
+
+@pytest.mark.parametrize(
+    ("estimable", "words"),
+    [
+        (("delay_s",), "estimator test: estimable is a tuple; it is a mapping from parameter to kind"),
+        ({"dellay_s": "linear"}, "'dellay_s' is no parameter of the model; did you mean 'delay_s'"),
+        ({"delay_s": "metres"}, "delay_s is of kind 'metres'; known are linear and angle"),
+    ],
+)
+def test_what_is_no_list_of_what_can_be_estimated_is_one_sentence(estimable: Any, words: str) -> None:
+    model = replace(ON_A_LINE, estimable=estimable)
+    given: dict[str, Any] = {"estimate": ["delay_s"], "estimate_sigma": {"delay_s": 0.5}}
+    with pytest.raises(BadInput, match=words):
+        bound(model, "ekf", [MemorySource({}, RunMetadata("line", epoch_ns=0), "line")], **given)
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_particles_say_that_a_parameter_is_constant() -> None:
+    """What is drawn at the start is all there is of it, unless it drifts."""
+    log, estimate = fl.record("landmarks", duration_s=0.5), ["bias_range_m", "forward_scale"]
+    given = {"kind": "particles:5", "estimate": estimate, "estimate_sigma": dict.fromkeys(estimate, 0.1)}
+    drifts = {"bias_range_m": 0.01, "forward_scale": 0.0}
+    comes_back = {"forward_scale": 5.0}
+    own = {
+        "still": given,
+        "one": {**given, "estimate_drift": drifts},
+        "none": {**given, "estimate_drift": drifts, "estimate_time_s": comes_back},
+    }
+    words = "is constant, and particles have only the values that were drawn at the start"
+    said = [each.partition(words) for each in fl.replay(log, own).losses if words in each]
+    assert [first for first, _, _ in said] == [
+        "still robot1: bias_range_m, forward_scale ",
+        "one robot1: forward_scale ",
+    ]
+    assert all("give estimate_drift, or take a Gaussian filter" in mend for _, _, mend in said)
 
 
 # A time offset: what the sensor says is of the state of so much earlier

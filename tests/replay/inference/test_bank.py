@@ -138,5 +138,5 @@ def test_what_has_no_angle_is_refused():
 
     with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, across which"):
         modelled(RANGING_POSITION, "bank:ekf")
-    with pytest.raises(BadInput, match="'pf' is no filter for the members of a bank"):
+    with pytest.raises(BadInput, match="'pf' is not a filter for the members of a bank"):
         modelled(ROLLER, "bank:pf")

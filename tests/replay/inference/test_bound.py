@@ -305,7 +305,7 @@ def alone(sources: Sequence[MemorySource]) -> list[Any]:
 @pytest.mark.usefixtures("uncompiled")
 def test_a_bound_without_truth_is_refused_in_one_sentence() -> None:
     source = target(0, truth=False)
-    with pytest.raises(BadInput, match=r"a bound is of the true states, and .* /truth; give"):
+    with pytest.raises(BadInput, match=r"a bound needs the true states, and .* /truth; give"):
         bound(CV, "bound", [source])
     short = target(0)
     cut = [

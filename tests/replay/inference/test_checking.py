@@ -179,7 +179,7 @@ WRONG: dict[str, tuple[Model, str]] = {
     ),
     "a kind that does not exist": (
         replace(VEHICLE_A, state={**vehicle_a.STATE, "x_m": "metres"}),
-        "known are linear",
+        "give linear",
     ),
     "a correction that is none for small steps": (
         replace(VEHICLE_A, correct=Correction(along_heading, moved_by, stepped, moved_well)),
@@ -188,6 +188,18 @@ WRONG: dict[str, tuple[Model, str]] = {
     "a step that is not found again": (
         replace(VEHICLE_A, correct=Correction(along_heading, moved_well, stepped_twice, moved_well)),
         "stepped_twice .* does not find the step of moved_well",
+    ),
+    "estimable without kinds": (
+        replace(VEHICLE_A, estimable=("sigma_speed_mps",)),
+        "estimable is a tuple; it is a mapping from parameter to kind, such as",
+    ),
+    "an estimable that is no parameter": (
+        replace(VEHICLE_A, estimable={"sigma_sped_mps": "linear"}),
+        "'sigma_sped_mps' is no parameter of the model; did you mean 'sigma_speed_mps'",
+    ),
+    "an estimable orientation": (
+        replace(VEHICLE_A, estimable={"sigma_speed_mps": "axis"}),
+        "sigma_speed_mps is of kind 'axis'; known are linear and angle",
     ),
     "a wrong mode": (
         replace(VEHICLE_A, modes={"odd": Motion(as_if_linear, vehicle_a.noise)}),

@@ -67,7 +67,7 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "kind of the state": (
         replace(VEHICLE_A, state={**vehicle_a.STATE, "heading_rad": "rotation"}),
-        ("kinds linear, linear, rotation", "known are linear, angle, axis"),
+        ("kinds linear, linear, rotation", "give linear, angle, axis"),
     ),
     "half a quaternion": (
         replace(VEHICLE_A, state=dict.fromkeys(vehicle_a.STATE, "quaternion")),
@@ -75,11 +75,11 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     ),
     "kind of what is measured": (
         with_sensor(SPEED, measured={"speed_mps": "axis"}),
-        ("sensor speed", "kind axis", "linear and angle"),
+        ("sensor speed", "kind axis", "linear or angle"),
     ),
     "no noise": (
         with_sensor(SPEED, noise=None),
-        ("sensor speed", "nothing of its noise", "`covariance`"),
+        ("sensor speed", "states no noise", "`covariance`"),
     ),
     "a covariance of nothing": (
         with_sensor(SPEED, covariance="covariance_m2"),
@@ -142,7 +142,9 @@ def test_a_number_that_no_channel_states_or_states_as_nonsense() -> None:
         BadInput, match=r"topic /speed does not state sigma_speed_mps; .*--set sigma_spe"
     ):
         bound(model, "ekf", [SOURCE])
-    with pytest.raises(BadInput, match="topic /speed states sigma_speed_mps = fast, which is no number"):
+    with pytest.raises(
+        BadInput, match="topic /speed states sigma_speed_mps = fast, which is not a number"
+    ):
         bound(model, "ekf", [changed("/speed", {"sigma_speed_mps": "fast"})])
     with pytest.raises(BadInput, match="topic /speed: parameter 'sigma_speed_mps' is inf"):
         bound(model, "ekf", [changed("/speed", {"sigma_speed_mps": "inf"})])

@@ -447,8 +447,11 @@ def test_rates_are_numbers_of_the_run_and_compile_nothing(uncompiled: None) -> N
 
 
 BAD: dict[str, tuple[Mapping[str, Any], str]] = {
-    "unknown filter": ({"filter": "ekff"}, "'ekff' is no filter for the modes of an imm; did you mean"),
-    "smoother": ({"filter": "smoother"}, "'smoother' is no filter for the modes of an imm"),
+    "unknown filter": (
+        {"filter": "ekff"},
+        "'ekff' is not a filter for the modes of an imm; did you mean",
+    ),
+    "smoother": ({"filter": "smoother"}, "'smoother' is not a filter for the modes of an imm"),
     "variant": ({"filter": "ekf:9"}, "filter ekf has no variants; give 'imm:ekf' without ':9'"),
     "mode": ({"mode": "steady"}, "parameter 'mode' is 'steady'; imm takes all modes of a model"),
     "modes": ({"mode": ["steady", "agile"]}, "imm takes all modes of a model; leave out `mode`"),
@@ -458,7 +461,8 @@ BAD: dict[str, tuple[Mapping[str, Any], str]] = {
     ),
     "initial": (
         {"steady_at_start": 1.5},
-        "initial probabilities are steady 1.5, agile -0.5; give numbers of zero or more whose sum is",
+        "initial probabilities of the modes are steady 1.5, agile -0.5; give numbers of zero or more "
+        "whose sum is",
     ),
 }
 

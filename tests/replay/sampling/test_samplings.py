@@ -97,10 +97,10 @@ def test_a_sampling_prints_the_name_it_came_from(count, symmetric, seed, rotatio
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("", "is no sampling"),
-        ("lcd-50", "is no sampling"),
-        ("s2kf--5", "is no sampling"),
-        ("s2kf-50:", "is no sampling"),
+        ("", "is not a sampling"),
+        ("lcd-50", "is not a sampling"),
+        ("s2kf--5", "is not a sampling"),
+        ("s2kf-50:", "is not a sampling"),
         ("ukf-3", "number: is not known"),
         ("s2kf", "count: is missing"),
         ("s2kf-0", "count: .*greater than 0"),
@@ -123,7 +123,7 @@ def test_bad_names_are_refused_in_one_sentence(name, reason):
     [
         ("gf-3", 0, "dimension of 1 or more"),
         ("s2kf-50", -2, "dimension of 1 or more"),
-        ("ukf:kappa=-2", 2, "take more than -2"),
+        ("ukf:kappa=-2", 2, "give more than -2"),
         ("s2kf-8", 8, "take 9 or more"),
         ("s2kf-15:symmetric", 8, "take 16 or more"),
     ],

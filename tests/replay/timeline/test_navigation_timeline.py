@@ -96,6 +96,10 @@ def test_the_scene_has_path_tube_axes_and_fixes_by_quality(drawn: Drawn):
     assert_allclose([path[0], path[-1]], [[0, 0, 0], [0, 118, 0]])
     [sizes] = drawn.still["/navigation/ekf/tube"]["Ellipsoids3D:half_sizes"]
     assert_allclose(np.sort(sizes[0]), [2.0, 4.0, 6.0])  # two standard deviations
+    [centres] = drawn.still["/navigation/ekf/tube"]["Ellipsoids3D:centers"]
+    assert_allclose(
+        np.diff(np.array(centres)[:, 1]), 4.0
+    )  # of a path of 2 m a second, more than half of 6 m
     places = drawn.moving["/navigation/ekf/body"]["Transform3D:translation"]
     assert_allclose(np.concatenate(places)[10], [0, 20, 0])
     [points] = drawn.still["/navigation/fix"]["Points3D:positions"]

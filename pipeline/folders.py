@@ -1,0 +1,18 @@
+"""Folders of logs, where a command takes them."""
+
+from pathlib import Path
+
+from recorders.errors import BadInput
+
+
+def logs_in(path: Path) -> list[Path]:
+    """The logs of a folder by name, without the estimates beside them; of any other path that path.
+
+    Raises BadInput where a folder has none.
+    """
+    if not path.is_dir():
+        return [path]
+    files = [each for each in sorted(path.glob("*.mcap")) if not each.match("*.estimates.mcap")]
+    if not files:
+        raise BadInput(f"{path}: has no logs to replay; give a log, or a folder or result with some")
+    return files
