@@ -47,13 +47,17 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
     """A type of parameters with other defaults for some of them."""
-    fields: Any = {name: (_accepted(kind.model_fields[name]), value) for name, value in defaults.items()}
+    fields: Any = {}
+    for name, value in defaults.items():
+        field = kind.model_fields[name]
+        fields[name] = (_accepted(field), Field(value, description=field.description))
     return create_model(kind.__name__, __base__=kind, **fields) if fields else kind
 
 
 def _accepted(field: FieldInfo) -> Any:
-    """What a parameter accepts, its type with its bounds, and what it means."""
-    return Annotated[(field.annotation, *field.metadata, Field(description=field.description))]
+    """What a parameter accepts: its type with its bounds."""
+    bounds = tuple(field.metadata)
+    return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
 
 def modelled_by(
@@ -112,8 +116,9 @@ def _any_parameters(method: Method) -> type[Parameters]:
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
                 kind = _accepted(field)
-                same = fields.get(name, (kind,))[0] == kind
-                fields[name] = (kind if same else Any, None)
+                other, said = fields.get(name, (kind, field))
+                meaning = field.description if field.description == said.description else None
+                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
     return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
 
 

@@ -433,20 +433,18 @@ def test_logs_are_replayed_as_an_experiment(drives: Path, tmp_path: Path, fuselo
 def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
     """What is set for one of them counts more, in any order; the scenario's parameters come first."""
     stated = experiment_of_logs([Path(__file__)], ["ekf", "ukf", "dead-reckoning"])
-    settings = {"ukf": {"gate_probability": 0.9}, "gate_probability": 1.0}
+    settings = {"ukf": {"sigma_range_m": 0.2}, "sigma_range_m": 0.3}
     for given in (settings, dict(reversed(settings.items()))):
         experiment = stated.with_settings(given, {})
         assert experiment.estimators == {
-            "ekf": {"gate_probability": 1.0},
-            "ukf": {"gate_probability": 0.9},
+            "ekf": {"sigma_range_m": 0.3},
+            "ukf": {"sigma_range_m": 0.2},
             "dead-reckoning": {},
         }
-    _, landmarks = load_experiment(
-        "landmarks", {"forward_noise_density": 0.1, "gate_probability": 1}, {}
-    )
+    _, landmarks = load_experiment("landmarks", {"forward_noise_density": 0.1, "sigma_range_m": 1}, {})
     assert landmarks.record is not None
     assert landmarks.record.parameters["forward_noise_density"] == 0.1
-    assert landmarks.estimators["ekf"] == {"gate_probability": 1}
+    assert landmarks.estimators["ekf"] == {"gate_probability": 1.0, "sigma_range_m": 1}
     with pytest.raises(BadInput, match=r"--set gate_probabilty: no such entry.*gate_probability"):
         load_experiment("landmarks", {"gate_probabilty": 1}, {})
 
