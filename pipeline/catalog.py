@@ -190,14 +190,17 @@ def _print_details(entry: Entry) -> None:
     for key, fact in entry.facts.items():
         say(f"{key}: {fact}")
     if entry.parameters:
+        described = describe(entry.parameters, entry.values)
         table = [
-            [each.name, _default(each.default, is_stated=each.name in entry.stated), each.accepts]
-            for each in describe(entry.parameters, entry.values)
+            [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
+            for each in described
         ]
-        if table:
-            print_table(["parameter", "default", "accepts"], table)
-            for place, text in explain(entry.parameters).items():
-                say(f"\n{place}\n{text}" if place else f"\n{text}")
+        if any(each.meaning for each in described):
+            print_table(["parameter", "default", "accepts", "meaning"], table)
+        elif table:
+            print_table(["parameter", "default", "accepts"], [row[:-1] for row in table])
+        for place, text in explain(entry.parameters).items() if table else ():
+            say(f"\n{place}\n{text}" if place else f"\n{text}")
 
 
 def _default(value: object, *, is_stated: bool) -> object:

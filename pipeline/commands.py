@@ -312,6 +312,12 @@ def _print_outcome(
         print_json(outcome | dict(told or {}))
         return
     print_metrics(values, judge.bounds, judge.runs_table)
+    if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
+        say(
+            "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
+            "show that a filter is consistent, only that it is not far from it; nis_per_component says "
+            "more"
+        )
     for sentence in judge.losses:
         say(sentence)
     if told:

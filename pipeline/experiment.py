@@ -14,6 +14,7 @@ from pipeline.ensemble import Progress, no_progress
 from pipeline.executors import Crew
 from pipeline.kept import Kept, kept_cells
 from pipeline.results import Outcome, Result, result_folder, write_outcome
+from pipeline.settings import parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, merge
 from recorders.parsing import read_toml
@@ -186,7 +187,8 @@ def load_experiment(
     """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
 
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
-    the scenario's or importer's parameters: `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`.
+    the scenario's or importer's parameters, else to all estimators that have such a parameter:
+    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`.
     """
     stated = read_experiment(name)
     return stated.name, stated.with_settings(settings, over)
@@ -237,6 +239,7 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
     """Settings where they belong; raises BadInput where one belongs nowhere."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
     part, names = _parameters_of_source(experiment)
+    own = parameters_by_label(experiment.estimators) if settings else {}
     placed: dict[str, Any] = {}
     for key, value in settings.items():
         if key in entries:
@@ -245,11 +248,15 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
             place = {"estimators": {key: value}}
         elif key in names:
             place = {part: {"parameters": {key: value}}}
+        elif takers := [label for label, known in own.items() if key in known]:
+            of_all = {"estimators": {label: {key: value} for label in takers}}
+            placed = merge(of_all, placed)  # what is set for one estimator counts more
+            continue
         else:
-            known = sorted(names | entries | experiment.estimators.keys())
+            known = sorted(names.union(entries, own, *own.values()))
             raise BadInput(
                 f"--set {key}: no such entry of the experiment, parameter of what it records, "
-                f"or estimator; {choices(key, known)}"
+                f"estimator or parameter of its estimators; {choices(key, known)}"
             )
         placed = merge(placed, place)
     return placed

@@ -23,7 +23,7 @@ from replay.inference.model import Model
 from replay.inference.needs import OWN_MODEL, names_state, nearest, nearest_parts
 
 
-def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
+def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     """Print what a log holds: the run, how long it is, its topics; of other data, how to import them."""
     from recorders.importers.ros.bags import looks_like_bag
 
@@ -58,7 +58,7 @@ def show_log(path: Path, *, recover: bool, as_json: bool) -> None:
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
     elif log.topics:
-        _say_what_fits(path, log)
+        _say_what_fits(path, log, is_all=is_all)
     if log.loss_statement:
         warn(log.loss_statement)
 
@@ -94,18 +94,21 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
 
 
-def _say_what_fits(path: Path, log: Log) -> None:
-    """Print which models fit the log and how, and what it lacks for the others; or that none fits."""
-    fitting_models = fitting_of(log.topics)
-    if not any(fitting.methods for fitting in fitting_models.values()):
+def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
+    """Print which models fit the log and how, or that none does; with `is_all` what others lack."""
+    fittings = fitting_of(log.topics)
+    fit = {name: each for name, each in fittings.items() if each.methods}
+    others = {name: each for name, each in fittings.items() if name not in fit}
+    if fit:
+        say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
+    else:
         say(f"No registered model fits it: {nearest(registered_models(), log.topics)}; {OWN_MODEL}")
-        return
-    say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
-    for name, fitting in fitting_models.items():
-        if fitting.methods:
-            say(f"  {name}: -e {' '.join(fitting.methods)}; from {', '.join(fitting.topics)}")
-        else:
-            say(f"  {name}: needs {'; '.join(fitting.lacks)}")
+    for name, each in fit.items():
+        say(f"  {name}: -e {' '.join(each.methods)}; from {', '.join(each.topics)}")
+    if fit and others and not is_all:
+        say(f"  {', '.join(others)}: do not fit; --all says what they need")
+    for name, each in others.items() if is_all else ():
+        say(f"  {name}: needs {'; '.join(each.lacks)}")
 
 
 def _show_bag(path: Path, *, as_json: bool) -> None:

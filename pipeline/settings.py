@@ -1,14 +1,14 @@
 """Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import read_toml
-from replay.engine.estimator import find_estimator
+from replay.engine.estimator import Estimator, find_estimator
 
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
@@ -42,15 +42,12 @@ def settings_of_estimators(
     given = {key: value for key, value in options.items() if value is not None}
     settings = parse_settings(texts) | given
     chosen: dict[str, dict[str, Any]] = {}
-    known: dict[str, set[str]] = {}
     for label in labels:
         own = settings.get(label, {})
         if not isinstance(own, dict):
             raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
         chosen[label] = dict(own)
-        kind = {**base.get(label, {}), **own}.get("kind", label)
-        estimator, _ = find_estimator(str(kind))
-        known[label] = set(estimator.parameters.model_fields)
+    known = parameters_by_label({label: {**base.get(label, {}), **chosen[label]} for label in labels})
     for key in [each for each in settings if each not in chosen]:
         takers = [label for label in chosen if key in known[label]]
         if not takers and key in OPTIONS:
@@ -61,6 +58,19 @@ def settings_of_estimators(
         for label in takers:
             chosen[label].setdefault(key, settings[key])
     return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
+
+
+def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
+    """The names of the parameters that estimators have, from their settings by label.
+
+    Raises BadInput where there is no such estimator.
+    """
+    names: dict[str, set[str]] = {}
+    for label, settings in estimators.items():
+        kind = settings.get("kind", label)
+        estimator = kind if isinstance(kind, Estimator) else find_estimator(str(kind))[0]
+        names[label] = set(estimator.parameters.model_fields)
+    return names
 
 
 def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:

@@ -15,9 +15,14 @@ from recorders.parsing import DEEPEST, parse_toml
 
 
 class Parameters(BaseModel):
-    """Base of all parameter types: immutable, no unknown names, no NaN and no infinity."""
+    """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    The text below a parameter says what it means and its unit; `describe` has it.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 ParametersType = TypeVar("ParametersType", bound=Parameters)
@@ -74,11 +79,15 @@ def _table_in(annotation: Any) -> type[BaseModel] | None:
 
 
 class Described(NamedTuple):
-    """One parameter as a person reads it: its full name, its default, and what it accepts."""
+    """One parameter as a person reads it: its full name, default, what it accepts, and what it means.
+
+    The meaning is empty where the type does not say it.
+    """
 
     name: str
     default: Any
     accepts: str
+    meaning: str
 
 
 def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
@@ -125,7 +134,8 @@ def _described(
         below = next((each for each in options if "properties" in each), None)
         if below is None:
             value = given.get(name, default)
-            yield Described(prefix + name, value, " or ".join(map(_accepts, options)))
+            meaning = " ".join(entry.get("description", "").split())
+            yield Described(prefix + name, value, " or ".join(map(_accepts, options)), meaning)
         else:
             values = merge(default or {}, given.get(name) or {})
             yield from _described(below, definitions, f"{prefix}{name}.", values)

@@ -60,8 +60,9 @@ def run(
 
     Or replay logs of your own as an experiment, LOG.mcap ... with -e for each estimator.
 
-    --set ekf.gate_probability=1 sets a parameter of an estimator, --set duration_s=30 of the scenario,
-    --set gap_limit_s=1 an entry of the experiment.
+    --set duration_s=30 sets a parameter of the scenario, --set ekf.gate_probability=1 of an estimator,
+    --set gate_probability=1 of all estimators that have it, --set gap_limit_s=1 an entry of the
+    experiment.
     """
     from pipeline.commands import run_named
 

@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     "fuselog info run.mcap",
 )
 @click.argument("log", type=ANY_PATH)
+@click.option("--all", "is_all", is_flag=True, help="Also say what it lacks for each model.")
 @recover_option
 @json_option
-def info(log: Path, recover: bool, as_json: bool) -> None:
-    """Say what LOG holds: the run, its topics, schemas, message counts."""
+def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
+    """Say what LOG holds: the run, its topics, schemas, message counts, the models that fit it."""
     from pipeline.information import show_log
 
-    show_log(log, recover=recover, as_json=as_json)
+    show_log(log, is_all=is_all, recover=recover, as_json=as_json)
 
 
 @command(

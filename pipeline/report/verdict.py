@@ -23,7 +23,13 @@ MEANING = {
 def verdict(result: Result) -> tuple[str, str]:
     """What was run; then which claims hold, or which estimator is best and whether it is consistent."""
     tables = metric_tables(result.metrics, result.bounds)
-    return _what_was_run(result, tables), _of_claims(result) if result.claims else _best(tables)
+    came = _of_claims(result) if result.claims else _best(tables, _runs(result))
+    return _what_was_run(result, tables), came
+
+
+def _runs(result: Result) -> int:
+    logs = result.settings.get("logs")
+    return len(logs) if isinstance(logs, list) else int(result.settings.get("runs", 1))
 
 
 def _what_was_run(result: Result, tables: list[MetricTable]) -> str:
@@ -34,7 +40,7 @@ def _what_was_run(result: Result, tables: list[MetricTable]) -> str:
     else:
         named = ", ".join(estimators) or result.experiment
     source = settings.get("record", {}).get("scenario") or settings.get("import", {}).get("source")
-    runs = len(settings["logs"]) if "logs" in settings else settings.get("runs", 1)
+    runs = _runs(result)
     over = f" over {runs} {'run' if runs == 1 else 'runs'}" + (f" of {source}" if source else "")
     seed = f", seed {settings['seed']}" if "seed" in settings and "import" not in settings else ""
     return f"{named}{over}{seed}."
@@ -54,7 +60,7 @@ def _of_claims(result: Result) -> str:
     return "; ".join(said) + "."
 
 
-def _best(tables: list[MetricTable]) -> str:
+def _best(tables: list[MetricTable], runs: int) -> str:
     """The estimator of the least error over all cases, and whether NEES calls it consistent."""
     quantity = _main_quantity(tables)
     errors = {
@@ -68,7 +74,7 @@ def _best(tables: list[MetricTable]) -> str:
     best = min(errors, key=lambda estimator: errors[estimator])
     least = f"{best} has the least {quantity}, {format_value(errors[best])}"
     alone = f"{quantity} of {best} is {format_value(errors[best])}"
-    return "; ".join([least if len(errors) > 1 else alone, *_doubts(tables, best)]) + "."
+    return "; ".join([least if len(errors) > 1 else alone, *_doubts(tables, best, runs)]) + "."
 
 
 def _main_quantity(tables: list[MetricTable]) -> str:
@@ -86,8 +92,12 @@ def _values(tables: list[MetricTable], estimator: str, quantity: str) -> list[fl
     return numbers if numbers and len(numbers) == len(values) else None
 
 
-def _doubts(tables: list[MetricTable], estimator: str) -> list[str]:
-    """Whether an estimator is consistent, and what it did not estimate."""
+def _doubts(tables: list[MetricTable], estimator: str, runs: int) -> list[str]:
+    """Whether an estimator is consistent, and what it did not estimate.
+
+    The interval of a single run's NEES is that of one step. Errors of other steps hang together with it,
+    so that a run within it is not shown to be inconsistent, and no more; innovations say more.
+    """
     said = []
     judged = [
         measured
@@ -98,10 +108,14 @@ def _doubts(tables: list[MetricTable], estimator: str) -> list[str]:
         [measured] = judged
         low, high = map(format_value, measured.bounds or ())
         where = f"lies {measured.place} the 95 % interval {low} to {high}"
-        said.append(f"its NEES of {format_value(measured.value)} {where}: {MEANING[measured.place]}")
+        alone = runs == 1 and measured.place == "within"
+        meaning = "one run does not show it to be inconsistent" if alone else MEANING[measured.place]
+        said.append(f"its NEES of {format_value(measured.value)} {where}: {meaning}")
+        said += _innovations(tables, estimator) if alone else []
     elif judged:
         consistent = sum(measured.place == "within" for measured in judged)
-        said.append(f"by NEES it is consistent in {consistent} of {len(judged)} cases")
+        is_so = "one run does not show it to be inconsistent" if runs == 1 else "it is consistent"
+        said.append(f"by NEES {is_so} in {consistent} of {len(judged)} cases")
     failed = sum(_values(tables, estimator, "failed_runs") or [])
     if failed:
         said.append(f"{failed:g} of its runs failed")
@@ -109,3 +123,13 @@ def _doubts(tables: list[MetricTable], estimator: str) -> list[str]:
     if share < LEAST_SHARE:
         said.append(f"it estimated {100 * share:.1f} % of the span")
     return said
+
+
+def _innovations(tables: list[MetricTable], estimator: str) -> list[str]:
+    """What NIS says, which is of all innovations; nothing where there is none."""
+    return [
+        f"its NIS of {format_value(nis.value)} per component, which says more, lies {nis.place} "
+        f"{format_value(nis.bounds[0])} to {format_value(nis.bounds[1])}"
+        for table in tables
+        if (nis := table.quantities.get("nis_per_component", {}).get(estimator)) and nis.bounds
+    ]

@@ -61,6 +61,23 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
 def doubts(told: Confidence, free: Sequence[Free]) -> Iterator[str]:
     """A sentence for every direction of the parameters (k,) of which the logs tell little."""
     own = [free[place] for place in told.places]
+    for direction, value in _weak(told, free):
+        yield _in_words(direction, value, own)
+
+
+def unknown(told: Confidence, free: Sequence[Free]) -> list[int]:
+    """The parameters (k,), by their places, of which the logs tell nothing by the curvature."""
+    found = []
+    for direction, value in _weak(told, free):
+        first, *others = _involved(direction)
+        if not others and _factor(value) >= MEANINGLESS:
+            found.append(told.places[first])
+    return found
+
+
+def _weak(told: Confidence, free: Sequence[Free]) -> Iterator[tuple[Floats, float]]:
+    """The directions (m,), of length one, along which the cost hardly rises, and its curvature there."""
+    own = [free[place] for place in told.places]
     is_log = np.array([each.is_positive for each in own])
     diagonal = np.diagonal(told.curvature)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -70,17 +87,31 @@ def doubts(told: Confidence, free: Sequence[Free]) -> Iterator[str]:
     if not weak and values[-1] > LARGEST_CONDITION * values[0]:
         weak = [0]
     for index in weak:
-        yield _in_words(vectors[:, index], values[index], [each.name for each in own])
+        yield vectors[:, index], values[index]
 
 
-def _in_words(direction: Floats, value: float, names: Sequence[str]) -> str:
+def _involved(direction: Floats) -> list[int]:
+    """The places of a direction (m,) that count, the first most."""
+    order = np.argsort(-np.abs(direction)).tolist()
+    return [place for place in order if abs(direction[place]) > INVOLVED]
+
+
+def _factor(value: float) -> float:
+    """Within what factor a positive parameter is known that alone has this curvature."""
+    return float(np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0)))
+
+
+def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
     """What it means that the cost has only this curvature along a direction (m,) of length one."""
-    order = np.argsort(-np.abs(direction))
-    first, *others = (place for place in order if abs(direction[place]) > INVOLVED)
+    names = [each.name for each in free]
+    first, *others = _involved(direction)
+    if not others and _factor(value) < MEANINGLESS:
+        return f"{names[first]}: the logs determine it within a factor of {_factor(value):.2g} (95 %)"
     if not others:
-        factor = np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0))
-        known = f"within a factor of {factor:.2g} (95 %)" if factor < MEANINGLESS else "not at all"
-        return f"{names[first]}: the logs determine it {known}"
+        return (
+            f"{names[first]}: the logs determine it not at all, but that the start, "
+            f"{free[first].start:g}, explains them worse"
+        )
     turned = [
         f"a {'larger' if direction[place] * direction[first] > 0.0 else 'smaller'} {names[place]}"
         for place in others

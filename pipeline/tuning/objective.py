@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
 from replay.engine.blocks import Ragged
-from replay.engine.estimator import Bound, bind
+from replay.engine.estimator import Bound, Opened, Opening, Recursive, bind
 from replay.engine.failures import sentences_of
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source
@@ -33,10 +33,18 @@ INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
 class Run(NamedTuple):
-    """A log in memory as it is replayed again and again."""
+    """A log in memory as it is replayed again and again.
+
+    Attributes:
+        ensemble: it alone.
+        name: what it is called.
+        begun: by the name of what is estimated how it begins, where the log does not say so. Where it
+            began depended on the values, the likelihoods of different measurements would be compared.
+    """
 
     ensemble: Ensemble[MemorySource]
     name: str
+    begun: Mapping[str, Opened] = {}
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
@@ -213,7 +221,7 @@ class Objective:
         return replace(self, runs=(), on_best=silent, team=None)
 
     def begin(self, start: Floats) -> None:
-        """Note what every log tells at the start (k,).
+        """Note what every log tells at the start (k,), and where filters begin there: so it stays.
 
         Raises BadInput where a run fails there, the log lacks what is minimised, or the estimator
         cannot go to other processes that are to work.
@@ -225,6 +233,8 @@ class Objective:
                 raise BadInput(
                     f"{self.label}: cannot be sent to another process ({error}); tune it with one worker"
                 ) from error
+        self.best = Best(self.best.evaluations, np.empty(0), np.inf)
+        self._told, self.runs = [], [self.begun(start, run) for run in self.runs]
         for run in self.runs:
             outputs = self.outputs(start, run)
             failures = _failures(outputs)
@@ -241,10 +251,31 @@ class Objective:
                 )
             self._told.append(_count(outputs))
 
+    def begins_alike(self, values: Floats) -> bool:
+        """Whether filters would begin at the same stamps with these values (k,)."""
+        return all(_stamps(run) == _stamps(self.begun(values, run)) for run in self.runs)
+
+    def begun(self, values: Floats, run: Run) -> Run:
+        """The log, with how the estimator begins with these values (k,); BadInput as `replay`."""
+        begun: dict[str, Opened] = {}
+        bound = self._bound(values, run)
+        if any(_opening(each) for each in bound):
+            noting = [_with_find(each, partial(_note, begun, each)) for each in bound]
+            next(replay(run.ensemble, noting), None)
+        return run._replace(begun=begun)
+
+    def _bound(self, values: Floats, run: Run) -> list[Bound]:
+        return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
+
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """What the estimator makes of a log with these values (k,), by topic; BadInput as `replay`."""
-        chosen = with_values(self.settings, self.names, values)
-        return collect(replay(run.ensemble, bind(self.label, run.ensemble, chosen)))
+        bound = [
+            _with_find(each, partial(_as_noted, run.begun[each.name]))
+            if each.name in run.begun
+            else each
+            for each in self._bound(values, run)
+        ]
+        return collect(replay(run.ensemble, bound))
 
     def sums(self, points: Floats, run: Run, told: int) -> list[Sums | None]:
         """What a log tells at each point (n, k); None where it gave another number of messages."""
@@ -269,6 +300,37 @@ class Objective:
             return np.inf
         cost = CRITERIA[self.by].cost(total)
         return cost if np.isfinite(cost) else np.inf
+
+
+def _opening(bound: Bound) -> Opening | None:
+    return bound.opening if isinstance(bound, Recursive) else None
+
+
+def _with_find(bound: Bound, find: Callable[..., Opened]) -> Bound:
+    """An estimator that finds its beginning in another way, if it has to find one."""
+    if isinstance(bound, Recursive) and bound.opening is not None:
+        return replace(bound, opening=replace(bound.opening, find=find))
+    return bound
+
+
+def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
+    """When a log's filters begin, by what is estimated and by topic."""
+    return {
+        (name, topic): rows.stream.publish_time_ns.tolist()
+        for name, opened in run.begun.items()
+        for topic, rows in opened.whole.items()
+    }
+
+
+def _note(begun: dict[str, Opened], bound: Bound, *first: Any) -> Opened:
+    opening = _opening(bound)
+    assert opening is not None
+    begun[bound.name] = opening.find(*first)
+    return begun[bound.name]
+
+
+def _as_noted(opened: Opened, *_: Any) -> Opened:
+    return opened
 
 
 def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:

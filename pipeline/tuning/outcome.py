@@ -46,6 +46,7 @@ class Found(NamedTuple):
         evaluations: how many values were tried.
         has_converged, was_stopped: how it ended.
         is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
+        begins_alike: whether filters begin with the optimum where they began in the search.
     """
 
     coordinates: Coordinates
@@ -55,6 +56,7 @@ class Found(NamedTuple):
     has_converged: bool = True
     was_stopped: bool = False
     is_at_edge: bool = False
+    begins_alike: bool = True
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -202,6 +204,7 @@ class Tuning:
         """A sentence for everything that one has to know of the values."""
         return [
             *self.notes_of_search,
+            *(each for each in self.replay.judge.losses if each.startswith(TUNED)),
             *self._notes_of_innovations(),
             *self._notes_of_truth(),
             *self._notes_of_others(),
@@ -230,12 +233,27 @@ class Tuning:
             yield f"by {self.objective.by} there are no intervals, and other values may do as well"
         beyond = found.coordinates.at_bounds(found.coordinates.of(found.optimum))
         for each, value, is_beyond in zip(free, found.optimum, beyond, strict=True):
-            if is_beyond:
+            if each.is_assumed:
+                yield (
+                    f"{each.name}: no channel states it; the search starts from {each.start:g}, which "
+                    f"replay assumes too; --set {each.name}=... sets another start"
+                )
+            if each.is_kept:
+                yield (
+                    f"{each.name}: the logs determine it not at all; it stays at {each.start:g}, where "
+                    "the search began"
+                )
+            elif is_beyond:
                 side = "lower" if value < each.start else "upper"
                 yield (
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
                 )
+        if not found.begins_alike:
+            yield (
+                "with these values the filter begins elsewhere than in the search that found them, and "
+                "with those found from there elsewhere again; give every log a prior"
+            )
         if found.is_at_edge:
             yield (
                 "there are no intervals: beside these values a run fails or uses fewer measurements, so "

@@ -33,7 +33,8 @@ MOST_GRID_POINTS = 10_000
 class Free(NamedTuple):
     """A parameter that is searched for: where from, and between what bounds.
 
-    Where it is positive, its logarithm is searched for.
+    Where it is positive, its logarithm is searched for. `is_assumed` says that neither a setting nor the
+    log states the start.
     """
 
     name: str
@@ -41,6 +42,17 @@ class Free(NamedTuple):
     low: float
     high: float
     is_positive: bool
+    is_assumed: bool = False
+
+    @property
+    def kept(self) -> "Free":
+        """The same, kept at its start."""
+        return self._replace(low=self.start, high=self.start)
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it stays at its start."""
+        return self.low == self.high
 
 
 @dataclass(frozen=True)
@@ -191,6 +203,8 @@ def _minimum(
     In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """
     low, high = coordinates.bounds
+    if all(each.is_kept for each in coordinates.free):
+        return low, True
     # what cannot be used is a wall that a search turns back from
     wall = 10.0 * abs(float(cost(coordinates.values(start[None]))[0])) + 1e6
 
@@ -202,7 +216,8 @@ def _minimum(
         points = np.clip(np.concatenate([point[None], point + steps, point - steps]), low, high)
         (here, *_), ahead, behind = np.split(costs(points), [1, 1 + len(point)])
         above, below = np.split(points[1:], 2)
-        return float(here), (ahead - behind) / np.diagonal(above - below)
+        width = np.diagonal(above - below)
+        return float(here), np.divide(ahead - behind, width, np.zeros_like(width), where=width > 0.0)
 
     bounds = list(zip(low, high, strict=True))
     if is_smooth:

@@ -7,6 +7,7 @@ chapter 7.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.executors import Team, crew_of, of_executor
 from pipeline.replays import Kind, Log, settings_of, sources_of
-from pipeline.tuning.confidence import confidence
+from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
     CRITERIA,
     Best,
@@ -28,6 +29,7 @@ from pipeline.tuning.objective import (
 )
 from pipeline.tuning.outcome import START, TUNED, Found, Source, Tuning
 from pipeline.tuning.search import (
+    Coordinates,
     Free,
     coordinates_of,
     curvature,
@@ -37,11 +39,13 @@ from pipeline.tuning.search import (
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
 from replay.engine.channels import stated
-from replay.engine.estimator import Bound, bind
+from replay.engine.estimator import Bound, Recursive, bind
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
 OPEN = {"gate_probability": 1.0}
+ROUNDS = 4  # of searches, each from where filters begin with the values of the one before
+ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 95 % interval
 
 
 def tune(
@@ -117,7 +121,7 @@ def tune(
             return made
 
         whole, beyond = objective(runs), objective(others) if others else None
-        found = _search(whole, searched, grid)
+        found = _settled(whole, searched, grid)
         compared = np.array([start, found.optimum])
         costs, held_out_costs = whole(compared), beyond(compared) if beyond else None
         rows = []
@@ -196,7 +200,10 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     start: Any = parameters
     for part in name.split("."):
         start = start.get(part) if isinstance(start, Mapping) else getattr(start, part, None)
-    if start is None:
+    is_assumed = start is None and isinstance(bound, Recursive) and name in bound.assumed
+    if isinstance(bound, Recursive) and is_assumed:
+        start = bound.assumed[name]
+    elif start is None:
         read = [source.topics[topic] for topic in (*bound.streams, *bound.whole)]
         start = stated(read, name, type(parameters))
     is_positive = least >= 0.0 or (given is not None and given[0] > 0.0)
@@ -211,27 +218,49 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
             f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
             f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
         )
-    return Free(name, start, low, min(high, greatest), is_positive)
+    return Free(name, start, low, min(high, greatest), is_positive, is_assumed)
 
 
-def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
-    """The values of least cost, and how well they are told.
+def _settled(objective: Objective, free: Sequence[Free], grid: int) -> Found:
+    """The values of least cost with which filters begin where they began in the search.
 
-    Raises BadInput where the cost does not change with one of them.
+    Without a prior in the log, where a filter begins depends on the values: on how far it trusts its
+    path between the first fixes, say. That is held during a search, else likelihoods of different
+    measurements would be compared; the next search holds where filters begin with the values found.
+    """
+    found = _search(objective, free, grid)
+    for _ in range(ROUNDS - 1):
+        if found.was_stopped or objective.begins_alike(found.optimum):
+            return found
+        objective.begin(found.optimum)
+        found = _search(objective, free, 1, found.coordinates.of(found.optimum))
+    return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
+
+
+def _search(objective: Objective, free: Sequence[Free], grid: int, point: Floats | None = None) -> Found:
+    """The values of least cost, and how well they are told; from a point (k,), in coordinates, if given.
+
+    A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
+    change with one of them.
     """
     coordinates = coordinates_of(objective, free)
     try:
-        point = coordinates.of(np.array([each.start for each in free]))
+        if point is None:
+            point = coordinates.of(np.array([each.start for each in free]))
         if grid > 1:
             point = least_of_grid(objective, coordinates, grid)
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
-        inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
-        told, is_at_edge = None, False
-        if objective.by == "likelihood" and inner:
-            bent = curvature(objective, coordinates, point, inner)
-            is_at_edge = not np.isfinite(bent).all()
-            told = None if is_at_edge else confidence(inner, bent)
+        told, is_at_edge = _told(objective, coordinates, point)
+        if told is not None and (places := unknown(told, free)):
+            kept = [each.kept if place in places else each for place, each in enumerate(free)]
+            nearer = replace(coordinates, free=kept)
+            low, high = nearer.bounds
+            ended, _ = least(objective, nearer, np.clip(point, low, high), is_smooth=is_smooth)
+            best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
+            if cost - best < ENOUGH:
+                coordinates, point = nearer, ended
+                told, is_at_edge = _told(objective, coordinates, point)
         optimum, evaluations = coordinates.values(point), objective.best.evaluations
         return Found(
             coordinates, optimum, evaluations, told, has_converged=has_converged, is_at_edge=is_at_edge
@@ -239,15 +268,27 @@ def _search(objective: Objective, free: Sequence[Free], grid: int) -> Found:
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
             raise
-        best = objective.best
-        return Found(coordinates, best.point, best.evaluations, was_stopped=True)
+        best_yet = objective.best
+        return Found(coordinates, best_yet.point, best_yet.evaluations, was_stopped=True)
+
+
+def _told(
+    objective: Objective, coordinates: Coordinates, point: Floats
+) -> tuple[Confidence | None, bool]:
+    """How well a search by likelihood tells what lies at no bound, and whether runs fail beside it."""
+    inner = np.flatnonzero(~coordinates.at_bounds(point)).tolist()
+    if objective.by != "likelihood" or not inner:
+        return None, False
+    bent = curvature(objective, coordinates, point, inner)
+    is_at_edge = not np.isfinite(bent).all()
+    return None if is_at_edge else confidence(inner, bent), is_at_edge
 
 
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
 ) -> dict[str, Any]:
     """What all other logs give, and what the logs of a fold cost with that."""
-    found = _search(rest, free, grid)
+    found = _settled(rest, free, grid)
     start = np.array([each.start for each in free])
     costs = left_out(np.array([start, found.optimum]))
     return {

@@ -76,6 +76,7 @@ class StreamMapping(Parameters):
         mounting_deg: roll, pitch, yaw that turn the sensor's axes into the body's (Rz Ry Rx); vectors
             are turned, and orientations become the body's.
         components, kinds: those of a vector that states them, with commas; kinds are linear else.
+        states: numbers that the channel states, for parameters of models: noise densities, say.
     """
 
     becomes: str
@@ -92,6 +93,7 @@ class StreamMapping(Parameters):
     mounting_deg: tuple[float, float, float] | None = None
     components: str = ""
     kinds: str = ""
+    states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
         """The names of all sources of numbers; some may come again."""
@@ -110,10 +112,11 @@ class StreamMapping(Parameters):
     @property
     def metadata(self) -> dict[str, str]:
         """What the stream's channel states."""
+        stated = {name: repr(number) for name, number in self.states.items()}
         if not self.components:
-            return {}
+            return stated
         linear = ",".join("linear" for _ in self.components.split(","))
-        return {"components": self.components, "kinds": self.kinds or linear}
+        return {**stated, "components": self.components, "kinds": self.kinds or linear}
 
 
 def schema_of(mapping: StreamMapping, where: str) -> Schema:

@@ -65,6 +65,7 @@ class Recursive:
             stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
             where its parameters do not let it.
         opening: how it finds what a log does not state; None where that states all.
+        assumed: the parameters that are assumed, since the log does not state them.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Recursive:
     parameters: Parameters | None = None
     rewinding: "Callable[[int], Recursive] | None" = None
     opening: Opening | None = None
+    assumed: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

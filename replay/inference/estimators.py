@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
-from pydantic import create_model
+from pydantic import Field, create_model
 from pydantic.fields import FieldInfo
 
 from recorders.errors import BadInput, choices
@@ -47,7 +47,10 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
     """A type of parameters with other defaults for some of them."""
-    fields: Any = {name: (_accepted(kind.model_fields[name]), value) for name, value in defaults.items()}
+    fields: Any = {}
+    for name, value in defaults.items():
+        field = kind.model_fields[name]
+        fields[name] = (_accepted(field), Field(value, description=field.description))
     return create_model(kind.__name__, __base__=kind, **fields) if fields else kind
 
 
@@ -113,8 +116,9 @@ def _any_parameters(method: Method) -> type[Parameters]:
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
                 kind = _accepted(field)
-                same = fields.get(name, (kind,))[0] == kind
-                fields[name] = (kind if same else Any, None)
+                other, said = fields.get(name, (kind, field))
+                meaning = field.description if field.description == said.description else None
+                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
     return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
 
 
@@ -208,7 +212,7 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, opening=opening)
+        made = replace(made, opening=opening, assumed=assumed)
         bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
     return bound
 

@@ -134,14 +134,10 @@ class Beginning:
         if self._aligns:
             aligned = self._aligned(first, clock, origins, begun)
             others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
-            facts = [aligned, *others]
+            facts = [aligned, *others, self._unaligned(aligned, begun)]
         has_begun = begun.time_ns < FOREVER_NS
         facts += [
-            _Fact(
-                f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it",
-                begun.time_ns,
-                has_begun,
-            )
+            _Fact(self._assumption(name, number), begun.time_ns, has_begun)
             for name, number in self.assumed.items()
         ]
         stream = gaussian_stream(
@@ -152,6 +148,22 @@ class Beginning:
             named(model.state),
         )
         return _of_runs(stream, has_begun), facts
+
+    def _unaligned(self, aligned: "_Fact", begun: "_Begun") -> "_Fact":
+        """That fixes did not tell all where a run begins without."""
+        [measured] = [sensor.measured for _, sensor, _ in self._measuring]
+        names = ", ".join(name for name in self.stage.model.state if name not in measured)
+        text = (
+            f"{names}: unknown at the start, since with these noise densities the path between the "
+            "first fixes does not tell it; state the densities of your sensors first, or give a prior"
+        )
+        return _Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
+
+    def _assumption(self, name: str, number: float) -> str:
+        """The sentence for a parameter that is assumed, with what it means where the model says that."""
+        meaning = " ".join((self.stage.model.parameters.model_fields[name].description or "").split())
+        said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
+        return f"{said} ({meaning.rstrip('.')})" if meaning else said
 
     @property
     def _without(self) -> str:

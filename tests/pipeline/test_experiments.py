@@ -18,7 +18,14 @@ from numpy.testing import assert_allclose
 from pipeline.charts import Chart
 from pipeline.claims import Claim
 from pipeline.ensemble import hash_files, hash_streams, record_ensemble
-from pipeline.experiment import Experiment, Setting, Study, load_experiment, run_experiment
+from pipeline.experiment import (
+    Experiment,
+    Setting,
+    Study,
+    experiment_of_logs,
+    load_experiment,
+    run_experiment,
+)
 from pipeline.results import Outcome, result_folder, write_outcome
 from pipeline.studies.localization import summarise
 from recorders.errors import BadInput
@@ -421,6 +428,25 @@ def test_logs_are_replayed_as_an_experiment(drives: Path, tmp_path: Path, fuselo
     assert not any(name.startswith("logs/") for name in names)
     assert fuselog("evaluate", str(tmp_path / "0/estimates/run-0001.mcap")).code == 0
     assert fuselog("report", str(tmp_path / "0"), "-o", str(tmp_path / "page.html")).code == 0
+
+
+def test_a_bare_name_sets_a_parameter_of_all_estimators_that_have_it() -> None:
+    """What is set for one of them counts more, in any order; the scenario's parameters come first."""
+    stated = experiment_of_logs([Path(__file__)], ["ekf", "ukf", "dead-reckoning"])
+    settings = {"ukf": {"sigma_range_m": 0.2}, "sigma_range_m": 0.3}
+    for given in (settings, dict(reversed(settings.items()))):
+        experiment = stated.with_settings(given, {})
+        assert experiment.estimators == {
+            "ekf": {"sigma_range_m": 0.3},
+            "ukf": {"sigma_range_m": 0.2},
+            "dead-reckoning": {},
+        }
+    _, landmarks = load_experiment("landmarks", {"forward_noise_density": 0.1, "sigma_range_m": 1}, {})
+    assert landmarks.record is not None
+    assert landmarks.record.parameters["forward_noise_density"] == 0.1
+    assert landmarks.estimators["ekf"] == {"gate_probability": 1.0, "sigma_range_m": 1}
+    with pytest.raises(BadInput, match=r"--set gate_probabilty: no such entry.*gate_probability"):
+        load_experiment("landmarks", {"gate_probabilty": 1}, {})
 
 
 @pytest.mark.parametrize(

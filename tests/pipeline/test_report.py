@@ -242,6 +242,23 @@ def test_the_verdict_names_the_best_estimator_and_whether_it_is_consistent(
     assert best == f"b has the least position_rmse_m, 0.25; {said}."
 
 
+def test_the_verdict_says_of_one_run_no_more_than_it_tells() -> None:
+    """Its NEES has the interval of a single step; the logs replayed say how many runs there are."""
+    metrics = {"b.position_rmse_m": 0.25, "b.nees": 3.0, "b.nis_per_component": 1.1}
+    result = _result(metrics, [], **{"": (2.0, 4.0)})
+    result.bounds["b.nis_per_component"] = (0.9, 1.2)
+    result.settings.update(runs=1, logs={"files": ["a.mcap"]})
+    assert verdict(result)[1] == (
+        "position_rmse_m of b is 0.25; its NEES of 3 lies within the 95 % interval 2 to 4: one run does "
+        "not show it to be inconsistent; its NIS of 1.1 per component, which says more, lies within 0.9 "
+        "to 1.2."
+    )
+    result.settings.update(runs=2, logs={"files": ["a.mcap", "b.mcap"]})
+    what, best = verdict(result)
+    assert what.startswith("a, b over 2 runs")
+    assert best.endswith("2 to 4: it is consistent.")
+
+
 def test_the_verdict_calls_no_bound_the_best() -> None:
     metrics = {"a.position_rmse_m": 0.5, "bound.position_rmse_m": 0.25, "bound.over_ensemble": 1.0}
     assert verdict(_result(metrics, []))[1] == "position_rmse_m of a is 0.5."

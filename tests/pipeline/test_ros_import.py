@@ -1,5 +1,6 @@
 """Bags of ROS from the command line and from Python."""
 
+import re
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -64,9 +65,13 @@ def test_from_the_bag_to_a_picture(
     log, rrd, estimates = (tmp_path / name for name in ("nav.mcap", "nav.rrd", "estimates.mcap"))
     bag = str(real_data / "nav2_turtlebot.mcap")
     assert fuselog("import", "ros", bag, "-o", str(log)).code == 0
-    said = fuselog("info", str(log)).out
+    said = fuselog("info", str(log), "--all").out
     assert "robot: -e ekf iekf ukf lrkf smoother bank particles; from /odometry, /pose" in said
     assert "vehicle: needs prior (fuselog.GaussianEstimate) of x_m, vx_mps, y_m, vy_mps; fix" in said
+    shorter = fuselog("info", str(log)).out
+    assert "robot: -e" in shorter
+    assert "vehicle: needs" not in shorter
+    assert re.search(r"^  .*vehicle.*: do not fit; --all says what they need$", shorter, re.MULTILINE)
     both = ["-e", "ekf", "-e", "smoother:ekf"]
     done = fuselog("replay", str(log), *both, "--save", str(rrd), "-o", str(estimates))
     assert done.code == 0

@@ -41,7 +41,7 @@ def test_a_guessed_mapping_works_as_it_is(
     text = mapping.read_text()
     assert 'unit = "ms" }' in text
     assert "# 100 rows a second." in text
-    assert "# 1 rows a second; 1 gaps over 5 s, the longest 10 s; 1 stamps repeat." in text
+    assert "# 1 row a second; 1 gap over 5 s, the longest 10 s; 1 stamp repeats." in text
     assert 'units.specific_force_mps2 = "g"   # its median length is 1.001' in text
     assert 'units.turn_rate_radps = "deg/s"   # the largest is 2' in text
     assert "# not taken:" in text
@@ -175,3 +175,56 @@ def test_a_heading_is_guessed_by_the_path(tmp_path: Path) -> None:
     assert truth.metadata["components"] == "x_m,y_m,heading_rad"
     turned = np.angle(np.exp(1j * (truth["state"][:, 2] - direction)))
     assert_allclose(turned, 0, atol=1e-6)
+
+
+def test_a_guess_of_a_vehicles_tables_says_what_is_still_to_be_said(tmp_path: Path) -> None:
+    """Fixes with a dilution, wheels, a truth in the plane: namespace and origin are asked for."""
+    tables = {
+        "gps": "stamp,latitude,longitude,hdop\n{:.3f},48.1370{},11.5750,0.87\n",
+        "odom": "stamp,v,w\n{:.3f},1.2{},0.1\n",
+        "truth": "stamp,x_east,y_north,yaw\n{:.3f},0.{},0.1,0.7\n",
+    }
+    for name, text in tables.items():
+        head, row = text.split("\n", 1)
+        stamps = [*range(12), 30]
+        lines = [row.format(1_760_000_000 + stamp, stamp) for stamp in stamps]
+        (tmp_path / f"{name}.csv").write_text(head + "\n" + "".join(lines))
+    text = guess([tmp_path])
+    found = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
+    assert found == ["GeodeticFix", "Odometry", "TruthState"]
+    assert "3 namespaces, /gps, /odom, /truth." in text
+    assert "# [origin]" in text
+    assert 'deviations.covariance_m2 = ["hdop", "hdop", "hdop"]' in text
+    assert text.count("# 1 row a second; 1 gap over 5 s, the longest 19 s.") == 3
+    folder, mapping = tmp_path / "one", tmp_path / "guessed.toml"
+    folder.mkdir()
+    (tmp_path / "gps.csv").rename(folder / "gps.csv")
+    mapping.write_text(guess([folder]))
+    assert "namespaces" not in mapping.read_text()
+    fixes = fl.import_("table", folder, mapping=str(mapping))["/fix"]
+    assert_allclose(fixes["covariance_m2"][0], np.diag([1.218, 1.218, 2.436]).ravel() ** 2)
+
+
+def test_a_mapping_states_noise_and_a_prior_as_the_page_shows(tmp_path: Path) -> None:
+    """The channel states the densities; the reference's first row, with its deviations, is the prior."""
+    page = (Path(__file__).parents[2] / "docs" / "your-log.md").read_text(encoding="utf-8")
+    tables = {
+        "wheels": "stamp,speed,yaw_rate\n{},1,0.1\n",
+        "gps": "stamp,latitude,longitude,hdop\n{},48.137,11.575,2\n",
+        "reference": "stamp,x_east,y_north,yaw\n{},1,2,0.5\n",
+    }
+    for name, text in tables.items():
+        head, row = text.split("\n", 1)
+        rows = "".join(row.format(1_760_000_000 + stamp) for stamp in range(3))
+        (tmp_path / f"{name}.csv").write_text(f"{head}\n{rows}")
+    blocks = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    [odometry] = [each for each in blocks if each.startswith("[[tables.streams]]") and "states" in each]
+    [others] = [each for each in blocks if each.startswith("[origin]")]
+    time = 'time = { column = "stamp", unit = "s" }'
+    mapping = tmp_path / "drive.toml"
+    mapping.write_text(f'{others}\n[[tables]]\nfiles = "wheels.csv"\n{time}\n\n{odometry}')
+    log = fl.import_("table", tmp_path, mapping=str(mapping))
+    assert log["/car/odometry"].metadata["forward_noise_density"] == "0.022"
+    assert_allclose(log["/car/fix"]["covariance_m2"][0], np.diag([2.8, 2.8, 5.6]).ravel() ** 2)
+    assert_allclose(log["/car/prior"]["mean"], [[1, 2, 0.5]])
+    assert_allclose(log["/car/prior"]["covariance"][0], np.diag([1, 1, 0.01]).ravel())

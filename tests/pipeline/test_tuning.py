@@ -21,6 +21,9 @@ from pipeline.executors import Here
 from pipeline.results import read_result
 from pipeline.tuning.objective import Best
 from pipeline.tuning.search import Cost, curvature
+from recorders.log import RunMetadata
+from recorders.recording import Recording
+from replay.engine.sources import memory_source
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
@@ -107,6 +110,67 @@ def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
     assert np.isnan(intervals["sigma_range_m"])
     assert intervals["sigma_bearing_rad"] > 0
     assert list(bounded.correlation) == ["sigma_bearing_rad"]
+
+
+TURN_NOISE = 0.012  # rad/s/sqrt(Hz)
+
+
+@pytest.fixture(scope="module")
+def drive() -> fl.MemorySource:
+    """Two minutes of wheels and fixes, without a prior."""
+    rng, step_s = np.random.default_rng(7), 0.1
+    turn_radps = 0.2 * np.sin(0.05 * np.arange(1200) * step_s)
+    heading = np.cumsum(turn_radps) * step_s
+    place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * 1.5 * step_s
+    stamps = EPOCH_NS + np.arange(1200) * 100_000_000
+    wheels = fl.make_stream(
+        "/car/odometry",
+        fl.schemas.ODOMETRY,
+        stamps,
+        metadata={"forward_noise_density": "0.02"},
+        forward_mps=1.5 + 0.02 / step_s**0.5 * rng.normal(size=1200),
+        turn_radps=turn_radps + TURN_NOISE / step_s**0.5 * rng.normal(size=1200),
+    )
+    fixes = fl.make_stream(
+        "/car/fix",
+        fl.schemas.POSITION_FIX,
+        stamps[::10],
+        position_m=(place + 0.7 * rng.normal(size=place.shape))[::10],
+        covariance_m2=np.tile([0.49, 0.0, 0.0, 0.49], (120, 1)),
+    )
+    return memory_source(Recording([wheels, fixes]), RunMetadata("drive", epoch_ns=EPOCH_NS))
+
+
+def test_a_log_without_a_prior_gives_the_same_from_far_and_near(drive: fl.MemorySource) -> None:
+    """Where the filter begins depends on the values, and is held in a search; its start is assumed.
+
+    From 0.05 the path between the first fixes is not trusted, and the filter would begin sooner.
+    """
+    name = "turn_noise_density"
+    far = fl.tune(drive, "ekf", name)
+    near = fl.tune(drive, "ekf", name, set={name: TURN_NOISE})
+    for found in (far, near):
+        [row] = found.parameters.to_dict("records")
+        assert row["low"] < TURN_NOISE < row["high"]
+    assert far.found.optimum == pytest.approx(near.found.optimum, rel=1e-3)
+    assert far.parameters["start"].tolist() == [0.05]
+    assert any(each.startswith(f"{name}: no channel states it") for each in far.notes)
+    assert any("begins where its path fits the first fixes" in each for each in far.notes)
+
+
+def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource) -> None:
+    """A speed's noise of a millimetre in a second, beside fixes of 0.7 m."""
+    name, start = (
+        "forward_noise_density",
+        {"forward_noise_density": 1e-3, "turn_noise_density": TURN_NOISE},
+    )
+    found = fl.tune(drive, "ekf", [*start], set=start)
+    assert found.parameters["value"][0] == 1e-3
+    assert found.parameters["low"].isna().tolist() == [True, False]
+    assert any(
+        each.startswith(f"{name}: the logs determine it not at all; it stays") for each in found.notes
+    )
+    assert tomllib.loads(found.toml)["ekf"][name] == 1e-3
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, explain, merge, parse_settings
 from recorders.parsing import parse_json, read_toml
+from replay.estimators.landmarks import ROBOT
 
 
 class Inner(Parameters):
@@ -73,6 +74,21 @@ def test_descriptions_have_full_names_defaults_and_bounds() -> None:
         "inner.name": ("c", "string"),
         "others": (None, "array or none"),
     }
+
+
+def test_the_text_below_a_parameter_is_its_meaning() -> None:
+    """In `fuselog models robot` every row has one, with the unit of a noise density."""
+
+    class Stated(Parameters):
+        sigma_m: float = 1.0
+        """Of a range,
+        in m."""
+        count: int = 2
+
+    assert [each.meaning for each in describe(Stated)] == ["Of a range, in m.", ""]
+    meanings = {each.name: each.meaning for each in describe(ROBOT.parameters)}
+    assert all(meanings.values())
+    assert "m/s/sqrt(Hz)" in meanings["forward_noise_density"]
 
 
 def test_settings_are_toml_and_else_text() -> None:

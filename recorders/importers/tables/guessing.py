@@ -42,6 +42,7 @@ _YAW_RATE = (
     r"|gz|w_?z|ang(ular)?_?(vel(ocity)?|speed|rate)(_?z)?|angular(_z)?)"
 )
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
+_EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
 )
@@ -104,8 +105,26 @@ def guess(paths: Sequence[Path]) -> str:
         "# What fuselog guessed; mend what is wrong: docs/your-log.md says how.",
         f"summary = {json.dumps(f'guessed from {paths[0].name}')}",
         *(f"# not taken: {note}" for note in notes),
+        *_warnings("\n".join(tables)),
     ]
     return "\n".join(head) + "\n\n" + "\n".join(tables)
+
+
+def _warnings(text: str) -> Iterator[str]:
+    """What a person must still say of streams that belong together: their vehicle and their origin."""
+    namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
+    if len(namespaces) > 1:
+        yield f"# The topics lie in {len(namespaces)} namespaces, {', '.join(namespaces)}."
+        yield "# An estimator takes those of one: give all topics of one vehicle the same, such as"
+        yield "# /car/odometry, /car/fix and /car/truth."
+    becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
+    if {"GeodeticFix", "TruthState"} <= {*becomes}:
+        yield "# The truth is in a plane, fixes are latitudes and longitudes. Where the plane touches"
+        yield "# (by default at the first fix, from which the truth may be shifted):"
+        yield "# [origin]"
+        yield "# latitude_deg = "
+        yield "# longitude_deg = "
+        yield "# altitude_m = "
 
 
 def _table(path: Path, name: str, *, is_alone: bool) -> str:
@@ -228,12 +247,17 @@ def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
         return ["# All rows have one stamp."]
     usual_s = float(np.median(forward))
     gaps = forward[forward > 5 * usual_s]
-    told = f"# {1 / usual_s:.4g} rows a second"
+    rate = f"{1 / usual_s:.4g}"
+    told = f"# {rate} {'row' if rate == '1' else 'rows'} a second"
     if len(gaps):
-        told += f"; {len(gaps)} gaps over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
-    for what, which in (("repeat", steps_s == 0), ("go back", steps_s < 0)):
+        what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        told += f"; {what} over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
+    for one, many, which in (
+        ("repeats", "repeat", steps_s == 0),
+        ("goes back", "go back", steps_s < 0),
+    ):
         if which.any():
-            told += f"; {which.sum()} stamps {what}"
+            told += f"; 1 stamp {one}" if which.sum() == 1 else f"; {which.sum()} stamps {many}"
     return [f"{told}."]
 
 
@@ -365,6 +389,13 @@ def _fix(table: _Table) -> Iterator[str]:
     deviations = _take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {_names(deviations)}")
+    elif dilution := _take(table.columns, r"(.*_)?hdop"):
+        lines += [
+            "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
+            "# horizontally divided by the root of 2. A guess of that error is 2 m; fill in your own.",
+            f"deviations.covariance_m2 = {_names(3 * dilution)}",
+            "factors.covariance_m2 = [1.4, 1.4, 2.8]",
+        ]
     else:
         lines += [
             "# No standard deviations are named; stated ones, east, north, up:",
@@ -491,12 +522,12 @@ def _pose(table: _Table) -> Iterator[str]:
 def _position(columns: list[_Column]) -> tuple[list[_Column], list[int]]:
     """The columns of a position, and what they are multiplied by to be of east, north and up."""
     for up, sign in (("up", 1), ("down", -1)):
-        if found := _take(columns, "east(ing)?|e", "north(ing)?|n", f"{up}|{up[0]}"):
+        if found := _take(columns, _EAST, _NORTH, f"(z_)?{up}|{up[0]}"):
             return found, [1, 1, sign]
     found = (
         _axes(columns, *_POSITIONS)
         or _axes(columns, *_POSITIONS, axes="xy")
-        or _take(columns, "east(ing)?|e", "north(ing)?|n")
+        or _take(columns, _EAST, _NORTH)
     )
     return found, [1] * len(found)
 

@@ -105,6 +105,15 @@ def test_a_robot_begins_at_its_first_pose() -> None:
     assert_array_equal(found["innovation"]["accepted"], 1)
 
 
+def test_a_heading_that_fixes_do_not_tell_is_said() -> None:
+    """By what is assumed of the odometry; that is said with what it means."""
+    told = sentences_of(outputs(ROBOT, "ekf", [log(odometry(), fix())])["started"].stream)
+    assert any(each.startswith("heading_rad: unknown at the start") for each in told)
+    assert "(Noise of the forward speed, in m/s/sqrt(Hz): " in "".join(told)
+    known = outputs(ROBOT, "ekf", [log(odometry(), seen())])["started"].stream
+    assert not any("unknown" in each for each in sentences_of(known))
+
+
 def test_a_span_begins_at_its_own_first_pose() -> None:
     source = log(odometry(), seen())
     later = replace(source, start_ns=int(SLOW[2]) + 1)
