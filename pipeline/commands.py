@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.executors import crew_of
@@ -27,6 +25,7 @@ from pipeline.results import (
     ErrorTables,
     in_order,
     plain,
+    read_table,
     result_folder,
     split_metric,
     write_outcome,
@@ -429,7 +428,7 @@ def run_named(
         print_parameters(result.settings["parameters"])
         say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
     runs = folder / RUNS
-    print_metrics(result.metrics, result.bounds, pd.read_parquet(runs) if runs.is_file() else None)
+    print_metrics(result.metrics, result.bounds, read_table(runs) if runs.is_file() else None)
     print_claims(result.claims)
     say(f"{folder}: {', '.join(result.contents)}")
 

@@ -26,7 +26,7 @@ from pipeline.experiment import (
     run_experiment,
 )
 from pipeline.outputs import LOG, check_files, check_folder
-from pipeline.results import Result
+from pipeline.results import Result, read_table
 from pipeline.studies.localization import summary_table
 from pipeline.sweeps import nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
@@ -122,7 +122,7 @@ class ResultFolder:
     def tables(self) -> dict[str, pd.DataFrame]:
         """All tables by name."""
         paths = sorted((self.folder / "tables").glob("*.parquet"))
-        return {path.stem: pd.read_parquet(path) for path in paths}
+        return {path.stem: read_table(path) for path in paths}
 
 
 def run(

@@ -126,6 +126,14 @@ class MetricTable:
     quantities: dict[str, dict[str, Measured]]
 
 
+def read_table(path: Path) -> "pd.DataFrame":
+    """A table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
+    import pandas as pd
+
+    with path.open("rb") as file:
+        return pd.read_parquet(file)
+
+
 def metric_tables(
     metrics: Mapping[str, MetricValue],
     bounds: Mapping[str, Bounds],

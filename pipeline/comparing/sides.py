@@ -18,7 +18,7 @@ from pipeline.ensemble import Progress, judge_logs, parts_of
 from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.experiment import Experiment, Setting, load_scenario
 from pipeline.replays import Replay, replay
-from pipeline.results import RESULT_FILE, Result, read_result, split_metric
+from pipeline.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runner import Runner
 from pipeline.starting import check_same_run
 from recorders.errors import BadInput
@@ -250,7 +250,7 @@ def of_result(folder: Path, progress: Progress) -> Given:
             f"{folder}: its study {result.settings.get('study', result.experiment)} keeps no row for "
             "each run; compare its estimates logs"
         )
-    rows, times = (pd.read_parquet(path) for path in tables.values())
+    rows, times = (read_table(path) for path in tables.values())
     stated = result.settings.get("parameters", {})
     numbers = sorted(set(rows["run"]))
     runs = {number: _run_of_result(result, number) for number in numbers}

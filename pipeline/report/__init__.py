@@ -21,7 +21,7 @@ from pipeline.charts import Chart
 from pipeline.report.first_run import picture_of_timeline, plan_of_first_run
 from pipeline.report.naming import distinct_names
 from pipeline.report.verdict import verdict
-from pipeline.results import MetricTable, Result, metric_tables, read_result
+from pipeline.results import MetricTable, Result, metric_tables, read_result, read_table
 from pipeline.terminal import format_value
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
@@ -116,7 +116,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         if each.startswith(("figures/", "tables/")) and not (folder / each).is_file():
             raise BadInput(f"{folder}: {each} is missing; run the experiment again")
     try:
-        tables = {path.stem: _read_table(path) for path in sorted(folder.glob("tables/*.parquet"))}
+        tables = {path.stem: read_table(path) for path in sorted(folder.glob("tables/*.parquet"))}
         figures = sorted(map(_figure, sorted(folder.glob("figures/*.svg"))), key=_rank)
     except (OSError, ValueError) as error:
         raise BadInput(
@@ -130,11 +130,6 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     lead = [*_first_run(folder, viewer=viewer), *figures[:1]]
     metrics = metric_tables(result.metrics, result.bounds, tables.get("runs"))
     return Section(name, result, verdict(result), lead, metrics, short, figures[1:])
-
-
-def _read_table(path: Path) -> pd.DataFrame:
-    with path.open("rb") as file:
-        return pd.read_parquet(file)
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:

@@ -47,5 +47,5 @@ def test_orientation_at_100_runs(tmp_path):
 
 def test_another_scenario_is_refused(tmp_path):
     label, experiment = load_experiment("bingham-2d", {}, {"record": {"scenario": "landmarks"}})
-    with pytest.raises(BadInput, match="none of axes or orientations"):
+    with pytest.raises(BadInput, match="neither axes nor orientations"):
         run_experiment(label, experiment, tmp_path / "out")

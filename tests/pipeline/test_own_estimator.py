@@ -180,7 +180,7 @@ def test_the_code_of_others_that_fails_is_named(package: Path) -> None:
         replay.format("enough.mcap", "gone"): "estimator 'gone' (gone:GONE) raised ModuleNotFoundError",
         replay.format("enough.mcap", "number"): "estimator 'number' (broken:NUMBER) is int",
         replay.format("few.mcap", "choosy"): "fewer than 4 beacons",
-        "fuselog record twice": "/landmarks: recorded as 2 streams",
+        "fuselog record twice": "/landmarks: is recorded as 2 streams",
         replay.format(
             "few.mcap enough.mcap", "choosy"
         ): "few.mcap: choosy walker failed at 4.500 s: fewer than 4 beacons",

@@ -43,7 +43,7 @@ def test_published_errors_are_found_again_to_four_digits(navigation: Path, case:
 def test_folders_without_a_recording_are_refused(navigation: Path, tmp_path: Path) -> None:
     for name, wanted in (("uwb-pose", "UWB"), ("uwb-outdoor", "trajectory.csv")):
         _, experiment = load_experiment(name, {}, {})
-        with pytest.raises(BadInput, match=rf"holds no {wanted}.*; give the recording's folder"):
+        with pytest.raises(BadInput, match=rf"has no {wanted}.*; give the recording's folder"):
             run_experiment(name, experiment, tmp_path / "out", data=tmp_path)
     shutil.copy(navigation / "uwb_lias" / "UWB_dynamic_exp_mid.csv", tmp_path)
     _, experiment = load_experiment("uwb-pose", {}, {})

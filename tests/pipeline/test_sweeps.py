@@ -102,5 +102,5 @@ def test_what_cannot_be_swept_is_bad_input(over, sentence, tmp_path, capsys):
 
 
 def test_a_study_of_its_own_is_not_swept(tmp_path):
-    with pytest.raises(BadInput, match="does more than judge"):
+    with pytest.raises(BadInput, match="makes more than metrics of single runs"):
         fl.sweep("torus-filter", {"seed": [1, 2]}, out=tmp_path / "sweep")

@@ -75,7 +75,7 @@ def test_a_declared_distance_is_negated_for_fusion_and_stays_as_it_was_in_the_lo
 
 
 def test_matchers_are_named_in_the_folder_where_the_parameters_name_none(folder):
-    with pytest.raises(BadInput, match=r"matchers\.toml: missing"):
+    with pytest.raises(BadInput, match=r"matchers\.toml: no such file"):
         read(folder, ScoreMatricesParameters())
     (folder / "matchers.toml").write_text('[[matchers]]\nname = "face"\nmodality = "face"\n')
     assert len(read(folder, ScoreMatricesParameters()).streams[0]["scores"][0]) == 1

@@ -343,7 +343,7 @@ def test_samples_have_the_second_moment_of_their_distribution():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: make_bingham(np.eye(3), [0.0, 0.0, 0.0]), "d 2 or 4"),
+        (lambda: make_bingham(np.eye(3), [0.0, 0.0, 0.0]), "d = 2 or 4"),
         (lambda: make_bingham(np.ones((2, 2)), [-1.0, 0.0]), "orthonormal"),
         (lambda: make_bingham(np.eye(2), [-np.inf, 0.0]), "finite"),
         (lambda: bingham.around([2.0, 0.0], [-1.0]), "has length 2"),

@@ -242,14 +242,14 @@ def test_streams_without_messages_are_told_and_stop_no_other_run(tmp_path: Path)
 
 def test_runs_with_other_topics_are_no_ensemble():
     first, second = record(0), record(1, robots=1, range_bearing={"rate_hz": 0.0})
-    with pytest.raises(BadInput, match="topic /robot1/range_bearing is not as in run 0"):
+    with pytest.raises(BadInput, match="topic /robot1/range_bearing differs from that of run 0"):
         replayed([first, second])
 
 
 def test_runs_that_state_other_noise_are_no_ensemble():
     """What the first run's channels state would be taken for all of them."""
     sensor = {"rate_hz": 5.0, "sigma_range_m": 0.3}
-    with pytest.raises(BadInput, match="topic /robot1/range_bearing is not as in run 0"):
+    with pytest.raises(BadInput, match="topic /robot1/range_bearing differs from that of run 0"):
         replayed([record(0), record(1, range_bearing=sensor)])
 
 

@@ -236,7 +236,7 @@ def test_a_batch_has_priors_generators_innovations_and_further_outputs() -> None
 
 
 def test_a_batch_of_the_wrong_shape_is_told_in_one_sentence() -> None:
-    words = r"estimator m/a: covariance has the shape \(1, 2, 2\); \(1, 1, 1\) is wanted"
+    words = r"estimator m/a: covariance has the shape \(1, 2, 2\); \(1, 1, 1\) is needed"
     with pytest.raises(BadInput, match=words):
         run(solved((1, 2, 2)), [make_run([1.0])])
 

@@ -81,7 +81,7 @@ def test_a_planar_filter_takes_x_and_y_of_a_fix_by_their_names(estimator: str, o
     [
         ({"components": "range_m,height_m"}, "position_m: no component x_m: .* range_m, height_m"),
         ({"components": "x_m,y_m,z_m"}, "names 3 components .* position_m has 2"),
-        ({"width": "9"}, "covariance_m2 has 9 numbers, 4 are needed"),
+        ({"width": "9"}, "covariance_m2 has 9 numbers; 4 are needed"),
     ],
 )
 def test_fixes_that_do_not_say_what_they_are_are_refused(
@@ -132,7 +132,7 @@ def test_vectors_of_another_width_are_refused() -> None:
     source = record("axis")
     axis = source.streams["/axis"]
     cube = replace(axis, columns={**axis.columns, "axis": np.ones((len(axis), 3))})
-    with pytest.raises(BadInput, match="topic /axis: axis has 3 numbers, 2 are needed"):
+    with pytest.raises(BadInput, match="topic /axis: axis has 3 numbers; 2 are needed"):
         replayed("bingham-axis", changed(source, axis=cube))
 
 

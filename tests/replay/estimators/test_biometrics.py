@@ -297,7 +297,7 @@ def test_classifiers_find_the_likelihood_ratio_of_gaussians(classifier, calibrat
 def test_too_few_users_for_the_folds_and_unknown_subsets_are_refused():
     source = memory_source(*record_run("biometric-scores", {"users": 20, "low_galleries": 1}, 0))
     with pytest.raises(
-        BadInput, match="20 users are too few for 11 folds; give 22 users, or at most 10"
+        BadInput, match="20 users are too few for 11 folds; give at least 22 users, or at most 10 folds"
     ):
         user_folds(20, 11, np.random.default_rng(0))
     with pytest.raises(BadInput, match="no subset 'fase' of matchers; did you mean 'face'"):

@@ -61,7 +61,7 @@ def test_a_parameter_goes_before_what_the_channel_states():
         (
             "orientation",
             {"system": {"distribution": "gaussian", "diagonal": [1.0, 1.0, 1.0, -1.0]}},
-            "not negative",
+            "must not be negative",
         ),
         ("torus-headings", {"system_correlation": 1.0}, "less than 1"),
     ],

@@ -256,5 +256,5 @@ def test_two_landmarks_at_one_place_are_refused():
         **source.streams,
         "/landmarks": replace(landmarks, columns={**landmarks.columns, "position_m": places}),
     }
-    with pytest.raises(BadInput, match="coincide"):
+    with pytest.raises(BadInput, match="at one place"):
         judged([replace(source, streams=streams)], ("exact",))

@@ -187,7 +187,7 @@ def test_without_noise_of_the_motion_it_is_what_the_smoother_gains() -> None:
     ("asked", "sentence"),
     [
         ({"window_s": 0.0}, "window_s"),
-        ({"scales": {"x": 1.0}}, "scale x: no such component; did you mean 'x_m'"),
+        ({"scales": {"x": 1.0}}, "--scale x: the state has no such component; did you mean 'x_m'"),
         ({"scales": {"x_m": -1.0}}, "x_m"),
         ({"model": "robot"}, "robot does not fit this log"),
     ],
