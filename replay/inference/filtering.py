@@ -1,15 +1,15 @@
 """A filter as a replay runs it: one model by one method, bound to the topics of a log."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recorders.log import Topic, schemas
 from replay.distributions import chi2
+from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.failures import reason_stream
@@ -52,10 +52,6 @@ from replay.inference.settings import (
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Function = Callable[..., Any]
 
 
 class State(NamedTuple):
@@ -196,7 +192,7 @@ class Filter:
         )
         return [Ragged(stream, ragged_rows(lost, happenings.offsets))]
 
-    def passed_over(self, block: Block, lacking: NDArray[np.bool_]) -> list[Ragged]:
+    def passed_over(self, block: Block, lacking: Booleans) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""
         control = self.stage.model.control
         drops_controls = control is not None and control.interpolated

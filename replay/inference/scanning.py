@@ -356,7 +356,6 @@ def updating(model: Model, kind: ScanSensor) -> Function:
             for j in range(m):
                 moment[i, j] += shift[i] * shift[j]
         gain = memory.cross[track, mode]
-        find_slope(mean, covariance, memory.step.slope)
         for row in range(len(covariance)):
             step[row] = 0.0
             for i in range(m):
@@ -367,6 +366,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
                     for j in range(m):
                         entry -= gain[row, i] * moment[i, j] * gain[column, j]
                 covariance[row, column] = covariance[column, row] = entry
+        find_slope(mean, covariance, memory.step.slope)
         correct(mean, covariance, memory.step)
 
     return update
