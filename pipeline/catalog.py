@@ -21,7 +21,7 @@ from replay.inference.binding import serving
 from replay.inference.estimators import registered_models
 from replay.inference.model import Model, ModelParameters
 from replay.inference.needs import needs_of
-from replay.inference.settings import number_fields
+from replay.inference.parameters import number_fields
 from replay.judging.measuring import Metric
 
 

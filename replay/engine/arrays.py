@@ -1,7 +1,7 @@
 """What arrays are called in annotations, and functions that are put together and compiled."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,3 +10,19 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Function = Callable[..., Any]
+Kind = TypeVar("Kind", bound=type)
+
+
+def varying(axes: int, **of_fields: int) -> Callable[[Kind], Kind]:
+    """Mark a NamedTuple of arrays by how many of their first axes vary from log to log.
+
+    The sizes of all other axes are part of a kernel that gets them; see `replay.engine.kernels.native`.
+    Of what is not marked these are the first axis, the runs or messages, and none of a core's scratch.
+    """
+
+    def marked(kind: Kind) -> Kind:
+        fields = kind._fields  # type: ignore[attr-defined]
+        kind.varies = tuple(of_fields.get(name, axes) for name in fields)  # type: ignore[attr-defined]
+        return kind
+
+    return marked

@@ -1,40 +1,34 @@
-"""Compiles a kernel together with the model functions it is made of, once per source text.
+"""Loops over runs of plain functions, compiled and shared among the cores.
 
-numba's own disk cache finds module-level functions only, does not notice that a function from another
-file has changed, and stops on a damaged file. So the sources of a kernel and of everything it calls
-become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
-model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
-which also run uncompiled.
-
-`bundling` gathers sources, `inlining` compiles the inner functions, `keeping` keeps compiled code.
+A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
+arrays is written in LLVM's text by ourselves (`replay.engine.kernels`), in milliseconds; any other goes
+through numba (`replay.engine.through_numba`). With FUSELOG_UNCOMPILED=1 all are plain Python, which a
+debugger can follow: that is the reference.
 """
 
-import collections
-import inspect
 import os
-import re
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache, lru_cache, partial, wraps
+from functools import cache, lru_cache, wraps
 from itertools import pairwise
-from types import ModuleType
-from typing import Any, ParamSpec, TypeVar
+from types import FunctionType
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
-import numba
 import numpy as np
-from numba.core.errors import NumbaError
-
-from replay.engine.bundling import Bundle, DoesNotCompile
-from replay.engine.inlining import Inlined
-from replay.engine.keeping import execute, load
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-# Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
-_PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
-vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inlined)
+
+class Loop(Protocol):
+    """A compiled loop over runs."""
+
+    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
+        """What goes through the runs from a first one up to an end, with these arguments.
+
+        The last of them, `scratch`, is what one core works in.
+        """
+        ...
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -48,11 +42,9 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     def kernel() -> Callable[Parameters, Result]:
         if _is_uncompiled():
             return np.errstate(all="ignore")(function)
-        bundle = Bundle()
-        name = bundle.add(function.__name__, function)
-        names = ", ".join(inspect.signature(function).parameters)
-        text = f"def kernel({names}):\n    return {name}({names})"
-        return _compile(bundle, name, text, function)
+        from replay.engine.through_numba import function_of
+
+        return function_of(function)
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
@@ -68,8 +60,8 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
             belongs to that run. It may be a closure over model functions and numbers: that is how it is
             specialised. It may use NumPy and functions that keep to the same.
-        allocates: whether it makes arrays. A kernel that does not is compiled without the counting of
-            references to arrays, and is several times as fast.
+        allocates: whether it makes arrays. A kernel that does not is compiled in a twentieth of the
+            time, and is several times as fast.
 
     Returns `loop(runs, *arguments, scratch=None, own=None)`; its results do not depend on the number of
     runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
@@ -82,19 +74,13 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     """
     if _is_uncompiled():
         return uncompiled_over_runs(run_once)
-    bundle = Bundle(allocates)
-    kernel = bundle.add("run_once", run_once)
-    names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
-    loop = _compile(
-        bundle,
-        kernel,
-        f"def kernel(first, end, {names}):\n"
-        "    for run in range(first, end):\n"
-        f"        {kernel}(run, {names})",
-        run_once,
-    )
-    hint = "" if allocates else " (a kernel that makes arrays is compiled with allocates=True)"
-    return partial(_over_runs, name=run_once.__name__, loop=loop, places=bundle.places, hint=hint)
+    if allocates:
+        from replay.engine.through_numba import loop_of
+
+        return _shared(loop_of(run_once))
+    from replay.engine.kernels.native import Kernel
+
+    return _shared(Kernel(cast(FunctionType, run_once)))
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -117,70 +103,69 @@ def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return loop
 
 
-def _over_runs(
-    runs: int,
-    *arguments: Any,
-    scratch: Callable[[], Any] | None = None,
-    own: Sequence[Any] | None = None,
-    name: str,
-    loop: Callable[..., None],
-    places: Mapping[tuple[str, int], str],
-    hint: str,
-) -> None:
+def _shared(loop: Loop) -> Callable[..., None]:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
-    def work(pieces: Iterator[tuple[int, int]]) -> None:
-        memory = [scratch()] if scratch else []
-        for first, end in pieces:
+    def over_runs(
+        runs: int,
+        *arguments: Any,
+        scratch: Callable[[], Any] | None = None,
+        own: Sequence[Any] | None = None,
+    ) -> None:
+        def prepared() -> Callable[[int, int], None]:
             if own is None:
-                loop(first, end, *arguments, *memory)
-                continue
-            for run in range(first, end):
-                if own[run] is not None:
-                    loop(run, run + 1, *arguments, own[run])
+                return loop.of(arguments, [scratch()] if scratch else [])
+            of_own = {
+                run: loop.of((*arguments, each)) for run, each in enumerate(own) if each is not None
+            }
 
-    cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)] if cores > 1 else [0, runs]
-    waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
-    try:
+            def through(first: int, end: int) -> None:
+                for run in range(first, end):
+                    if run in of_own:
+                        of_own[run](run, run + 1)
+
+            return through
+
+        def work(through: Callable[[int, int], None] | None) -> None:
+            through = through or prepared()
+            for first, end in waiting:
+                through(first, end)
+
+        cores = min(runs, core_count())
+        cuts = (
+            [runs * piece // (4 * cores) for piece in range(4 * cores + 1)] if cores > 1 else [0, runs]
+        )
+        waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
+        first = prepared()
         if cores > 1:  # compiles here: a thread would wait for ever for a module that is being imported
-            last = [scratch()] if scratch else [each for each in own or () if each is not None][:1]
-            if own is None or last:
-                loop(0, 0, *arguments, *last)
-        helpers = [_helpers(os.getpid()).submit(work, waiting) for _ in range(cores - 1)]
+            first(0, 0)
+        helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
         try:
-            work(waiting)
+            work(first)
         finally:  # none works on when this returns
             begun = [helper for helper in helpers if not helper.cancel()]
             wait(begun)
         for helper in begun:
             helper.result()
-    except NumbaError as error:
-        said = re.sub(r"\x1b\[\d*m", "", str(error))  # bold where colorama is installed
-        reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
-        reason = re.sub(r",? ?(defined )?at \w+_[0-9a-f]{16} \(\d+\)", "", reason)
-        line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', said)
-        place = places.get((line[1], int(line[2])), "") if line else ""
-        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{place}{hint}") from error
+
+    return over_runs
+
+
+@cache
+def core_count() -> int:
+    """How many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
+    asked = os.environ.get("NUMBA_NUM_THREADS", "")
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
     """The threads beside the calling one; a forked process has none of its parent's."""
-    return ThreadPoolExecutor(max(1, numba.config.NUMBA_NUM_THREADS - 1))  # type: ignore[attr-defined]
+    return ThreadPoolExecutor(max(1, core_count() - 1))
 
 
 def _is_uncompiled() -> bool:
     return os.environ.get("FUSELOG_UNCOMPILED") == "1"
-
-
-def _compile(
-    bundle: Bundle, called: str, definition: str, function: Callable[..., Any]
-) -> Callable[..., Any]:
-    """The function `kernel` that calls one that a bundle holds, which is made of `function`."""
-    for own, source in bundle.definitions.items():
-        if own not in vars(_PARTS):
-            execute(source, own, _PARTS)
-    needed = f"import numba\nfrom {_PARTS.__name__} import {called}"
-    text = f"{needed}\n@numba.njit(nogil=True, {bundle.options})\n{definition}\n"
-    return load(text, f"{function.__module__}.{function.__name__}")

@@ -36,6 +36,7 @@ from replay.inference.generate import Input, derivative
 from replay.inference.happenings import Points, points_of
 from replay.inference.small_matrices import UpdateMemory, update, update_memory
 from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
+from replay.tracing.functions import traced
 
 Mode = Literal["alone", "naive", "ci", "joint"]
 
@@ -157,14 +158,13 @@ class Work(NamedTuple):
 
 KINDS = tuple(POSE.values())
 linear_drive = derivative(
-    drive,
+    traced(drive, 3, 2, None),
     [Input("pose", KINDS, "transition"), Input("velocity", ("linear", "linear"), "gain")],
     KINDS,
-    ("duration_s",),
     "state",
 )
 linear_sight = derivative(
-    sight, [Input("pose", KINDS, "rows")], ("linear", "angle"), ("place",), "predicted"
+    traced(sight, 3, 2), [Input("pose", KINDS, "rows")], ("linear", "angle"), "predicted"
 )
 
 
@@ -256,7 +256,7 @@ def meet(
 ) -> bool:
     """Use a sighting; False where a covariance is not positive definite."""
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
-    first, both = 3 * robots, robots[1] >= 0
+    first, both = (3 * robots[0], 3 * robots[1]), robots[1] >= 0
     for row in range(2):
         own[row, row] = variance[row]
     for side in range(1 + both):
@@ -285,11 +285,17 @@ def meet(
 
 
 def cooperate(
-    run: int, events: Events, settings: Settings, fusion: Fusion, carried: Carried, results: Results
+    run: int,
+    events: Events,
+    settings: Settings,
+    fusion: Fusion,
+    carried: Carried,
+    results: Results,
+    work: Work,
 ) -> None:
     """Move the robots of one run through its events, until these end or an update fails."""
     mean, covariance = carried.mean[run], carried.covariance[run]
-    work, difference = memory(len(mean)), np.empty(2)
+    difference = np.empty(2)
     for event in range(events.offsets[run], events.offsets[run + 1]):
         robots, now = events.robots[event], events.time_ns[event]
         robot, seen = robots[0], robots[1]
@@ -316,12 +322,15 @@ def cooperate(
         else:
             for k in range(2):
                 carried.velocity[run, robot, k] = events.value[event, k]
-        if not np.isfinite(mean.sum()):
+        total = 0.0
+        for row in range(len(mean)):
+            total += mean[row]
+        if not np.isfinite(total):
             carried.failure[run] = NOT_FINITE
         elif events.is_due[event]:
-            own = slice(3 * robot, 3 * robot + 3)
+            first, end = 3 * robot, 3 * robot + 3
             found = results.mean[event], results.covariance[event]
-            copy_gaussian(mean[own], covariance[own, own], found[0], found[1])
+            copy_gaussian(mean[first:end], covariance[first:end, first:end], found[0], found[1])
 
 
 def memory(states: int) -> Work:
@@ -344,7 +353,7 @@ def memory(states: int) -> Work:
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(cooperate)
+    return compile_over_runs(cooperate, allocates=False)
 
 
 def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
@@ -394,7 +403,8 @@ def run(
     count, topic = len(events.time_ns), f"/estimates/{name}"
     results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
     fusion = Fusion(mode == "joint", mode == "ci", criterion == "trace")
-    _compiled()(len(carried.mean), events, settings, fusion, carried, results)
+    scratch = partial(memory, carried.mean.shape[1])
+    _compiled()(len(carried.mean), events, settings, fusion, carried, results, scratch=scratch)
     said = np.isfinite(results.mean[:, 0])
     made = [
         states_in(

@@ -20,7 +20,7 @@ from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.models.vehicles import noise_moments
 from recorders.parameters import Parameters
 from replay.distributions import chi2
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Booleans, Floats, Integers, varying
 from replay.engine.blocks import Block, Ragged
 from replay.engine.channels import bindings, given_or_stated
 from replay.engine.compile import compile_over_runs
@@ -87,6 +87,7 @@ class Settings(NamedTuple):
     gate: float
 
 
+@varying(2)
 class Mixture(NamedTuple):
     """What is carried: first axis run, second the components, of which `used` are taken.
 
@@ -127,6 +128,7 @@ class Sets(NamedTuple):
     covariance: Floats
 
 
+@varying(1, step=0, shift=0)
 class Work(NamedTuple):
     """Memory of one core.
 

@@ -25,7 +25,7 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Booleans, Floats, Integers, varying
 from replay.engine.blocks import Block, Ragged
 from replay.engine.compile import compile_over_runs
 from replay.engine.estimator import Bound, Estimator, Recursive
@@ -81,6 +81,7 @@ class Settings(NamedTuple):
     forget_s: float
 
 
+@varying(2)
 class Tracks(NamedTuple):
     """The tracks of all runs: first axis run, second a place for each track, of which `used` are taken.
 
@@ -132,6 +133,7 @@ class Told(NamedTuple):
     spread: Floats
 
 
+@varying(2)
 class Memory(NamedTuple):
     """What the reports of one stamp are associated in: see `replay.inference.association`.
 

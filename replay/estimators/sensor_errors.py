@@ -17,7 +17,7 @@ from replay.estimators.targets import Targets
 from replay.inference.generate import function_of, is_flat, tuple_of
 from replay.inference.model import Model, Motion, trial_state
 from replay.inference.scanning import ScanSensor
-from replay.inference.steps import Stage
+from replay.inference.stage import Stage
 from replay.inference.tracking import Newborn
 
 BY_SORT = ("registration", "correlated")

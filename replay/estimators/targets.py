@@ -25,8 +25,9 @@ from replay.inference.model import (
     switching_of,
 )
 from replay.inference.opening import unknown
-from replay.inference.settings import TracedParameters, number_fields, settings_type
-from replay.inference.steps import Stage
+from replay.inference.parameters import number_fields, settings_type
+from replay.inference.settings import TracedParameters
+from replay.inference.stage import Stage
 from replay.inference.tracking import Newborn
 
 POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")

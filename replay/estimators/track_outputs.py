@@ -13,7 +13,7 @@ from replay.engine.results import innovation_stream, named
 from replay.estimators.scan_sensors import KINDS
 from replay.estimators.scans import Found
 from replay.inference.scanning import Scans
-from replay.inference.steps import Stage
+from replay.inference.stage import Stage
 from replay.inference.tracking import Told
 from replay.inference.tracks import NEVER
 

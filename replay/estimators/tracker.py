@@ -36,8 +36,9 @@ from replay.estimators.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.targets import Targets, targets_of
 from replay.estimators.track_outputs import track_outputs
 from replay.estimators.track_smoother import smoothing_tracks
+from replay.inference.parameters import number_fields
 from replay.inference.scanning import Scans, in_time, measuring, take_scans
-from replay.inference.settings import number_fields
+from replay.inference.stage import stage_of
 from replay.inference.tracking import Newborn, Told, Tracker, of_last, track_scans
 from replay.inference.tracks import Tracks, no_tracks
 
@@ -391,7 +392,8 @@ def _take(
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
     """The parts that the parameters ask for."""
     stage, shared = targets.stage, settings.errors.shared
-    sensors = tuple(measuring(stage.model, kind) for kind in KINDS)
+    stage = stage_of(*stage, names=settings.names)
+    sensors = tuple(measuring(stage.model, kind, settings.names) for kind in KINDS)
     association = "jpda" if parameters.association in EXISTING else parameters.association
     assert parameters.management is not None
     return Tracker(

@@ -30,11 +30,11 @@ from replay.inference.smoothing import (
     ForwardMemory,
     smoothing_steps,
 )
+from replay.inference.stage import Stage
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Note,
-    Stage,
     Steps,
     Workspace,
     gaussian_filter,

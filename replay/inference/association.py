@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput, choices
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Booleans, Floats, Integers, varying
 from replay.engine.compile import compiled
 
 # Clusters in which both tracks and detections are more than this are left to belief propagation.
@@ -30,6 +30,7 @@ MOST_ROUNDS = 1000
 NONE = -1
 
 
+@varying(2)
 class Weights(NamedTuple):
     """What maps are made of.
 
@@ -42,6 +43,7 @@ class Weights(NamedTuple):
     missed: Floats
 
 
+@varying(2)
 class Memory(NamedTuple):
     """What association works in, for so many tracks and detections at most.
 

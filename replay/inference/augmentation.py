@@ -22,17 +22,17 @@ from replay.engine.results import gaussian_stream
 from replay.inference.corrections import correcting_more
 from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
+from replay.inference.parameters import number_fields, settings_type
 from replay.inference.point_errors import (
     Errors,
     PointError,
-    jacobians_with,
     motion_with_errors,
     point_errors,
     sensor_with_errors,
     with_point_errors,
 )
-from replay.inference.settings import TracedParameters, number_fields, settings_type
-from replay.inference.steps import Stage
+from replay.inference.settings import TracedParameters
+from replay.inference.stage import Stage
 from replay.inference.walks import Walk, kept, spread, with_walk_parameters
 
 Names = tuple[str, ...]
@@ -244,9 +244,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         noise=_reading(model, names, given, "state, duration_s", "first(state), duration_s", variances),
         noises=motion.noises + len(names) if motion.noises else 0,
         linear=motion.linear and reads_none,
-        jacobians=jacobians_with(model, motion, tuple(_kept(model, name) for name in names))
-        if reads_none and not motion.noises
-        else None,
+        jacobians=None,
         moments=None,
     )
 

@@ -35,7 +35,8 @@ from replay.inference.methods import (
 )
 from replay.inference.model import Model
 from replay.inference.sensor_steps import slots_of
-from replay.inference.steps import Gaussian, Note, Stage, Steps
+from replay.inference.stage import Stage
+from replay.inference.steps import Gaussian, Note, Steps
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
 AGREED = 0.1  # members become one where their means are on average so near, as a squared distance

@@ -40,12 +40,12 @@ from replay.inference.motion_steps import motion_derivative, motion_noise
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations
 from replay.inference.sensor_steps import linear_sensor, sensor_noise
 from replay.inference.smoothing import solve_semidefinite
+from replay.inference.stage import Stage
 from replay.inference.steps import (
     NO_TRUTH,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Note,
-    Stage,
     Steps,
     Workspace,
     workspace,

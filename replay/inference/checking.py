@@ -39,7 +39,8 @@ from replay.inference.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.settings import number_fields, settings_type
+from replay.inference.parameters import number_fields, settings_type
+from replay.tracing.functions import arguments_like, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
@@ -88,10 +89,11 @@ def check_model(
         states: (n, components) at which to try; random ones of order one unless given.
         seed: of the random states, controls and points of a map.
 
-    Raises AssertionError, with one sentence, where derivatives by jets differ from central differences
-    or from those written by hand, a number of components is wrong, what is declared linear is not, an
-    angle is declared linear or what is declared an angle is none, a unit vector leaves its length, or
-    a variance is negative; BadInput where the parameters are none of the model's.
+    Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
+    from central differences or from those written by hand, a number of components is wrong, what is
+    declared linear is not, an angle is declared linear or what is declared an angle is none, a unit
+    vector leaves its length, or a variance is negative; BadInput where the parameters are none of the
+    model's.
     """
     values = build(model.parameters, parameters or {}, "check_model")
     names = number_fields(model.parameters)
@@ -182,21 +184,21 @@ def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
 def _check_derivatives(
     call: _Call, state: Floats, others: list[Floats], part: Motion | Sensor
 ) -> Floats:
-    """Compare jets with central differences and what is written by hand; returns that by the state."""
+    """Compare derivatives with differences and what is written by hand; returns that by the state."""
     kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
     sizes = {"state": tangent_size(kinds), **{name: n for name, (n, _) in call.inputs.items()}}
     inputs = [Input("state", kinds, "state")]
     inputs += [Input(name, ("linear",) * n, name if n else "") for name, (n, _) in call.inputs.items()]
-    rest = [f"rest_{index}" for index in range(len(call.rest))]
     rows = tangent_size(outputs)
     work = SimpleNamespace(
         values=np.empty(len(outputs)), **{name: np.zeros((rows, size)) for name, size in sizes.items()}
     )
+    given = (tuple(state), *map(tuple, others), *call.rest)
     try:
-        linearise = derivative(call.function, inputs, outputs, rest, "values")
-        linearise(tuple(state), *map(tuple, others), *call.rest, work)
-    except TypeError as error:
-        raise AssertionError(f"{call.what} has no derivatives by jets: {error}") from error
+        linearise = derivative(traced(call.function, *arguments_like(given)), inputs, outputs, "values")
+    except BadInput as error:
+        raise AssertionError(str(error)) from error
+    linearise(*given, work)
     arguments = [state, *others]
     for index, (name, size) in enumerate(sizes.items()):
         for column in range(size):
@@ -253,19 +255,19 @@ def _check_by_hand(
 
 
 def _compare(
-    call: _Call, jets: Floats, others: Floats, by: tuple[str, int], tolerance: float, how: str
+    call: _Call, exact: Floats, others: Floats, by: tuple[str, int], tolerance: float, how: str
 ) -> None:
     """Raise where a column of a Jacobian is not as it is by another way."""
     name, column = by
-    found = jets[:, column]
-    allowed = tolerance * np.maximum(1.0, np.maximum(np.abs(found), np.abs(jets).max(initial=0.0)))
+    found = exact[:, column]
+    allowed = tolerance * np.maximum(1.0, np.maximum(np.abs(found), np.abs(exact).max(initial=0.0)))
     wrong = np.flatnonzero(~(np.abs(found - others) <= allowed))
     if len(wrong):
         row = int(wrong[0])
         inner = _tangent(call.state)[column] if name == "state" else f"{name} {column}"
         raise AssertionError(
             f"{call.what}: the derivative of {_tangent(call.outputs)[row]} by {inner} is "
-            f"{found[row]:.9g} by jets and {others[row]:.9g} {how}"
+            f"{found[row]:.9g} and {others[row]:.9g} {how}"
         )
 
 

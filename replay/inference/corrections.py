@@ -23,6 +23,7 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Correction, Model
+from replay.tracing.functions import traced
 
 Kinds = tuple[str, ...]
 
@@ -38,7 +39,8 @@ def sloping(kinds: Kinds, correct: Correction | None) -> Function:
             pass
 
         return leave
-    along, read_state, t = correct.along, tuple_of(len(kinds)), tangent_size(kinds)
+    along = traced(correct.along, len(kinds))
+    read_state, t = tuple_of(len(kinds)), tangent_size(kinds)
 
     def fill(mean: Floats, covariance: Floats, slope: Floats) -> None:
         direction, variance = along(read_state(mean)), 0.0
@@ -99,7 +101,9 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
             Input("target", kinds, "transition"),
             Input("slope", ("linear",) * t),
         ]
-        linearise = derivative(correct.step, inputs, ("linear",) * t, (), "step")
+        linearise = derivative(
+            traced(correct.step, len(kinds), len(kinds), t), inputs, ("linear",) * t, "step"
+        )
 
         def compare_together(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
             linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
@@ -164,7 +168,8 @@ def _stepping(kinds: Kinds, move: Function) -> Function:
     """`step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
-    linearise = derivative(move, inputs, kinds, (), "state")
+    arguments = (len(each.kinds) for each in inputs)
+    linearise = derivative(traced(move, *arguments), inputs, kinds, "state")
     read_state, read_step = tuple_of(len(kinds)), tuple_of(len(straight))
 
     def step_to(mean: Floats, work: Any) -> None:

@@ -35,7 +35,7 @@ from replay.inference.settings import (
     assumed_of,
     settings_of,
 )
-from replay.inference.steps import Stage
+from replay.inference.stage import Stage, stage_of
 
 
 @lru_cache(maxsize=256)
@@ -196,7 +196,10 @@ def bind_model(
         found = found._replace(origin=_origin_of(label, model, found, topics))
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        stage = augmented_stage(own, added)
+        try:
+            stage = stage_of(*augmented_stage(own, added))
+        except BadInput as error:
+            raise BadInput(f"estimator {label}: {error}") from error
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
         settings = with_walks(numbers, added)

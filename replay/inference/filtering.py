@@ -33,6 +33,7 @@ from replay.inference.happenings import (
     with_ticks,
 )
 from replay.inference.methods import Method
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import (
     Carried,
     Estimates,
@@ -44,12 +45,9 @@ from replay.inference.recursion import (
 )
 from replay.inference.rewinding import issued
 from replay.inference.sensor_steps import slots_of
-from replay.inference.settings import (
-    complaint_of,
-    number_fields,
-    reading_settings,
-)
-from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Stage, Steps
+from replay.inference.settings import complaint_of, reading_settings
+from replay.inference.stage import Stage
+from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Steps
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 

@@ -21,10 +21,12 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL
 from replay.inference.affine import Trajectory, affine_steps, damped, reaching
 from replay.inference.generate import is_flat, resetting, retraction
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
-from replay.inference.settings import number_fields, reading_settings
+from replay.inference.settings import reading_settings
 from replay.inference.smoothing import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
-from replay.inference.steps import Gaussian, Stage, Steps
+from replay.inference.stage import Stage
+from replay.inference.steps import Gaussian, Steps
 
 SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
 ROUNDING = 1e-15

@@ -12,7 +12,8 @@ Hertzberg et al., Information Fusion 14, 2013; Sola, arXiv 1711.02508.
 
 import hashlib
 import linecache
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,7 +22,9 @@ import numpy as np
 from recorders.models.planar import wrap_angle
 from replay.engine.arrays import Function
 from replay.engine.tangent import WIDTHS
-from replay.inference.jets import jet, slope_of, value_of
+from replay.tracing.functions import Derivative, TracedFunction
+from replay.tracing.graph import Node
+from replay.tracing.traced import Trace
 
 TANGENT = {"linear": 1, "angle": 1, "axis": 1, "quaternion": 3}
 # The basis of the imaginary units: e_i e_j = sign * e_k of Hamilton's product, as rows of `_product`.
@@ -207,90 +210,127 @@ class Input(NamedTuple):
     into: str = ""
     zero: bool = False
 
-    def entries(self, first: int, slopes: int) -> str:
-        """The argument's components as jets whose slopes from `first` on are its tangent space."""
-
-        def seeds(values: Mapping[int, str]) -> str:
-            return _listed([values.get(index, "0.0") for index in range(slopes)])
-
-        found = []
-        for kind, c, t, _ in things(self.kinds):
-            at = first + t
-            x = ["0.0" if self.zero else f"{self.name}[{c + index}]" for index in range(WIDTHS[kind])]
-            if not self.into:
-                found += x
-            elif kind in ("linear", "angle"):
-                found.append(f"jet({x[0]}, {seeds({at: '1.0'})})")
-            elif kind == "axis":
-                found += [
-                    f"jet({x[0]}, {seeds({at: f'-{x[1]}'})})",
-                    f"jet({x[1]}, {seeds({at: x[0]})})",
-                ]
-            else:  # d(q exp(d/2))/dd at 0 is q times half a unit
-                for row in range(4):
-                    values = {
-                        at + j - 1: f"{0.5 * sign} * {x[i]}" for i, j, sign in _PRODUCT[row] if j > 0
-                    }
-                    found.append(f"jet({x[row]}, {seeds(values)})")
-        return _listed(found)
-
 
 def derivative(
-    function: Function,
-    inputs: Sequence[Input],
-    outputs: Sequence[str],
-    rest: Sequence[str],
-    values: str = "",
+    function: Function, inputs: Sequence[Input], outputs: Sequence[str], values: str = ""
 ) -> Function:
-    """The values and exact Jacobians of a component-first function, by jets.
+    """The values and exact Jacobians of a component-first function, by its graph.
 
     Args:
-        function: takes the inputs, tuples, and then what is in `rest`; returns a tuple.
+        function: takes the inputs, tuples, and then others; returns a tuple. It is traced.
         inputs: its first arguments.
         outputs: the kinds of what it returns.
-        rest: the names of its further arguments.
         values: the array of the workspace that gets the values (n,), if they are wanted.
 
-    Returns `linearise(inputs..., rest..., work)`, without the inputs that are zero. It fills the values
-    and the wanted Jacobians (t of the outputs, t of the input), in the tangent spaces.
+    Returns `linearise(inputs..., others..., work)`, without the inputs that are zero. It fills the
+    values and the wanted Jacobians (t of the outputs, t of the input), in the tangent spaces.
     """
-    sizes = [tangent_size(each.kinds) if each.into else 0 for each in inputs]
-    slopes = sum(sizes)
-    given = [each.entries(sum(sizes[:index]), slopes) for index, each in enumerate(inputs)]
-    names = [each.name for each in inputs if not each.zero]
-    found = "".join(f"y{row}, " for row in range(len(outputs)))
-    lines = [
-        f"def linearise({', '.join([*names, *rest, 'work'])}):",
-        # unpacked first: numba takes seven times as long to compile slopes of a tuple's entries
-        f"    {found} = function({', '.join([*given, *rest])})",
-        *(f"    work.{values}[{row}] = value_of(y{row})" for row in range(len(outputs)) if values),
+    assert isinstance(function, TracedFunction)
+    wanted = [(index, each) for index, each in enumerate(inputs) if each.into]
+    sizes = [tangent_size(each.kinds) for _, each in wanted]
+    firsts = [sum(sizes[:place]) for place in range(len(wanted))]
+    columns = [
+        (each.into, column)
+        for (_, each), size in zip(wanted, sizes, strict=True)
+        for column in range(size)
     ]
-    places = [
-        (f"work.{each.into}", column, sum(sizes[:index]) + column)
-        for index, each in enumerate(inputs)
-        for column in range(sizes[index])
-    ]
-    for kind, c, t, _ in things(outputs):
-        for matrix, column, slope in places:
-            slope_at = [f"slope_of(y{c + index}, {slope})" for index in range(WIDTHS[kind])]
-            if kind in ("linear", "angle"):
-                lines.append(f"    {matrix}[{t}, {column}] = {slope_at[0]}")
-            elif kind == "axis":
-                lines.append(
-                    f"    {matrix}[{t}, {column}] = value_of(y{c}) * {slope_at[1]} - "
-                    f"value_of(y{c + 1}) * {slope_at[0]}"
-                )
-            else:
-                point = [f"value_of(y{c + index})" for index in range(4)]
-                lines += [f"    point = {_listed(point)}", f"    slopes = {_listed(slope_at)}"]
-                lines += [
-                    f"    {matrix}[{t + row - 1}, {column}] = "
-                    f"2.0 * ({_terms('point', 'slopes', row, True)})"
-                    for row in (1, 2, 3)
-                ]
-    return function_of(
-        "\n".join([*lines, ""]), function=function, jet=jet, value_of=value_of, slope_of=slope_of
+
+    def seeds(trace: Trace) -> dict[Node, dict[int, Node]]:
+        found: dict[Node, dict[int, Node]] = {}
+        for (index, each), first in zip(wanted, firsts, strict=True):
+            found |= _seeded(trace, index, each.kinds, first)
+        return found
+
+    def combine(
+        trace: Trace, returned: Sequence[Node], slopes: Sequence[Mapping[int, Node]]
+    ) -> dict[Any, Node]:
+        return {
+            (columns[variable][0], row, columns[variable][1]): node
+            for variable in range(len(columns))
+            for row, node in _in_tangent_space(trace, outputs, returned, slopes, variable)
+        }
+
+    linearised = Derivative(function, seeds, combine)
+    zeros = tuple((index, (0.0,) * len(each.kinds)) for index, each in enumerate(inputs) if each.zero)
+    count, rows = len(outputs), tangent_size(outputs)
+    written = tuple((len(outputs) + index, *place) for index, place in enumerate(linearised.places))
+    known = set(linearised.places)
+    empty = tuple(
+        (into, row, column)
+        for into, column in columns
+        for row in range(rows)
+        if (into, row, column) not in known
     )
+
+    def linearise(*given: Any) -> None:
+        work, arguments = given[-1], given[:-1]
+        for place, zero in zeros:
+            arguments = (*arguments[:place], zero, *arguments[place:])
+        found = linearised(*arguments)
+        if values:
+            for index in range_of(count):
+                getattr(work, values)[index] = found[index]
+        for into, row, column in empty:
+            getattr(work, into)[row, column] = 0.0
+        for index, into, row, column in written:
+            getattr(work, into)[row, column] = found[index]
+
+    return linearise
+
+
+def range_of(count: int) -> tuple[int, ...]:
+    """The numbers below one, for a loop that is written out."""
+    return tuple(range(count))
+
+
+def _seeded(
+    trace: Trace, argument: int, kinds: Sequence[str], first: int
+) -> dict[Node, dict[int, Node]]:
+    """How the components of an argument change with its tangent space, whose variables begin at one."""
+    graph = trace.graph
+    x = [graph.input((argument, index)) for index in range(len(kinds))]
+    one, found = graph.constant(1.0), {}
+    for kind, c, t, _ in things(kinds):
+        at = first + t
+        if kind in ("linear", "angle"):
+            found[x[c]] = {at: one}
+        elif kind == "axis":
+            found[x[c]] = {at: graph.apply(operator.neg, x[c + 1])}
+            found[x[c + 1]] = {at: x[c]}
+        else:  # d(q exp(d/2))/dd at 0 is q times half a unit
+            for row in range(4):
+                found[x[c + row]] = {
+                    at + j - 1: graph.apply(operator.mul, graph.constant(0.5 * sign), x[c + i])
+                    for i, j, sign in _PRODUCT[row]
+                    if j > 0
+                }
+    return found
+
+
+def _in_tangent_space(
+    trace: Trace,
+    kinds: Sequence[str],
+    returned: Sequence[Node],
+    slopes: Sequence[Mapping[int, Node]],
+    variable: int,
+) -> Iterator[tuple[int, Node]]:
+    """The slopes of what a function returns by one variable, by the row of the tangent space."""
+    zero = trace.graph.constant(0.0)
+    y = [trace.number(node) for node in returned]
+    for kind, c, t, _ in things(kinds):
+        by = [slopes[c + index].get(variable, zero) for index in range(WIDTHS[kind])]
+        d = [trace.number(node) for node in by]
+        if kind in ("linear", "angle"):
+            yield t, by[0]
+        elif kind == "axis":
+            yield t, trace.node_of(y[c] * d[1] - y[c + 1] * d[0])
+        else:
+            for row in (1, 2, 3):
+                total: Any = 0.0
+                for i, j, sign in _PRODUCT[row]:
+                    term = y[c + i] * d[j]
+                    total = total + term if (sign > 0) == (i == 0) else total - term
+                yield t + row - 1, trace.node_of(2.0 * total)
 
 
 @lru_cache(maxsize=64)

@@ -16,10 +16,11 @@ from replay.engine.geodetic import GEODETIC, in_plane
 from replay.engine.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.binding import Found
 from replay.inference.model import Control, Map, Sensor
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import CONTROL, NOTHING, Happenings
 from replay.inference.sensor_steps import reading
-from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import Stage
+from replay.inference.settings import reading_settings
+from replay.inference.stage import Stage
 
 EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 

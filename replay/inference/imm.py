@@ -48,10 +48,12 @@ from replay.inference.methods import (
     no_steps,
 )
 from replay.inference.model import Model, switching_of
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.sensor_steps import noting, slots_of
-from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import Gaussian, Note, Stage, Steps
+from replay.inference.settings import reading_settings
+from replay.inference.stage import Stage
+from replay.inference.steps import Gaussian, Note, Steps
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18

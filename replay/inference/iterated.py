@@ -26,7 +26,8 @@ from replay.inference.methods import FILTERS, Method
 from replay.inference.recursion import NOTHING, Estimates, Happenings, no_results
 from replay.inference.smoothers import Piece, Smoother, SmootherParameters
 from replay.inference.smoothing import FOREVER_NS, Nodes, back_memory, no_later, smoothing_steps
-from replay.inference.steps import Gaussian, Stage, Steps
+from replay.inference.stage import Stage
+from replay.inference.steps import Gaussian, Steps
 
 
 class IteratedParameters(SmootherParameters):

@@ -30,6 +30,7 @@ from replay.inference.gaussian import (
 from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
 from replay.inference.motion_steps import linear_motion, motion_noise
+from replay.inference.parameters import number_fields
 from replay.inference.regression import sample_memory, sampled_motion, sampled_sensor
 from replay.inference.sensor_steps import (
     kalman_update,
@@ -41,11 +42,11 @@ from replay.inference.sensor_steps import (
     sensor_derivative,
 )
 from replay.inference.settings import trial_parameters
+from replay.inference.stage import Stage, traced_sensor
 from replay.inference.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Note,
-    Stage,
     Steps,
     Workspace,
     gaussian_filter,
@@ -309,7 +310,8 @@ def _lacks_slopes(model: Model) -> str:
             rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
             work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
             try:
-                sensor_derivative(model, sensor)(trial_state(model.kinds), about, parameters, work)
+                own = traced_sensor(model, sensor, number_fields(model.parameters))
+                sensor_derivative(model, own)(trial_state(model.kinds), about, parameters, work)
             except Exception:  # is said when the model is bound, see `model.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:

@@ -15,7 +15,8 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Model, Motion
-from replay.inference.steps import Stage, Workspace
+from replay.inference.stage import Stage
+from replay.inference.steps import Workspace
 
 
 def linear_motion(stage: Stage) -> Function:
@@ -65,7 +66,7 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Functi
     ]
     if motion.noises:
         inputs.append(Input("noise", ("linear",) * motion.noises, "noise_gain", zero=True))
-    return derivative(motion.move, inputs, model.kinds, ("duration_s", "parameters"), "state")
+    return derivative(motion.move, inputs, model.kinds, "state")
 
 
 def motion_noise(model: Model, motion: Motion) -> Function:

@@ -32,10 +32,12 @@ from replay.inference.iterated import ITERATED, IteratedSmoother, Way
 from replay.inference.methods import Method, MethodParameters
 from replay.inference.model import Model
 from replay.inference.motion_steps import motion_derivative
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import Estimates, filled, no_results, recursion
 from replay.inference.sensor_steps import reading, sensor_derivative, sensor_noise, slots_of
-from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import NOTHING_MEASURED, Note, Stage, Steps, Workspace, workspace
+from replay.inference.settings import reading_settings
+from replay.inference.stage import Stage
+from replay.inference.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
 
 RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors

@@ -24,9 +24,10 @@ from replay.engine.tangent import tangent_components, things
 from replay.inference.binding import Found, measures_state
 from replay.inference.happenings import World, data_columns, happenings_of, sensor_table
 from replay.inference.model import Sensor, Start
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import CONTROL, Happenings
-from replay.inference.settings import complaint_of, number_fields, reading_settings
-from replay.inference.steps import Stage
+from replay.inference.settings import complaint_of, reading_settings
+from replay.inference.stage import Stage
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 FOREVER_NS = np.iinfo(np.int64).max

@@ -28,8 +28,8 @@ from replay.inference.particle_update import weighing
 from replay.inference.particles import Cloud, Clouds, ParticleMemory, SensorMemory, moving, summing_up
 from replay.inference.recursion import Estimates, Happenings, Innovations
 from replay.inference.settings import trial_parameters
+from replay.inference.stage import Stage
 from replay.inference.steps import (
-    Stage,
     Steps,
     workspace,
 )

@@ -22,12 +22,12 @@ from replay.inference.generate import (
 )
 from replay.inference.particles import Cloud, ParticleMemory, SensorMemory
 from replay.inference.sensor_steps import note_numbers, noting, reading, sensor_noise
+from replay.inference.stage import Stage
 from replay.inference.steps import (
     NOT_EXPLAINED,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Note,
-    Stage,
 )
 
 
@@ -97,8 +97,8 @@ def _comparing(stage: Stage, number: int) -> Function:
     if sensor.noises:
         entering = Input("noise", ("linear",) * sensor.noises, "noise_gain", zero=True)
         kinds = tuple(sensor.measured.values())
-        inputs, rest = [Input("state", model.kinds), entering], ("about", "parameters")
-        linearise = derivative(measure, inputs, kinds, rest, "predicted")
+        inputs = [Input("state", model.kinds), entering]
+        linearise = derivative(measure, inputs, kinds, "predicted")
 
         def predict_with_noise(
             states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory

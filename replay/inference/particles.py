@@ -31,9 +31,9 @@ from replay.inference.generate import (
 from replay.inference.model import Model
 from replay.inference.motion_steps import nothing
 from replay.inference.regression import settling
+from replay.inference.stage import Stage
 from replay.inference.steps import (
     Gaussian,
-    Stage,
     Workspace,
 )
 from replay.sampling.resampling import choose_systematically

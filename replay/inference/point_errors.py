@@ -9,7 +9,6 @@ take minutes to compile.
 """
 
 import re
-from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -17,9 +16,8 @@ from itertools import product
 from typing import NamedTuple
 
 from recorders.errors import BadInput
-from replay.engine.arrays import Function
 from replay.inference.corrections import correcting_more
-from replay.inference.generate import Input, derivative, function_of, tuple_of
+from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.settings import trial_parameters
 from replay.inference.walks import kept, spread, with_walk_parameters
@@ -112,38 +110,8 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
         noise=noise,
         noises=noises + len(errors) if noises else 0,
         noise_block=t if not noises and len(entries) != t else 0,
-        jacobians=None if noises else jacobians_with(model, motion, tuple(map(kept, _names(errors)))),
+        jacobians=None,
         moments=None,
-    )
-
-
-def jacobians_with(model: Model, motion: Motion, kept_of: Sequence[str]) -> Function:
-    """The Jacobians of a motion, and of what walks beside it: `model.Motion.jacobians`.
-
-    `kept_of` are expressions of the share that each of the latter keeps in a step. The motion does not
-    read them, so that jets are of its own state alone: they take a compiler the square of its size.
-    """
-    t, end = model.tangent, model.tangent + len(kept_of)
-    inputs = [
-        Input("state", model.kinds, "transition"),
-        Input("control", ("linear",) * model.controls, "gain" if motion.control_noise else ""),
-    ]
-    linearise = derivative(motion.move, inputs, model.kinds, ("duration_s", "parameters"))
-    diagonal = [f"    by_state[{t + row}, {t + row}] = {each}" for row, each in enumerate(kept_of)]
-    return function_of(
-        "def jacobians(state, control, duration_s, parameters, by_state, by_control):\n"
-        "    linearise(state, control, duration_s, parameters, Target(by_state, by_control))\n"
-        f"    for row in range({end}):\n"
-        f"        for column in range({t} if row >= {t} else {end}):\n"
-        f"            if row >= {t} or column >= {t}:\n"
-        "                by_state[row, column] = by_state[column, row] = 0.0\n"
-        f"    for row in range({t}, {end}):\n"
-        f"        for column in range({t}, {end}):\n"
-        "            by_state[row, column] = 0.0\n"
-        f"        for column in range(by_control.shape[1]):\n"
-        "            by_control[row, column] = 0.0\n" + "\n".join([*diagonal, ""]),
-        linearise=linearise,
-        Target=namedtuple("Target", ("transition", "gain")),
     )
 
 
@@ -167,28 +135,11 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
         f"    return ({_listed(entries)})\n",
         **names,
     )
-    kinds = tuple(sensor.measured.values())
-    inputs = [Input("state", model.kinds, "rows")]
-    linearise = derivative(sensor.measure, inputs, kinds, ("about", "parameters"))
-    t = model.tangent - model.size
-    lines = [
-        f"    by_state[{row}, {column + t}] = {_same(sensor, numbers)}" for column, row, numbers in own
-    ]
-    jacobian = function_of(
-        "def jacobian(state, about, parameters, by_state):\n"
-        "    linearise(state, own(about), parameters, Target(by_state))\n"
-        f"    for row in range({len(kinds)}):\n"
-        f"        for column in range({model.tangent}, {model.tangent + len(errors)}):\n"
-        "            by_state[row, column] = 0.0\n" + "\n".join([*lines, ""]),
-        linearise=linearise,
-        own=names["own"],
-        Target=namedtuple("Target", ("rows",)),
-    )
     return replace(
         sensor,
         measure=measure,
         is_numbered=bool(own),
-        jacobian=None if sensor.noises else jacobian,
+        jacobian=None,
         log_likelihood=None if own else sensor.log_likelihood,
         moments=None,
     )

@@ -17,6 +17,7 @@ from replay.engine.blocks import filled_rows
 from replay.engine.results import ALL_WELL
 from replay.inference.generate import function_of
 from replay.inference.model import Model
+from replay.inference.stage import Stage
 from replay.inference.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
@@ -24,7 +25,6 @@ from replay.inference.steps import (
     NOTHING_MEASURED,
     UNKNOWN,
     Note,
-    Stage,
     Steps,
 )
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function
+from replay.engine.arrays import Floats, Function, varying
 from replay.inference.gaussian import cholesky, wrap
 from replay.inference.generate import (
     differencing,
@@ -30,12 +30,14 @@ from replay.inference.generate import (
 from replay.inference.model import Motion, Sensor
 from replay.inference.motion_steps import motion_derivative, motion_noise, nothing
 from replay.inference.sensor_steps import reading, sensor_noise
-from replay.inference.steps import Stage, Workspace
+from replay.inference.stage import Stage
+from replay.inference.steps import Workspace
 from replay.sampling.sets import SampleSets
 
 MEANS = 30  # at most so many steps to an intrinsic mean
 
 
+@varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
     """Samples of N(0, I), and what a regression at them works in; N = t + noises.
 

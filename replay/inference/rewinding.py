@@ -22,6 +22,7 @@ from replay.inference.generate import function_of
 from replay.inference.happenings import data_columns, happenings_of
 from replay.inference.methods import Method
 from replay.inference.model import Model
+from replay.inference.parameters import number_fields
 from replay.inference.recursion import (
     CONTROL,
     NOTHING,
@@ -33,8 +34,9 @@ from replay.inference.recursion import (
     taking_in,
 )
 from replay.inference.sensor_steps import slots_of
-from replay.inference.settings import number_fields, reading_settings
-from replay.inference.steps import FAILURES, Stage, Steps
+from replay.inference.settings import reading_settings
+from replay.inference.stage import Stage
+from replay.inference.steps import FAILURES, Steps
 from replay.sampling.sets import sets_by_runs
 
 BEFORE_ALL_NS = np.iinfo(np.int64).min

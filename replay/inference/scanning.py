@@ -23,7 +23,7 @@ import numpy as np
 
 from recorders.log import Schema
 from recorders.models.states import PLANE_MOTION
-from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.arrays import Booleans, Floats, Function, Integers, varying
 from replay.engine.components import Components
 from replay.inference.association import Memory as AssociationMemory
 from replay.inference.association import Weights, memory_for
@@ -33,7 +33,8 @@ from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
 from replay.inference.sensor_steps import sensor_derivative
 from replay.inference.shared_bias import Pool, pool_of
-from replay.inference.steps import Stage, Workspace, workspace
+from replay.inference.stage import Stage, traced_sensor
+from replay.inference.steps import Workspace, workspace
 from replay.inference.tracks import Tracks
 
 
@@ -115,6 +116,7 @@ def in_time(first: Scans, second: Scans) -> Scans:
     return take_scans(both, np.argsort(both.time_ns, kind="stable"))
 
 
+@varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
 class Memory(NamedTuple):
     """What one core works in; axes are tracks, their modes, and the detections of a scan.
 
@@ -201,11 +203,15 @@ def target_of(model: Model) -> Function:
 
 
 @lru_cache(maxsize=64)
-def measuring(model: Model, kind: ScanSensor) -> Sensor:
-    """What of a kind of sensors is as a model's sensor is."""
-    text = "def measure(state, about, parameters):\n    return inner(target(state), about, parameters)\n"
-    measure = function_of(text, inner=kind.measure, target=target_of(model))
-    return Sensor(kind.leaf, kind.schema, kind.measured, measure)
+def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
+    """What of a kind of sensors is as a model's sensor is, which may read parameters of these names."""
+    target, inner = target_of(model), kind.measure
+
+    def measure(state: Any, about: Any, parameters: Any) -> Any:
+        return inner(target(state), about, parameters)
+
+    own = Sensor(kind.leaf, kind.schema, kind.measured, measure, fields={"origin": 2})
+    return traced_sensor(model, own, names)
 
 
 @lru_cache(maxsize=4)
@@ -229,14 +235,14 @@ def adding_errors(components: int) -> Function:
     return add
 
 
-def observing(model: Model, kind: ScanSensor) -> Function:
+def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Function:
     """`observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
 
     Fills the prediction of a track's mode and its whitened innovation covariance. Returns the density's
     factor before exp(-d2 / 2), NaN where the covariance is none.
     """
     m, read_state, read_origin = len(kind.measured), tuple_of(model.size), tuple_of(2)
-    linearise, noise = sensor_derivative(model, measuring(model, kind)), kind.noise
+    linearise, noise = sensor_derivative(model, measuring(model, kind, names)), kind.noise
     add_noise, target, add_errors = adding_noise(m), target_of(model), adding_errors(m)
 
     def observe(
@@ -275,7 +281,9 @@ def observing(model: Model, kind: ScanSensor) -> Function:
     return observe
 
 
-def correlating(model: Model, kind: ScanSensor, corner: tuple[int, int]) -> Function:
+def correlating(
+    model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
+) -> Function:
     """`correlate(mean, covariance, origin, parameters, work)`: a newborn's position with sensor errors.
 
     The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
@@ -284,7 +292,7 @@ def correlating(model: Model, kind: ScanSensor, corner: tuple[int, int]) -> Func
     x, y = corner
     read_state, read_origin = tuple_of(model.size), tuple_of(2)
     of_first, of_second = errors_at(0), errors_at(1)
-    linearise = sensor_derivative(model, measuring(model, kind))
+    linearise = sensor_derivative(model, measuring(model, kind, names))
 
     def shift(mean: Floats, covariance: Floats, error: int, by_x: float, by_y: float) -> None:
         """Move the position by so much of an error."""

@@ -28,7 +28,8 @@ from replay.inference.generate import (
     tuple_of,
 )
 from replay.inference.model import Model, Sensor
-from replay.inference.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Stage, Workspace
+from replay.inference.stage import Stage
+from replay.inference.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Workspace
 
 
 class Reading(NamedTuple):
@@ -89,7 +90,7 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
     if sensor.noises:
         inputs.append(Input("noise", ("linear",) * sensor.noises, "noise_gain", zero=True))
     kinds = tuple(sensor.measured.values())
-    return derivative(sensor.measure, inputs, kinds, ("about", "parameters"), "predicted")
+    return derivative(sensor.measure, inputs, kinds, "predicted")
 
 
 def linear_sensor(stage: Stage, number: int) -> Function:

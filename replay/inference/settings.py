@@ -1,19 +1,16 @@
 """The numbers that a model's functions read: given as parameters, or stated by a log's channels."""
 
-from collections import namedtuple
 from collections.abc import Mapping
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Topic
-from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.channels import stated
 from replay.inference.binding import Found
-from replay.inference.generate import function_of
 from replay.inference.model import (
     Model,
     ModelParameters,
@@ -25,33 +22,19 @@ from replay.inference.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.steps import Stage
-
-
-@cache
-def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """The parameters that model functions may read: all that are numbers."""
-    schema = parameters.model_json_schema()["properties"]
-    numeric = ("number", "integer", "boolean", "null")
-    return tuple(
-        name
-        for name, entry in schema.items()
-        if all(each.get("type") in numeric for each in entry.get("anyOf", [entry]))
-    )
-
-
-@lru_cache(maxsize=64)
-def settings_type(names: tuple[str, ...]) -> type[Any]:
-    """The NamedTuple that model functions get as their parameters."""
-    return namedtuple("Settings", names)
+from replay.inference.parameters import number_fields, settings_type
+from replay.inference.stage import Stage
 
 
 @lru_cache(maxsize=64)
 def reading_settings(names: tuple[str, ...]) -> Function:
     """`read(settings, row)`: a row of numbers as the NamedTuple."""
-    entries = ", ".join(f"settings[row, {index}]" for index in range(len(names)))
-    text = f"def read(settings, row):\n    return Settings({entries})\n"
-    return function_of(text, Settings=settings_type(names))
+    kind = settings_type(names)
+
+    def read(settings: Floats, row: int) -> Any:
+        return kind(*(settings[row, index] for index in range(len(names))))
+
+    return read
 
 
 def trial_parameters(model: Model) -> Any:

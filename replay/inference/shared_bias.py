@@ -15,11 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats
+from replay.engine.arrays import Booleans, Floats, varying
 from replay.inference.gaussian import cholesky
 from replay.inference.tracks import Tracks
 
 
+@varying(0, is_updated=1)
 class Pool(NamedTuple):
     """What sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
 

@@ -41,7 +41,8 @@ from replay.inference.smoothing import (
     no_later,
     smoothing_steps,
 )
-from replay.inference.steps import Stage, Steps
+from replay.inference.stage import Stage
+from replay.inference.steps import Steps
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file

@@ -25,7 +25,8 @@ from replay.inference.gaussian import copy_gaussian, moved_covariance, multiply,
 from replay.inference.generate import tangent_size
 from replay.inference.model import Correction
 from replay.inference.recursion import Estimates
-from replay.inference.steps import Note, Stage, Steps
+from replay.inference.stage import Stage
+from replay.inference.steps import Note, Steps
 
 FOREVER_NS = np.iinfo(np.int64).max
 

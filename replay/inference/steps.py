@@ -20,7 +20,8 @@ from replay.inference.generate import (
     adding_noise,
     tuple_of,
 )
-from replay.inference.model import Model, Motion, Sensor
+from replay.inference.model import Model
+from replay.inference.stage import Stage
 
 FAILURES = (
     "the covariance is no longer positive definite",
@@ -32,18 +33,6 @@ FAILURES = (
 # indices of FAILURES
 NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
 NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
-
-
-class Stage(NamedTuple):
-    """A model as a method takes it: its motion, and the sensors that the log has.
-
-    `modes` are the motions of all modes, in their order, for a method that takes all of them.
-    """
-
-    model: Model
-    motion: Motion
-    sensors: tuple[Sensor, ...]
-    modes: tuple[Motion, ...] = ()
 
 
 class Gaussian(NamedTuple):

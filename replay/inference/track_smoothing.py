@@ -12,7 +12,7 @@ import numpy as np
 from replay.engine.arrays import Floats, Integers
 from replay.inference.recursion import Estimates
 from replay.inference.smoothing import FOREVER_NS, Nodes, back_memory, going_back, no_later
-from replay.inference.steps import Stage
+from replay.inference.stage import Stage
 
 
 def smooth_tracks(

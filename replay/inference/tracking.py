@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.arrays import Floats, Function, Integers, varying
 from replay.engine.compile import compile_over_runs
 from replay.engine.tangent import tangent_components
 from replay.inference.association import ASSOCIATIONS
@@ -38,7 +38,8 @@ from replay.inference.scanning import (
 )
 from replay.inference.settings import reading_settings
 from replay.inference.shared_bias import pool_errors
-from replay.inference.steps import Gaussian, Stage, Steps, gaussian_filter
+from replay.inference.stage import Stage
+from replay.inference.steps import Gaussian, Steps, gaussian_filter
 from replay.inference.track_management import MANAGEMENTS, Evidence
 from replay.inference.tracks import NEVER, Tracks, are_near, drop, expected
 
@@ -81,6 +82,7 @@ class Newborn(NamedTuple):
     mode: Floats
 
 
+@varying(2)
 class Told(NamedTuple):
     """What is said after every scan; scan s of run r has the rows of that number.
 
@@ -250,7 +252,7 @@ def weighing(tracker: Tracker) -> Function:
     """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing(
-        [observing(model, kind) for kind in kinds],
+        [observing(model, kind, tracker.names) for kind in kinds],
         "track, mode, mean, covariance, origin, parameters, memory",
     )
     compare = choosing([comparing(kind) for kind in kinds], "track, mode, detection, memory")
@@ -396,7 +398,9 @@ def beginning(tracker: Tracker) -> Function:
     begins, birth_number, birth = births_of(kinds)
     correlate, read_pair = nothing, tuple_of(2)
     if shared_at < model.size:
-        correlations = [correlating(model, kind, corner) for kind in kinds if kind.birth is not None]
+        correlations = [
+            correlating(model, kind, corner, tracker.names) for kind in kinds if kind.birth is not None
+        ]
         correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:

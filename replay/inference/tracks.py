@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Booleans, Floats, Integers, varying
 from replay.inference.gaussian import copy_gaussian
 
 NEVER = -1
 
 
+@varying(2)
 class Tracks(NamedTuple):
     """The tracks of all runs, the oldest first: axes run and place, of which `used` are taken.
 

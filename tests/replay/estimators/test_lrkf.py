@@ -18,7 +18,8 @@ from replay.estimators.reactor import REACTOR
 from replay.inference.all_methods import METHODS
 from replay.inference.gaussian import no_innovation
 from replay.inference.regression import regression, sample_memory, sampled_sensor
-from replay.inference.steps import Gaussian, Stage
+from replay.inference.stage import stage_of
+from replay.inference.steps import Gaussian
 from replay.sampling import Samples, parse_sampling
 from replay.sampling.sets import SampleSets
 
@@ -93,7 +94,7 @@ POINT = SimpleNamespace(size_drift_m2=1e-4, position_drift_m2=1e-3, point_varian
 
 def predicted(method, mean, covariance, *samples):
     """One step of the reactor, uncompiled."""
-    steps = METHODS[method].steps(Stage(REACTOR, REACTOR.motion, REACTOR.sensors))
+    steps = METHODS[method].steps(stage_of(REACTOR, REACTOR.motion, REACTOR.sensors))
     belief = Gaussian(mean[None].copy(), covariance[None].copy())
     memory = steps.memory(tuple(as_sets(each) for each in samples))
     assert steps.predict(0, belief, np.empty(0), 1.0, STEP, 0, memory)
@@ -136,7 +137,7 @@ def innovated_exactly(mean, covariance, measured):
 
 def innovated(mean, covariance, measured, samples):
     """The same by samples of the target and of the noise."""
-    stage = Stage(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
+    stage = stage_of(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
     work = METHODS["lrkf"].steps(stage).memory((as_sets(samples),))
     assert sampled_sensor(stage, 0, 0)(mean, covariance, measured, POINT, 0, work)
     return work.innovations[0]

@@ -22,7 +22,7 @@ from replay.engine.replaying import collect
 from replay.engine.sources import MemorySource, memory_source
 from replay.estimators.scan_sensors import place_clutter, polar_clutter
 from replay.inference.association import existence_after, marginals
-from replay.inference.settings import settings_type
+from replay.inference.parameters import settings_type
 from replay.judging.track_errors import instants_of, track_errors, track_figures, tracks_at
 from tests.replay.estimators import scan_scenes
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2

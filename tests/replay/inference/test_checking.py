@@ -170,7 +170,10 @@ WRONG: dict[str, tuple[Model, str]] = {
         replace(VEHICLE_A, motion=replace(VEHICLE_A.motion, linear=True)),
         "move .* declared linear",
     ),
-    "no derivative": (with_speed(measure=by_math), "by_math .* no derivatives by jets"),
+    "no derivative": (
+        with_speed(measure=by_math),
+        "by_math .* it uses math.* of a number that is not known before; write np",
+    ),
     "too many components": (with_speed(measure=pair), "pair .* returns 2 components; 1 are needed"),
     "a negative variance": (with_speed(noise=negative), "negative .* gives a negative variance, -0.01"),
     "an indefinite covariance": (

@@ -1,6 +1,5 @@
 """What is asked of a model, and the one sentence where it, the log or the settings do not meet it."""
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -103,14 +102,15 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
 
 
 def told(state: Any, *_: Any) -> Any:
-    return (float(np.base_repr(3)),)  # which numba does not know
+    return (float(np.base_repr(int(state[0]))),)
 
 
-@pytest.mark.skipif("FUSELOG_UNCOMPILED" in os.environ, reason="nothing is compiled")
-def test_a_model_that_does_not_compile_is_named_with_its_line() -> None:
-    """The estimator, and the file and line of the model's function."""
+def test_a_model_that_cannot_be_traced_is_named_with_its_line(uncompiled: None) -> None:
+    """The estimator, the file and line of the model's function, and what to write instead."""
     line = told.__code__.co_firstlineno + 1
-    with pytest.raises(BadInput, match=rf"estimator test: kernel .* \({__file__}, line {line}\)"):
+    with pytest.raises(
+        BadInput, match=rf"estimator test: told \(test_contract.py, line {line}\): .*int\(\)"
+    ):
         outputs(with_sensor(SPEED, measure=told), "ekf", [SOURCE])
 
 

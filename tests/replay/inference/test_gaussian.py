@@ -17,13 +17,13 @@ from replay.inference.gaussian import cholesky
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
 from replay.inference.recursion import fault_of
 from replay.inference.sensor_steps import kalman_update
+from replay.inference.stage import stage_of
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Gaussian,
     Note,
-    Stage,
     Workspace,
     workspace,
 )
@@ -77,7 +77,7 @@ def correct(
     """The Kalman update by an innovation v with covariance S and cross-covariance C."""
     sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, all_linear("z", len(v)), nothing)
     motion = Motion(nothing)
-    stage = Stage(
+    stage = stage_of(
         Model("", all_linear("x", len(mean)), ModelParameters, (sensor,), motion), motion, (sensor,)
     )
 
@@ -172,7 +172,7 @@ class Linear(NamedTuple):
     control: Floats
     look: Floats
 
-    def stage(self) -> Stage:
+    def stage(self) -> Any:
         """As component-first functions."""
         states, controls, components = len(self.transition), self.control.shape[1], len(self.look)
 
@@ -197,7 +197,7 @@ class Linear(NamedTuple):
         control = Control("control", schema, names("u", controls))
         state = all_linear("x", states)
         model = Model("", state, ModelParameters, (sensor,), motion, control=control)
-        return Stage(model, motion, (sensor,))
+        return stage_of(model, motion, (sensor,))
 
 
 def one_set(dimension: int, kappa: float) -> SampleSets:

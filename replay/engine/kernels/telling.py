@@ -1,0 +1,40 @@
+"""Says that a kernel is compiled, where that takes long."""
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from multiprocessing import parent_process
+from threading import Timer
+
+_LOG = logging.getLogger("fuselog")
+_PATIENCE_S = 1.0  # what compiles in less time is not told of
+
+
+@contextmanager
+def compiling(title: str) -> Iterator[None]:
+    """Say what is compiled where that takes longer than a second."""
+    patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
+    patience.daemon = True
+    patience.start()
+    try:
+        yield
+    finally:
+        patience.cancel()
+
+
+def _say(sentence: str) -> None:
+    """By the program's logging, as the command line sets it up; else on standard error, each once.
+
+    Not from a worker process, whose parent is what somebody watches.
+    """
+    if _LOG.hasHandlers():
+        _LOG.info(sentence)
+    elif parent_process() is None:
+        _print_once(sentence)
+
+
+@cache
+def _print_once(sentence: str) -> None:
+    print(f"fuselog: {sentence}", file=sys.stderr, flush=True)

@@ -1,0 +1,5 @@
+"""Models as expression graphs: each function is called once with traced numbers, and is known then.
+
+From the graph of a function come its exact derivatives (`derivatives`), its machine code (`emission`),
+its Python and its formulas (`text`). Begin reading in `functions`, which is what models are wrapped in.
+"""

@@ -1,0 +1,358 @@
+"""Functions of models, traced: called as they are where kernels are plain Python, graphs elsewhere.
+
+A model's function takes tuples of numbers, numbers, parameters (a NamedTuple of numbers), and sometimes
+arrays that it changes; it returns a tuple of numbers, or one number. What it is given is described by
+`Argument`s. It is called once for every way through its conditions, which selections join.
+"""
+
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.kernels.identity import identity
+from replay.engine.kernels.numbers import REAL, Emitter, Number, constant
+from replay.engine.kernels.program import Instance, Program, called
+from replay.engine.kernels.values import Array, Record, entries, load, part_of, store
+from replay.tracing.derivatives import slopes_of
+from replay.tracing.emission import emit, python_of
+from replay.tracing.graph import INPUT, Graph, Node, described, needed
+from replay.tracing.traced import CannotTrace, Trace
+
+MOST_WAYS = 256
+
+
+class Shape(NamedTuple):
+    """An array of these sizes, which the function reads and changes."""
+
+    sizes: tuple[int, ...]
+
+
+# a tuple of so many numbers; a number (None); the names of parameters; an array
+Argument = int | tuple[str, ...] | Shape | None
+
+
+class Result(NamedTuple):
+    """What a function gives: the nodes it returns, and whether they are one number and no tuple.
+
+    `written` are the entries of arrays that it changes: argument, place, and the node.
+    """
+
+    returned: tuple[Node, ...]
+    is_number: bool
+    written: tuple[tuple[int, tuple[int, ...], Node], ...]
+
+
+class TracedFunction:
+    """A function of a model, with its graph."""
+
+    def __init__(self, function: Callable[..., Any], arguments: Sequence[Argument]) -> None:
+        self.function = function
+        self.arguments = tuple(arguments)
+        self.__name__ = getattr(function, "__name__", "function")
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function itself."""
+        return self.function(*arguments)
+
+    @cached_property
+    def graph(self) -> Graph:
+        """The graph, with that of derivatives as they are asked for."""
+        return Graph()
+
+    @cached_property
+    def result(self) -> Result:
+        """Trace the function; raises BadInput with its line, and the mend, where that cannot be."""
+        return trace(self.graph, self.function, self.arguments)
+
+    @property
+    def outputs(self) -> list[Node]:
+        """All that it returns and writes."""
+        return [*self.result.returned, *(node for _, _, node in self.result.written)]
+
+    def kernel_identity(self) -> str:
+        """What is part of a kernel's key: the graph."""
+        where = [(argument, place) for argument, place, _ in self.result.written]
+        return _digest(
+            [repr(self.arguments), repr(where), str(self.result.is_number), *described(self.outputs)]
+        )
+
+    def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
+        """Write a call of it; see `replay.engine.kernels.expressions`."""
+        numbers = _called(program, emitter, self, self.outputs, arguments)
+        count = len(self.result.returned)
+        for (argument, place, _), number in zip(self.result.written, numbers[count:], strict=True):
+            store(emitter, part_of(emitter, arguments[argument], place), number)
+        if self.result.is_number:
+            return numbers[0]
+        return tuple(numbers[:count]) if count or not self.result.written else None
+
+
+class Derivative:
+    """The values of a traced function and chosen derivatives, as one function that returns a tuple.
+
+    Args:
+        function: the function.
+        seeds: (trace, inputs of all arguments) -> of every input how it changes with the variables.
+        combine: (trace, returned nodes, their slopes) -> the derivatives that are wanted, by place; what
+            is not in there is zero.
+    """
+
+    def __init__(
+        self,
+        function: TracedFunction,
+        seeds: Callable[[Trace], dict[Node, dict[int, Node]]],
+        combine: Callable[[Trace, Sequence[Node], Sequence[dict[int, Node]]], dict[Any, Node]],
+    ) -> None:
+        self.function = function
+        self._seeds = seeds
+        self._combine = combine
+        self.__name__ = f"derivative_of_{function.__name__}"
+
+    @cached_property
+    def entries(self) -> dict[Any, Node]:
+        """The derivatives by place; zero where there is none."""
+        trace = Trace(self.function.graph, {})
+        returned = self.function.result.returned
+        slopes = slopes_of(trace, returned, self._seeds(trace))
+        found = self._combine(trace, returned, slopes)
+        return {place: node for place, node in found.items() if not node.is_number(0.0)}
+
+    @property
+    def places(self) -> tuple[Any, ...]:
+        """Where the numbers behind the values belong."""
+        return tuple(self.entries)
+
+    @property
+    def outputs(self) -> list[Node]:
+        """The values and then the derivatives."""
+        return [*self.function.result.returned, *self.entries.values()]
+
+    def kernel_identity(self) -> str:
+        """What is part of a kernel's key."""
+        return _digest([repr(self.function.arguments), repr(self.places), *described(self.outputs)])
+
+    def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
+        """Write a call of it."""
+        return tuple(_called(program, emitter, self.function, self.outputs, arguments))
+
+    def __call__(self, *arguments: Any) -> tuple[float, ...]:
+        """The values as the function itself gives them, and the derivatives by the graph."""
+        places, compute = self._computed
+        return (*self.function(*arguments), *compute([_at(arguments, place) for place in places]))
+
+    @cached_property
+    def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
+        """The places of the inputs that the derivatives need, and the derivatives of these in Python."""
+        nodes = list(self.entries.values())
+        places = [node.value for node in needed(nodes) if node.operation == INPUT]
+        names = {place: f"x{index}" for index, place in enumerate(places)}
+        lines = [f"    {name} = np.float64(given[{index}])" for index, name in enumerate(names.values())]
+        lines += [f"    {line}" for line in python_of(nodes, names)]
+        scope: dict[str, Any] = {"np": np}
+        exec("\n".join(["def computed(given):", *lines]), scope)
+        return places, scope["computed"]
+
+
+def arguments_like(values: Sequence[Any]) -> tuple[Argument, ...]:
+    """How arguments such as these are described."""
+    return tuple(
+        (getattr(each, "_fields", None) or len(each)) if isinstance(each, tuple) else None
+        for each in values
+    )
+
+
+# --- calls in kernels -------------------------------------------------------------------------------
+
+
+def _called(
+    program: Program,
+    emitter: Emitter,
+    function: TracedFunction,
+    outputs: Sequence[Node],
+    arguments: Sequence[Any],
+) -> list[Number]:
+    """The numbers of a graph's outputs: a function of its own, of the inputs that they need."""
+    places = [node.value for node in needed(outputs) if node.operation == INPUT]
+    key = "graph", *places, *described(outputs)
+    if key not in program.instances:
+        body = Emitter()
+        inputs = {place: Number(REAL, f"%a{index}") for index, place in enumerate(places)}
+        found = emit(body, outputs, inputs)
+        parameters = [[(REAL, each.code)] for each in inputs.values()]
+        program.instances[key] = program.define(function.__name__, body, parameters, tuple(found))
+    instance: Instance = program.instances[key]
+    given = [_number(emitter, function.arguments, arguments, place) for place in places]
+    return list(called(emitter, instance, given))
+
+
+def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any], place: Any) -> Number:
+    """The number of an argument at a place."""
+    argument, entry = place
+    value = arguments[argument]
+    if isinstance(value, Array):
+        return load(emitter, part_of(emitter, value, entry))
+    if isinstance(value, Record) and isinstance(kinds[argument], tuple):
+        value = value.get(entry)
+    elif entry is not None:
+        found = entries(value)
+        assert found is not None
+        value = found[entry]
+    return emitter.as_kind(value, REAL) if isinstance(value, Number) else constant(float(value))
+
+
+def _at(arguments: Sequence[Any], place: Any) -> float:
+    """The number of an argument at a place, in Python."""
+    argument, entry = place
+    value = arguments[argument]
+    if entry is None:
+        return value
+    return getattr(value, entry) if isinstance(entry, str) else value[entry]
+
+
+# --- tracing ----------------------------------------------------------------------------------------
+
+
+class _Parameters:
+    """The parameters of a function that is traced."""
+
+    def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
+        self._trace, self._argument, self._names = trace, argument, names
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name not in self._names:
+            raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._names)}")
+        return self._trace.number(self._trace.graph.input((self._argument, name)))
+
+    def __iter__(self) -> Iterator[Any]:
+        return (getattr(self, name) for name in self._names)
+
+
+def _given(trace: Trace, argument: int, kind: Argument) -> Any:
+    graph = trace.graph
+    if kind is None:
+        return trace.number(graph.input((argument, None)))
+    if isinstance(kind, Shape):
+        array = np.empty(kind.sizes, object)
+        for index in np.ndindex(kind.sizes):
+            array[index] = trace.number(graph.input((argument, index)))
+        return array
+    if isinstance(kind, int):
+        return tuple(trace.number(graph.input((argument, entry))) for entry in range(kind))
+    return _Parameters(trace, argument, kind)
+
+
+def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argument]) -> Result:
+    """Call a function with traced numbers, every way through its conditions.
+
+    Raises BadInput where it does what no graph holds: with the line, and what to write instead.
+    """
+    ways = 0
+
+    def follow(decisions: dict[Node, bool]) -> Result:
+        nonlocal ways
+        ways += 1
+        if ways > MOST_WAYS:
+            raise CannotTrace(
+                f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that "
+                "are not known before; write np.clip or np.where, and a fixed number of rounds"
+            )
+        here = Trace(graph, dict(decisions))
+        given = [_given(here, index, kind) for index, kind in enumerate(arguments)]
+        with np.errstate(all="ignore"):
+            found = _result(here, function(*given), given)
+        for index in reversed(range(len(here.more))):
+            before = dict.fromkeys(here.more[:index], True)
+            other = follow({**decisions, **before, here.more[index]: False})
+            found = _joined(graph, here.more[index], found, other)
+        return found
+
+    try:
+        return follow({})
+    except RecursionError as error:
+        raise BadInput(
+            f"{_where(function, error)}: it has a loop that does not end; use fixed rounds"
+        ) from error
+    except Exception as error:
+        said = (
+            str(error)
+            if isinstance(error, CannotTrace | BadInput)
+            else f"{type(error).__name__}: {error}"
+        )
+        raise BadInput(f"{_where(function, error)}: {said}") from error
+
+
+def _result(trace: Trace, returned: Any, given: Sequence[Any]) -> Result:
+    is_number = not isinstance(returned, tuple | list | np.ndarray | None)
+    listed = [] if returned is None else [returned] if is_number else list(returned)
+    written = []
+    for argument, array in enumerate(given):
+        if isinstance(array, np.ndarray):
+            for index in np.ndindex(array.shape):
+                node = trace.node_of(array[index])
+                if node is not trace.graph.input((argument, index)):
+                    written.append((argument, index, node))
+    return Result(tuple(map(trace.node_of, listed)), is_number, tuple(written))
+
+
+def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
+    if len(yes.returned) != len(no.returned):
+        raise CannotTrace(
+            f"it returns {len(yes.returned)} numbers on one way and {len(no.returned)} on another"
+        )
+    returned = tuple(
+        graph.select(condition, *both) for both in zip(yes.returned, no.returned, strict=True)
+    )
+    places = dict.fromkeys(
+        (argument, place) for part in (yes, no) for argument, place, _ in part.written
+    )
+    own = [{(argument, place): node for argument, place, node in part.written} for part in (yes, no)]
+    written = tuple(
+        (*place, graph.select(condition, *(part.get(place, graph.input(place)) for part in own)))
+        for place in places
+    )
+    return Result(returned, yes.is_number, written)
+
+
+def _where(function: Callable[..., Any], error: Exception) -> str:
+    """A function's name, with the file and line at which its own code stopped."""
+    code = getattr(function, "__code__", None)
+    name = getattr(function, "__name__", "a model's function")
+    own = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if Path(frame.filename).parent != Path(__file__).parent and "numpy" not in frame.filename
+    ]
+    if own:
+        return f"{name} ({Path(own[-1].filename).name}, line {own[-1].lineno})"
+    return f"{name} ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else name
+
+
+def _digest(words: Sequence[str]) -> str:
+    return sha256("\n".join(words).encode()).hexdigest()
+
+
+_KNOWN: dict[Any, tuple[str, TracedFunction, Any]] = {}
+
+
+def traced(function: Any, *arguments: Argument) -> Any:
+    """A function as a traced one; the same again while it, and what it uses, has not changed.
+
+    None for None, and what is traced already is as it was.
+    """
+    if function is None or isinstance(function, TracedFunction):
+        return function
+    key = id(function), arguments
+    own = identity(function) if isinstance(function, FunctionType) else ""
+    known = _KNOWN.get(key)
+    if known is None or known[0] != own or known[2] is not function:
+        made = TracedFunction(function, arguments)
+        made.result  # noqa: B018 - what cannot be traced is said here
+        known = _KNOWN[key] = own, made, function
+    return known[1]

@@ -1,0 +1,181 @@
+"""Expression graphs: numbers that are made of others, each once, with what is known folded.
+
+A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. Zero times anything is
+zero here, so that what does not depend on something costs nothing.
+"""
+
+import math
+import operator
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from recorders.errors import BadInput
+
+MOST_NODES = 200_000
+INPUT, CONSTANT, POWER, SELECT = "input", "constant", "power", "select"
+_COMPARISONS = (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
+_TRUTHS = (
+    *_COMPARISONS,
+    np.isnan,
+    np.isfinite,
+    np.isinf,
+    np.signbit,
+    operator.and_,
+    operator.or_,
+    operator.xor,
+    operator.not_,
+)
+
+
+class Node:
+    """A number or a truth: an operation, what it is applied to, and a constant that goes with it."""
+
+    __slots__ = ("arguments", "is_truth", "number", "operation", "value")
+
+    def __init__(self, number: int, operation: Any, arguments: tuple["Node", ...], value: Any) -> None:
+        self.number = number
+        self.operation = operation
+        self.arguments = arguments
+        self.value = value
+        self.is_truth: bool = operation in _TRUTHS or (operation is CONSTANT and isinstance(value, bool))
+        if operation is SELECT:
+            self.is_truth = arguments[1].is_truth
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether its value is known."""
+        return self.operation is CONSTANT
+
+    def is_number(self, value: float) -> bool:
+        """Whether it is known to be this number."""
+        return self.operation is CONSTANT and not self.is_truth and self.value == value
+
+
+class Graph:
+    """The nodes of one function, in the order in which they can be computed."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._known: dict[Any, Node] = {}
+
+    def _node(self, operation: Any, arguments: tuple[Node, ...], value: Any, key: Any) -> Node:
+        found = self._known.get(key)
+        if found is None:
+            if len(self.nodes) == MOST_NODES:
+                raise BadInput(
+                    f"it takes more than {MOST_NODES:,} operations, loops written out; use fewer rounds"
+                )
+            found = self._known[key] = Node(len(self.nodes), operation, arguments, value)
+            self.nodes.append(found)
+        return found
+
+    def input(self, place: Any) -> Node:
+        """What is handed in."""
+        return self._node(INPUT, (), place, (INPUT, place))
+
+    def constant(self, value: Any) -> Node:
+        """A number, or a truth."""
+        value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
+        sign = math.copysign(1.0, value)
+        return self._node(CONSTANT, (), value, (CONSTANT, type(value), sign, repr(value)))
+
+    def power(self, base: Node, exponent: int) -> Node:
+        """A number to the power of an integer: by multiplication."""
+        if exponent == 1:
+            return base
+        if exponent == 0:
+            return self.constant(1.0)
+        if base.is_constant:
+            return self.constant(_power(base.value, exponent))
+        return self._node(POWER, (base,), exponent, (POWER, base.number, exponent))
+
+    def select(self, condition: Node, yes: Node, no: Node) -> Node:
+        """One of two; the other is no part of the result, whatever it is."""
+        if condition.is_constant:
+            return yes if condition.value else no
+        if yes is no:
+            return yes
+        return self._node(
+            SELECT, (condition, yes, no), None, (SELECT, condition.number, yes.number, no.number)
+        )
+
+    def apply(self, operation: Any, *arguments: Node) -> Node:
+        """An operation on nodes, or what is known to be the same."""
+        if all(each.is_constant for each in arguments):
+            return self.constant(evaluated(operation, *(each.value for each in arguments)))
+        simpler = self._simpler(operation, arguments)
+        if simpler is not None:
+            return simpler
+        key = operation, *(each.number for each in arguments)
+        return self._node(operation, arguments, None, key)
+
+    def _simpler(self, operation: Any, arguments: tuple[Node, ...]) -> Node | None:
+        if operation is operator.neg:
+            inner = arguments[0]
+            return inner.arguments[0] if inner.operation is operator.neg else None
+        if len(arguments) != 2 or any(each.is_truth for each in arguments):
+            return None
+        x, y = arguments
+        if operation is operator.add:
+            return y if x.is_number(0.0) else x if y.is_number(0.0) else None
+        if operation is operator.sub:
+            if y.is_number(0.0):
+                return x
+            return self.apply(operator.neg, y) if x.is_number(0.0) else None
+        if operation is operator.mul:
+            if x.is_number(0.0) or y.is_number(0.0):
+                return self.constant(0.0)
+            for one, other in ((x, y), (y, x)):
+                if one.is_number(1.0):
+                    return other
+                if one.is_number(-1.0):
+                    return self.apply(operator.neg, other)
+        if operation is operator.truediv and y.is_number(1.0):
+            return x
+        return None
+
+
+def evaluated(operation: Any, *values: Any) -> Any:
+    """What an operation gives for numbers; infinity and NaN without a word, as compiled code."""
+    with np.errstate(all="ignore"):
+        if operation in (operator.not_, operator.and_, operator.or_, operator.xor):
+            return operation(*values)
+        return operation(*(each if isinstance(each, bool) else np.float64(each) for each in values))
+
+
+def _power(base: float, exponent: int) -> float:
+    """As compiled code multiplies: by squaring."""
+    found, square, rest = None, base, abs(exponent)
+    while rest:
+        if rest & 1:
+            found = square if found is None else found * square
+        rest >>= 1
+        if rest:
+            square = square * square
+    assert found is not None
+    return found if exponent > 0 else float(np.float64(1.0) / found)
+
+
+def needed(outputs: Iterable[Node]) -> list[Node]:
+    """All nodes that some are made of, and these, in the order in which they can be computed."""
+    found: set[Node] = set()
+    waiting = list(outputs)
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.add(node)
+            waiting += node.arguments
+    return sorted(found, key=lambda node: node.number)
+
+
+def described(outputs: Iterable[Node]) -> Iterator[str]:
+    """Words that are the same for the same graph, whatever else was traced with it."""
+    outputs = list(outputs)
+    places: dict[Node, int] = {}
+    for node in needed(outputs):
+        places[node] = len(places)
+        name = node.operation if isinstance(node.operation, str) else node.operation.__name__
+        yield f"{name} {[places[each] for each in node.arguments]} {node.value!r}"
+    yield str([places[each] for each in outputs])

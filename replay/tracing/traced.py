@@ -1,0 +1,285 @@
+"""Traced numbers: what a model's function is called with so that its graph is known afterwards.
+
+They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects. A
+condition that depends on them is tried both ways (see `functions`). What would freeze a value that is
+not known, such as float() or an index, is refused with the mend.
+"""
+
+import linecache
+import operator
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from replay.tracing.graph import Graph, Node
+
+
+class CannotTrace(TypeError):
+    """What a function does that no graph holds, and what to write instead."""
+
+
+_MENDS = {
+    "float()": "leave the number as it is, or write np.where(condition, a, b)",
+    "int()": "write np.floor or np.trunc, and no index",
+    "an index": "write np.interp(x, table_x, table_y), np.take(table, x) or np.where",
+    "math.*": "write np.* of it",
+}
+
+
+def refused(what: str) -> CannotTrace:
+    """The sentence for something that is refused."""
+    return CannotTrace(f"it uses {what} of a number that is not known before; {_MENDS[what]}")
+
+
+class Traced(np.lib.mixins.NDArrayOperatorsMixin):
+    """A number of a graph that grows as it is used."""
+
+    __slots__ = ("node", "trace")
+
+    def __init__(self, trace: "Trace", node: Node) -> None:
+        self.trace = trace
+        self.node = node
+
+    def __repr__(self) -> str:
+        return f"traced number {self.node.number}"
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        options.pop("out", None)  # of `x += y`, for which a new number does as well
+        if method != "__call__" or options:
+            raise CannotTrace(f"it uses np.{ufunc.__name__}.{method}; write it with operators")
+        return apply(ufunc, inputs)
+
+    def __array_function__(self, function: Any, _: Any, inputs: Any, options: dict[str, Any]) -> Any:
+        return apply(function, (*inputs, *options.values()) if function is np.clip else inputs, options)
+
+    def __bool__(self) -> bool:
+        return self.trace.decided(self)
+
+    def __round__(self, decimals: int = 0) -> Any:
+        return apply(np.round, (self, decimals) if decimals else (self,))
+
+    def __divmod__(self, other: Any) -> Any:
+        return self // other, self % other
+
+    def __float__(self) -> float:
+        frame = sys._getframe(1)
+        line = linecache.getline(frame.f_code.co_filename, frame.f_lineno)
+        raise refused("float()" if "float(" in line else "math.*")
+
+    def __int__(self) -> int:
+        raise refused("int()")
+
+    def __index__(self) -> int:
+        raise refused("an index")
+
+    def __hash__(self) -> int:
+        return hash(self.node)
+
+
+class Trace:
+    """One call of a function with traced numbers: the graph, and the way through its conditions."""
+
+    def __init__(self, graph: Graph, decisions: dict[Node, bool]) -> None:
+        self.graph = graph
+        self.decisions = decisions  # of conditions, in the order in which they were met
+        self.more: list[Node] = []  # conditions met that were not decided before
+
+    def decided(self, number: Traced) -> bool:
+        """Which way is taken at a condition: a new one holds, and is tried the other way later."""
+        node = (
+            number.node
+            if number.node.is_truth
+            else self.graph.apply(operator.ne, number.node, self.graph.constant(0.0))
+        )
+        if node.is_constant:
+            return bool(node.value)
+        if node not in self.decisions:
+            self.decisions[node] = True
+            self.more.append(node)
+        return self.decisions[node]
+
+    def number(self, node: Node) -> Traced:
+        """A node as a traced number."""
+        return Traced(self, node)
+
+    def node_of(self, value: Any) -> Node:
+        """The node of a traced number or a known one."""
+        if isinstance(value, Traced):
+            return value.node
+        return self.graph.constant(value)
+
+
+def where(condition: Any, yes: Any, no: Any) -> Any:
+    """One of two numbers, of which the other may be anything."""
+    numbers = [each for each in (condition, yes, no) if isinstance(each, Traced)]
+    if not numbers:
+        return yes if condition else no
+    trace = numbers[0].trace
+    test = trace.node_of(condition)
+    if not test.is_truth:
+        test = trace.graph.apply(operator.ne, test, trace.graph.constant(0.0))
+    return trace.number(trace.graph.select(test, trace.node_of(yes), trace.node_of(no)))
+
+
+def _interpolated(x: Any, table_x: Any, table_y: Any) -> Any:
+    """`np.interp` over a table that is known: the straight line of the last knot before x."""
+    known_x, known_y = np.asarray(table_x, float), np.asarray(table_y, float)
+    found: Any = float(known_y[0])
+    for k in range(len(known_x) - 1):
+        slope = (known_y[k + 1] - known_y[k]) / (known_x[k + 1] - known_x[k])
+        found = where(
+            x >= float(known_x[k]), float(slope) * (x - float(known_x[k])) + float(known_y[k]), found
+        )
+    return where(x >= float(known_x[-1]), float(known_y[-1]), found)
+
+
+def _sorted_in(table: Any, x: Any, side: str = "left") -> Any:
+    """`np.searchsorted` in a table that is known: how many of its numbers are less."""
+    count: Any = 0.0
+    for each in np.asarray(table, float).tolist():
+        count = count + where(x > each if side == "left" else x >= each, 1.0, 0.0)
+    return count
+
+
+def _taken(table: Any, index: Any) -> Any:
+    """`np.take` of a table that is known."""
+    numbers = np.asarray(table, float).tolist()
+    found: Any = numbers[0]
+    for place, each in enumerate(numbers[1:], 1):
+        found = where(index >= float(place), each, found)
+    return found
+
+
+def _log_of_sum(x: Any, y: Any) -> Any:
+    """`np.logaddexp`."""
+    larger, less = where(x > y, x, y), where(x > y, y, x)
+    return where(x == y, x + np.log(2.0), larger + np.log1p(np.exp(less - larger)))
+
+
+# What is made of other functions, each a true choice: NaN in what is not chosen stays there.
+_COMPOSED: dict[Any, Callable[..., Any]] = {
+    np.where: where,
+    np.minimum: lambda x, y: where((x <= y) | np.isnan(x), x, y),
+    np.maximum: lambda x, y: where((x >= y) | np.isnan(x), x, y),
+    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    np.divmod: lambda x, y: (x // y, x % y),
+    np.square: lambda x: x * x,
+    np.reciprocal: lambda x: 1.0 / x,
+    np.positive: lambda x: x,
+    np.deg2rad: lambda x: x * (np.pi / 180.0),
+    np.radians: lambda x: x * (np.pi / 180.0),
+    np.rad2deg: lambda x: x * (180.0 / np.pi),
+    np.degrees: lambda x: x * (180.0 / np.pi),
+    np.interp: _interpolated,
+    np.searchsorted: _sorted_in,
+    np.take: _taken,
+    np.logaddexp: _log_of_sum,
+}
+_OPERATORS: dict[Any, Any] = {
+    np.add: operator.add,
+    np.subtract: operator.sub,
+    np.multiply: operator.mul,
+    np.true_divide: operator.truediv,
+    np.negative: operator.neg,
+    np.less: operator.lt,
+    np.less_equal: operator.le,
+    np.greater: operator.gt,
+    np.greater_equal: operator.ge,
+    np.equal: operator.eq,
+    np.not_equal: operator.ne,
+    np.logical_and: operator.and_,
+    np.bitwise_and: operator.and_,
+    np.logical_or: operator.or_,
+    np.bitwise_or: operator.or_,
+    np.logical_not: operator.not_,
+    np.invert: operator.not_,
+    np.remainder: operator.mod,
+    np.floor_divide: operator.floordiv,
+    np.around: np.rint,
+    np.round: np.rint,
+    np.fabs: np.absolute,
+}
+# What a graph holds as it is, beside the operators.
+PRIMITIVES = (
+    *(np.sqrt, np.cbrt, np.hypot, np.exp, np.exp2, np.expm1, np.log, np.log2, np.log10, np.log1p),
+    *(np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.arctan2, np.sinc),
+    *(np.sinh, np.cosh, np.tanh, np.arcsinh, np.arccosh, np.arctanh),
+    *(np.absolute, np.sign, np.copysign, np.fmod, np.floor, np.ceil, np.trunc, np.rint),
+    *(np.isnan, np.isfinite, np.isinf, np.signbit),
+)
+_LOGICAL = (operator.and_, operator.or_, operator.not_)
+
+
+def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None = None) -> Any:
+    """What a function of NumPy's gives for traced and other numbers, or arrays of them."""
+    if function in (np.interp, np.searchsorted, np.take):
+        tables, numbers = (
+            [each for each in inputs if np.ndim(each)],
+            [each for each in inputs if not np.ndim(each)],
+        )
+        if any(isinstance(entry, Traced) for table in tables for entry in np.ravel(table)):
+            raise CannotTrace(f"it uses np.{function.__name__} of a table that is not known before")
+        if len(numbers) + len(tables) == len(inputs):
+            return _COMPOSED[function](*inputs, **(options or {}))
+    if any(np.ndim(each) for each in inputs if not isinstance(each, Traced)):
+        return _over_arrays(function, inputs)
+    if function in _COMPOSED:
+        return _COMPOSED[function](*inputs)
+    trace = next(each.trace for each in inputs if isinstance(each, Traced))
+    if function is np.power:
+        return _power(trace, *inputs)
+    operation = _OPERATORS.get(function, function)
+    if operation not in PRIMITIVES and function not in _OPERATORS:
+        raise CannotTrace(
+            f"it uses np.{getattr(function, '__name__', function)} of a number that is not known before"
+        )
+    if operation is np.rint and len(inputs) == 2:
+        scale = 10.0 ** inputs[1]
+        return apply(np.rint, (inputs[0] * scale,)) / scale
+    nodes = [trace.node_of(each) for each in inputs]
+    if operation in _LOGICAL:
+        nodes = [
+            each if each.is_truth else trace.graph.apply(operator.ne, each, trace.graph.constant(0.0))
+            for each in nodes
+        ]
+    return trace.number(trace.graph.apply(operation, *nodes))
+
+
+def _power(trace: Trace, base: Any, exponent: Any) -> Any:
+    """A power; of an integer by multiplication, as in Python's source."""
+    if isinstance(exponent, int | np.integer):
+        return trace.number(trace.graph.power(trace.node_of(base), int(exponent)))
+    return trace.number(trace.graph.apply(np.power, trace.node_of(base), trace.node_of(exponent)))
+
+
+def _over_arrays(function: Any, inputs: tuple[Any, ...]) -> Any:
+    boxed = []
+    for each in inputs:
+        box = np.empty((), object)
+        if isinstance(each, Traced):
+            box[()] = each
+        else:
+            box = np.asarray(each, object)
+        boxed.append(box)
+    parts = np.broadcast_arrays(*boxed)
+    found = np.empty(parts[0].shape, object)
+    for index in np.ndindex(found.shape):
+        found[index] = function(*(part[index] for part in parts))
+    return found
+
+
+def _methods() -> None:
+    """What NumPy calls of the objects in an array, such as `x.sin()`."""
+
+    def method(function: Any) -> Callable[..., Any]:
+        return lambda *inputs: apply(function, inputs)
+
+    for function in (*PRIMITIVES, *_COMPOSED, *_OPERATORS):
+        name = function.__name__
+        if not hasattr(Traced, name):
+            setattr(Traced, name, method(function))
+
+
+_methods()
