@@ -5,11 +5,12 @@ bytes at a time.
 Source: the MCAP specification (mcap.dev/spec), records Message, Schema and Channel.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from numba import njit
 from numpy.typing import NDArray
 
 # Opcode and length of a record; then channel, sequence and two clocks of a message.
@@ -56,14 +57,15 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
 
 def scan(data: NDArray[np.uint8]) -> Scan:
     """Walk the records of a chunk."""
-    return Scan(*_scan(_words(data), len(data)))
+    return Scan(*_compiled(_scan)(_words(data), len(data)))
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
     """Whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
     if offsets[-1] + pattern.size > len(data):
         return False
-    return bool(_agree(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
+    agreed = _compiled(_agree)
+    return bool(agreed(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
 
 
 def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -72,7 +74,14 @@ def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
 
 
-@njit(cache=True, nogil=True)
+@cache
+def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
+    """A loop, compiled by numba, which takes longer to import than to say what a log holds."""
+    from numba import njit
+
+    return njit(cache=True, nogil=True)(loop)
+
+
 def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
     found = np.empty(size // MESSAGE_HEAD_BYTES, np.int64)
     channel_ids = np.empty(len(found), np.uint16)
@@ -116,7 +125,6 @@ def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
     )
 
 
-@njit(cache=True, nogil=True)
 def _agree(words, offsets, places, expected, mask):  # type: ignore[no-untyped-def]
     for offset in offsets:
         wrong = np.uint64(0)

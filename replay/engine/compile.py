@@ -6,7 +6,8 @@ become one module, whose compiled code is kept in the user's cache under the has
 model is a new file, a known one loads in a fraction of a second. Kernels stay plain Python functions,
 which also run uncompiled.
 
-`bundling` gathers sources, `inlining` compiles the inner functions, `keeping` keeps compiled code.
+`bundling` gathers sources, `inlining` compiles the inner functions, `keeping` keeps compiled code. numba
+takes long to import: only what compiles or loads a kernel does.
 """
 
 import collections
@@ -21,20 +22,12 @@ from itertools import pairwise
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
-import numba
 import numpy as np
-from numba.core.errors import NumbaError
 
 from replay.engine.bundling import Bundle, DoesNotCompile
-from replay.engine.inlining import Inlined
-from replay.engine.keeping import execute, load
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-
-# Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
-_PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
-vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inlined)
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -128,6 +121,8 @@ def _over_runs(
     hint: str,
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+    import numba
+    from numba.core.errors import NumbaError
 
     def work(pieces: Iterator[tuple[int, int]]) -> None:
         memory = [scratch()] if scratch else []
@@ -167,6 +162,8 @@ def _over_runs(
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
     """The threads beside the calling one; a forked process has none of its parent's."""
+    import numba
+
     return ThreadPoolExecutor(max(1, numba.config.NUMBA_NUM_THREADS - 1))  # type: ignore[attr-defined]
 
 
@@ -178,9 +175,24 @@ def _compile(
     bundle: Bundle, called: str, definition: str, function: Callable[..., Any]
 ) -> Callable[..., Any]:
     """The function `kernel` that calls one that a bundle holds, which is made of `function`."""
+    from replay.engine.keeping import execute, load
+
+    parts = _parts()
     for own, source in bundle.definitions.items():
-        if own not in vars(_PARTS):
-            execute(source, own, _PARTS)
-    needed = f"import numba\nfrom {_PARTS.__name__} import {called}"
+        if own not in vars(parts):
+            execute(source, own, parts)
+    needed = f"import numba\nfrom {parts.__name__} import {called}"
     text = f"{needed}\n@numba.njit(nogil=True, {bundle.options})\n{definition}\n"
     return load(text, f"{function.__module__}.{function.__name__}")
+
+
+@cache
+def _parts() -> ModuleType:
+    """Where what kernels are made of is defined, each once; compiled code that was kept looks there."""
+    import numba
+
+    from replay.engine.inlining import Inlined
+
+    parts = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
+    vars(parts).update(collections=collections, numba=numba, numpy=np, Inlined=Inlined)
+    return parts
