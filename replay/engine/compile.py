@@ -15,7 +15,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, lru_cache, partial, wraps
 from itertools import pairwise
@@ -87,7 +87,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         run_once,
     )
     hint = "" if allocates else " (a kernel that makes arrays is compiled with allocates=True)"
-    return partial(_over_runs, name=run_once.__name__, loop=loop, places=bundle.places, hint=hint)
+    return partial(_over_runs, name=run_once.__name__, loop=loop, place=bundle.place, hint=hint)
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -117,7 +117,7 @@ def _over_runs(
     own: Sequence[Any] | None = None,
     name: str,
     loop: Callable[..., None],
-    places: Mapping[tuple[str, int], str],
+    place: Callable[[str, int], str],
     hint: str,
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
@@ -155,8 +155,8 @@ def _over_runs(
         reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
         reason = re.sub(r",? ?(defined )?at \w+_[0-9a-f]{16} \(\d+\)", "", reason)
         line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', said)
-        place = places.get((line[1], int(line[2])), "") if line else ""
-        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{place}{hint}") from error
+        where = place(line[1], int(line[2])) if line else ""
+        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{where}{hint}") from error
 
 
 @lru_cache(maxsize=1)
