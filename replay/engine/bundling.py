@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Mapping
 from hashlib import sha256
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -41,7 +41,8 @@ class Bundle:
             inner += ", forceinline=True"
         self._decorator = f"@numba.njit({inner}, {self.options})"
         self.definitions: dict[str, str] = {}
-        self._functions: dict[str, FunctionType] = {}
+        # where a definition's lines come from, in words
+        self.places: dict[tuple[str, int], str] = {}
         self._names: dict[Any, str] = {}
 
     def add(self, name: str, value: Any) -> str:
@@ -60,25 +61,12 @@ class Bundle:
             self._names[key] = self._define(name, value, origin, literal)
         return self._names[key]
 
-    def place(self, own: str, line: int) -> str:
-        """Where a line, counted from 1, of a definition comes from, in words; empty for any other."""
-        if own not in self._functions:
-            return ""
-        function = self._functions[own]
-        file, above = _origin(function)
-        definition = _definition(function)
-        before, after = (
-            [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
-            for tree in (definition, ast.parse(ast.unparse(definition)).body[0])
-        )
-        lines = {1 + new.lineno: old.lineno for old, new in zip(before, after, strict=True)}
-        return f" ({file}, line {above + lines[line]})" if line in lines else ""
-
     def _define(self, name: str, value: Any, origin: str, literal: str | None) -> str:
-        is_source = isinstance(value, FunctionType) and not _is_known_to_numba(value)
-        if is_source:
+        lines: dict[int, str] = {}
+        if isinstance(value, FunctionType) and not _is_known_to_numba(value):
             name = value.__name__
-            definition = f"{self._decorator}\n{self._source(value)}"
+            source, lines = self._source(value)
+            definition = f"{self._decorator}\n{source}"
         elif isinstance(value, ModuleType):
             if value.__name__.partition(".")[0] not in _VERSIONED:
                 raise BadInput(
@@ -94,19 +82,17 @@ class Bundle:
             definition = f"from {value.__module__} import {origin} as {_NAME}  # {_stamp(value)}"
         own = f"{name}_{sha256(definition.encode()).hexdigest()[:16]}"
         self.definitions[own] = definition.replace(_NAME, own)
-        if is_source:
-            self._functions[own] = value
+        self.places |= {(own, 1 + line): place for line, place in lines.items()}
         return own
 
-    def _source(self, function: FunctionType) -> str:
-        """A function called `_NAME`."""
+    def _source(self, function: FunctionType) -> tuple[str, dict[int, str]]:
+        """A function called `_NAME`, and where its lines, counted from 1, come from."""
         closure = inspect.getclosurevars(function)
         needed = {**closure.globals, **closure.nonlocals}
         definition = _definition(function)
-        nodes = [each for each in ast.walk(definition) if isinstance(each, ast.Name | ast.Attribute)]
-        for node in nodes:
+        file, above = function.__code__.co_filename, function.__code__.co_firstlineno - 1
+        for node in ast.walk(definition):
             if _is_global_random(node, needed):
-                file, above = _origin(function)
                 raise DoesNotCompile(
                     f"{function.__qualname__} uses np.random ({file}, line {above + node.lineno}): its "
                     "numbers would depend on how runs are shared among cores; draw from the generator "
@@ -114,24 +100,28 @@ class Bundle:
                 )
         names = {name: self.add(name, value) for name, value in needed.items()}
         definition.name = _NAME
-        for node in nodes:
+        for node in ast.walk(definition):
             if isinstance(node, ast.Name):
                 node.id = names.get(node.id, node.id)
-        return ast.unparse(definition)
+        source = ast.unparse(definition)
+        before, after = (
+            [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
+            for tree in (definition, ast.parse(source).body[0])
+        )
+        return source, {
+            new.lineno: f" ({file}, line {above + old.lineno})"
+            for old, new in zip(before, after, strict=True)
+        }
 
 
-def _origin(function: FunctionType) -> tuple[str, int]:
-    """The file of a function, and how many lines are above it."""
-    return function.__code__.co_filename, function.__code__.co_firstlineno - 1
-
-
-def _is_global_random(node: ast.Name | ast.Attribute, needed: Mapping[str, Any]) -> bool:
+def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast.expr]:
     """Whether an expression is NumPy's module of generators that are nobody's own."""
-    if isinstance(node, ast.Attribute):
-        of = node.value
-        return node.attr == "random" and isinstance(of, ast.Name) and needed.get(of.id) is np
-    found = needed.get(node.id)
-    return found is np.random or getattr(found, "__self__", None) is np.random.mtrand._rand
+    if isinstance(node, ast.Attribute) and node.attr == "random":
+        return isinstance(node.value, ast.Name) and needed.get(node.value.id) is np
+    if isinstance(node, ast.Name):
+        found = needed.get(node.id)
+        return found is np.random or getattr(found, "__self__", None) is np.random.mtrand._rand
+    return False
 
 
 def _is_made_here(value: Any) -> bool:
@@ -142,7 +132,7 @@ def _is_made_here(value: Any) -> bool:
 
 def _is_known_to_numba(function: FunctionType) -> bool:
     """Whether numba has an implementation of its own for it (`numba.extending.overload`)."""
-    from numba.core.registry import cpu_target
+    from numba.core.registry import cpu_target  # which takes long to import
 
     context = cpu_target.typing_context
     context.refresh()

@@ -15,7 +15,7 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, lru_cache, partial, wraps
 from itertools import pairwise
@@ -87,7 +87,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
         run_once,
     )
     hint = "" if allocates else " (a kernel that makes arrays is compiled with allocates=True)"
-    return partial(_over_runs, name=run_once.__name__, loop=loop, place=bundle.place, hint=hint)
+    return partial(_over_runs, name=run_once.__name__, loop=loop, places=bundle.places, hint=hint)
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -117,14 +117,13 @@ def _over_runs(
     own: Sequence[Any] | None = None,
     name: str,
     loop: Callable[..., None],
-    place: Callable[[str, int], str],
+    places: Mapping[tuple[str, int], str],
     hint: str,
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
     import numba
-    from numba.core.errors import NumbaError
 
-    def work(pieces: Iterator[tuple[int, int]]) -> None:
+    def work(pieces: Iterable[tuple[int, int]]) -> None:
         memory = [scratch()] if scratch else []
         for first, end in pieces:
             if own is None:
@@ -135,13 +134,16 @@ def _over_runs(
                     loop(run, run + 1, *arguments, own[run])
 
     cores = min(runs, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)] if cores > 1 else [0, runs]
-    waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
     try:
-        if cores > 1:  # compiles here: a thread would wait for ever for a module that is being imported
-            last = [scratch()] if scratch else [each for each in own or () if each is not None][:1]
-            if own is None or last:
-                loop(0, 0, *arguments, *last)
+        if cores <= 1:
+            work([(0, runs)])
+            return
+        # compiles here: a thread would wait for ever for a module that is being imported
+        last = [scratch()] if scratch else [each for each in own or () if each is not None][:1]
+        if own is None or last:
+            loop(0, 0, *arguments, *last)
+        cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+        waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
         helpers = [_helpers(os.getpid()).submit(work, waiting) for _ in range(cores - 1)]
         try:
             work(waiting)
@@ -150,13 +152,13 @@ def _over_runs(
             wait(begun)
         for helper in begun:
             helper.result()
-    except NumbaError as error:
+    except numba.core.errors.NumbaError as error:
         said = re.sub(r"\x1b\[\d*m", "", str(error))  # bold where colorama is installed
         reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
         reason = re.sub(r",? ?(defined )?at \w+_[0-9a-f]{16} \(\d+\)", "", reason)
         line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', said)
-        where = place(line[1], int(line[2])) if line else ""
-        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{where}{hint}") from error
+        place = places.get((line[1], int(line[2])), "") if line else ""
+        raise DoesNotCompile(f"kernel '{name}' does not compile: {reason}{place}{hint}") from error
 
 
 @lru_cache(maxsize=1)
