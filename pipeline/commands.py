@@ -1,6 +1,6 @@
 """What the commands do: the work between the command line and the library.
 
-Rerun and matplotlib take long to import: only what draws imports them.
+Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,31 +11,11 @@ from typing import Any
 
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.estimates import log_of_estimates, stated_estimators
-from pipeline.executors import crew_of
-from pipeline.experiment import (
-    Stated,
-    experiment_of_logs,
-    read_experiment,
-    require_campaign,
-    run_experiment,
-)
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
-from pipeline.results import (
-    RUNS,
-    ErrorTables,
-    in_order,
-    plain,
-    read_table,
-    result_folder,
-    split_metric,
-    write_outcome,
-)
-from pipeline.settings import read_settings, settings_of_estimators, sigmas_of
+from pipeline.results import ErrorTables, in_order, plain, result_folder, split_metric, write_outcome
+from pipeline.settings import settings_of_estimators, sigmas_of
 from pipeline.starting import check_same_run, order_of, origins_of, span_of
-from pipeline.studies.localization import summarise, summary_table
-from pipeline.sweeps import DRAWN, Sampling, nested, parse_over, points_of, run_sweep
 from pipeline.terminal import (
-    print_claims,
     print_json,
     print_metrics,
     print_parameters,
@@ -45,15 +25,13 @@ from pipeline.terminal import (
     say,
     warn,
 )
-from pipeline.trajectories import ComparedLogs, compare_logs, evaluate
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
 from recorders.log import Companions, Log, NotMcap, open_log
-from recorders.parameters import merge, parse_settings
 from replay.engine.sources import LogSource
+from replay.judging.differences import FEWEST_RUNS
 from replay.judging.judge import Judge
 from replay.judging.measuring import find_metrics
-from replay.judging.trajectories import Comparison
 
 
 def replay_logs(
@@ -169,6 +147,10 @@ def evaluate_logs(
     Where there are entries of a `Comparison`, positions are compared as trajectories too, and estimates
     are judged in their alignment with the truth.
     """
+    from pipeline.studies.localization import summarise, summary_table
+    from pipeline.trajectories import ComparedLogs, compare_logs
+    from replay.judging.trajectories import Comparison
+
     if errors and out is None:
         raise BadInput("--errors: errors are written into a result folder; give one with --out")
     if logs and len(logs) != len(estimates):
@@ -254,6 +236,8 @@ def evaluate_trajectory(
     as_json: bool,
 ) -> None:
     """Judge a trajectory file against another."""
+    from pipeline.trajectories import evaluate
+
     if len(estimates) > 1:
         raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
     if logs or metrics or errors or recover:
@@ -310,7 +294,8 @@ def _print_outcome(
         }
         print_json(outcome | dict(told or {}))
         return
-    print_metrics(values, judge.bounds, judge.runs_table)
+    runs = judge.runs_table if judge.runs >= FEWEST_RUNS else None  # of fewer it says nothing
+    print_metrics(values, judge.bounds, runs)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
             "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
@@ -389,102 +374,3 @@ def _draw_log(
     for sentence in judge.unjudged:
         warn(sentence)
     _state_losses([log, source.log])
-
-
-def run_named(
-    named: Sequence[str],
-    labels: Sequence[str],
-    over: Mapping[str, Any],
-    *,
-    logs: int,
-    errors: bool,
-    data: Path | None,
-    out: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-    tells_parameters: bool,
-    as_json: bool,
-    settings_file: Path | None,
-    settings: Sequence[str],
-) -> None:
-    """Run an experiment, or replay logs as one, and print its metrics and claims."""
-    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
-    label, experiment = stated.name, stated.with_settings(values, over)
-    if experiment.logs and data is not None and named[0].endswith(".mcap"):
-        raise BadInput(f"{named[0]}: logs are replayed as they are; leave out --data")
-    if workers is not None or scheduler is not None:
-        require_campaign(experiment, "leave out --workers and --scheduler")
-    folder = out or Path("out") / label
-    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
-    check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
-    crew = crew_of(workers, scheduler, len(experiment.files) or experiment.runs)
-    result = run_experiment(
-        label, experiment, folder, data=data, logs=logs, errors=errors, crew=crew, progress=progress
-    )
-    if as_json:
-        print_json(result.model_dump(mode="json"))
-        return
-    if tells_parameters:
-        print_parameters(result.settings["parameters"])
-        say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
-    runs = folder / RUNS
-    print_metrics(result.metrics, result.bounds, read_table(runs) if runs.is_file() else None)
-    print_claims(result.claims)
-    say(f"{folder}: {', '.join(result.contents)}")
-
-
-def _stated_experiment(
-    named: Sequence[str],
-    labels: Sequence[str],
-    over: Mapping[str, Any],
-    settings_file: Path | None,
-    settings: Sequence[str],
-) -> tuple[Stated, dict[str, Any]]:
-    """The experiment of a name or a TOML file, or that of logs, and the settings that go over it."""
-    files = [Path(each) for each in named if each.endswith(".mcap")]
-    if files and (len(files) < len(named) or over.keys() & {"runs", "seed"}):
-        raise BadInput(f"{files[0]}: logs are replayed as they are; give logs alone, and -e")
-    if not files and (len(named) > 1 or labels):
-        raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
-    stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
-    return stated, merge(read_settings(settings_file, stated.labels), parse_settings(settings))
-
-
-def sweep_named(
-    named: Sequence[str],
-    labels: Sequence[str],
-    over: Mapping[str, Any],
-    *,
-    swept: Sequence[str],
-    samples: int | None,
-    sampling: Sampling,
-    out: Path | None,
-    workers: int | None,
-    scheduler: str | None,
-    as_json: bool,
-    settings_file: Path | None,
-    settings: Sequence[str],
-) -> None:
-    """Run an experiment, or replay logs as one, at many points; print its metrics at each."""
-    overs = [parse_over(text) for text in swept]
-    stated, values = _stated_experiment(named, labels, over, settings_file, settings)
-    experiment = stated.with_settings(values, over)
-    points = points_of(overs, samples, sampling, experiment.seed)
-    at = [stated.with_settings(merge(values, nested(point)), over) for point in points]
-    folder = out or Path("out") / f"{stated.name}-sweep"
-    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
-    check_folder(folder, {"input": inputs})
-    crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
-    result = run_sweep(stated.name, overs, points, at, folder, crew=crew, progress=progress)
-    if as_json:
-        print_json(result.model_dump(mode="json"))
-        return
-    drawn = {key: value for key, value in result.metrics.items() if split_metric(key)[1] in DRAWN}
-    lists = {key: value for key, value in drawn.items() if isinstance(value, list)}
-    shown = {key: value for key, value in lists.items() if len({*value}) > 1} or lists
-    rows = [
-        [*point.values(), *(value[number] for value in shown.values())]
-        for number, point in enumerate(points)
-    ]
-    print_table([*points[0], *shown], rows)
-    say(f"{folder}: the table of all metrics, figures, result.json")

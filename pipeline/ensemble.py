@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import psutil
 
 from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
@@ -412,6 +411,8 @@ def record_ensemble(
 def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
     """Raise BadInput with what something takes, where that is more memory than is free."""
     time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
+    import psutil  # which takes long to import
+
     there_bytes = psutil.virtual_memory().available
     if need_bytes > there_bytes:
         need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))

@@ -22,7 +22,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
 
-import numba
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
@@ -128,6 +127,8 @@ def processes(count: int) -> Crew:
 
 def _begin_worker() -> None:
     """One core for each worker; an interrupt is the parent's to deal with, and its end theirs too."""
+    import numba
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     numba.config.NUMBA_NUM_THREADS = 1  # type: ignore[attr-defined]
     threadpool_limits(1)

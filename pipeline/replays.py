@@ -34,8 +34,9 @@ from replay.engine.estimator import Estimator
 from replay.engine.sources import LogSource, MemorySource, memory_source
 from replay.inference.model import Model
 from replay.judging.evaluation import Errors, innovations_of
-from replay.judging.judge import Judge, error_table, joined
+from replay.judging.judge import Judge
 from replay.judging.measuring import find_metrics
+from replay.judging.tables import error_table, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -258,7 +258,7 @@ class ErrorTables:
         import pyarrow
         import pyarrow.parquet
 
-        from replay.judging.judge import error_table
+        from replay.judging.tables import error_table
 
         table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
         what = errors.estimator, errors.case

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
 from pipeline.claims import Claim
@@ -41,8 +40,13 @@ def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable
 
     The title is asked again after every item, as it may say how the work goes.
     """
+    if not err.is_terminal:
+        yield from items
+        return
+    from rich.progress import MofNCompleteColumn, Progress  # which take long to import
+
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+    with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task(str(title), total=total)
         for item in items:
             yield item

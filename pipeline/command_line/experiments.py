@@ -64,7 +64,7 @@ def run(
     --set gate_probability=1 of all estimators that have it, --set gap_limit_s=1 an entry of the
     experiment.
     """
-    from pipeline.commands import run_named
+    from pipeline.experiment_commands import run_named
 
     stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
     over = {key: value for key, value in stated.items() if value is not None}
@@ -112,7 +112,7 @@ def sweep(
     A table has every metric at every point, and within what nine in ten runs lie; figures show them as
     curves, or as heat maps over two parameters. A key is as --set has it.
     """
-    from pipeline.commands import sweep_named
+    from pipeline.experiment_commands import sweep_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     sweep_named(experiment, labels, over, **options)

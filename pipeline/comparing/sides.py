@@ -28,9 +28,9 @@ from recorders.trajectories import read_trajectory
 from replay.engine.estimator import configure
 from replay.engine.sources import LogSource, MemorySource, Source
 from replay.judging.evaluation import POSITION, split_topic
-from replay.judging.judge import joined
 from replay.judging.measuring import find_metrics
 from replay.judging.metrics import rmse_of
+from replay.judging.tables import joined
 from replay.judging.trajectories import estimates_of
 
 # Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.

@@ -24,8 +24,8 @@ from pipeline.tuning.objective import Objective, innovations_in
 from pipeline.tuning.search import Coordinates
 from replay.engine.sources import LogSource, MemorySource
 from replay.judging.evaluation import split_topic
-from replay.judging.judge import joined
 from replay.judging.measuring import metric_key
+from replay.judging.tables import joined
 from replay.judging.whiteness import whitened, whiteness
 
 Floats = NDArray[np.float64]

@@ -7,7 +7,6 @@ of them is one run, in which every trial has its own topics under the file's nam
 from pathlib import Path
 from typing import Annotated
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
@@ -89,6 +88,8 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
 
 def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
     """The datasets of one file, all of one length, and the sampling rate."""
+    import h5py  # which takes long to import
+
     try:
         with h5py.File(file) as content:
             missing = [name for name in DATASETS if name not in content]

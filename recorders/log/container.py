@@ -78,7 +78,10 @@ class Container:
 
 
 class _Place(NamedTuple):
-    """One record, a run of loose ones as if it were one message, or bytes that are lost."""
+    """One record, bytes that are lost, or a run of loose records.
+
+    A run is as if it were one message, or one schema where it has declarations alone.
+    """
 
     opcode: int
     offset: int
@@ -246,19 +249,22 @@ def _data_section(file: BinaryIO, size: int, summary: _Summary) -> Iterator[_Pla
     """Every whole record up to the end of the data section, and what is lost between two of them."""
     known = _stated_places(summary)
     run = position = len(MAGIC)
+    kind = Opcode.SCHEMA
     while (place := _next_place(file, size, position, known)) is not None:
         is_loose = place.opcode in _LOOSE
         if run < position and (not is_loose or place.end - run > _LOOSE_BYTES):
-            yield _Place(Opcode.MESSAGE, run, position - run)
-            run = position
+            yield _Place(kind, run, position - run)
+            run, kind = position, Opcode.SCHEMA
         position = place.end
         if not is_loose:
             yield place
             run = position
+        elif place.opcode == Opcode.MESSAGE:
+            kind = Opcode.MESSAGE
         if place.opcode == Opcode.DATA_END:
             return
     if run < position:
-        yield _Place(Opcode.MESSAGE, run, position - run)
+        yield _Place(kind, run, position - run)
 
 
 def _next_place(file: BinaryIO, size: int, position: int, known: Sequence[_Place]) -> _Place | None:
@@ -314,6 +320,8 @@ def _note(found: Container, file: BinaryIO, place: _Place, index: _Index) -> Non
             region = Region(place.offset, place.length, contents.spans, frozenset(contents.messages))
             found.regions.append(region)
             found.message_counts.update({key: len(each) for key, each in contents.messages.items()})
+    elif place.opcode == Opcode.SCHEMA:
+        _declare(found, read_records(read_bytes(file, place.offset, place.length)))
     elif place.opcode == Opcode.ATTACHMENT:
         found.attachments.append(_attachment_name(file, place))
     elif place.opcode in (Opcode.METADATA, Opcode.DATA_END):

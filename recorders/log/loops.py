@@ -1,20 +1,27 @@
-"""The compiled loops over the bytes of a chunk: find its records, and compare messages with a layout.
+"""The loops over the bytes of a chunk: find its records, and compare messages with a layout.
 
 The loops see the bytes as 64-bit words, one of which starts at every byte, so that they compare eight
-bytes at a time.
+bytes at a time. numba compiles them, and takes as long to import as plain Python to go through some
+megabytes: the first one is gone through so, in a process that has no other use for numba.
 Source: the MCAP specification (mcap.dev/spec), records Message, Schema and Channel.
 """
 
-from typing import NamedTuple
+import sys
+from collections import Counter
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from numba import njit
 from numpy.typing import NDArray
 
 # Opcode and length of a record; then channel, sequence and two clocks of a message.
 HEAD_BYTES = 9
 MESSAGE_HEAD_BYTES = HEAD_BYTES + 22
+
+# Bytes that are gone through without numba.
+_left = Counter(plain=1 << 20)
 
 _MESSAGE = int(Opcode.MESSAGE)
 _SCHEMA = int(Opcode.SCHEMA)
@@ -56,14 +63,15 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
 
 def scan(data: NDArray[np.uint8]) -> Scan:
     """Walk the records of a chunk."""
-    return Scan(*_scan(_words(data), len(data)))
+    return Scan(*_loop(_scan, len(data))(_words(data), len(data)))
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
     """Whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
     if offsets[-1] + pattern.size > len(data):
         return False
-    return bool(_agree(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
+    agreed = _loop(_agree, len(offsets) * pattern.size)
+    return bool(agreed(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
 
 
 def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -72,7 +80,21 @@ def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
 
 
-@njit(cache=True, nogil=True)
+def _loop(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
+    """The loop to go through so many bytes with."""
+    _left["plain"] -= size
+    if _left["plain"] >= 0 and "numba" not in sys.modules:
+        return np.errstate(over="ignore")(loop)
+    return _compiled(loop)
+
+
+@cache
+def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
+    from numba import njit
+
+    return njit(cache=True, nogil=True)(loop)
+
+
 def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
     found = np.empty(size // MESSAGE_HEAD_BYTES, np.int64)
     channel_ids = np.empty(len(found), np.uint16)
@@ -116,7 +138,6 @@ def _scan(words, size):  # type: ignore[no-untyped-def] # numba infers the types
     )
 
 
-@njit(cache=True, nogil=True)
 def _agree(words, offsets, places, expected, mask):  # type: ignore[no-untyped-def]
     for offset in offsets:
         wrong = np.uint64(0)

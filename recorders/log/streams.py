@@ -180,7 +180,10 @@ def stream_of(
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:
     """The values as an array of this type, which must be able to keep every one of them."""
-    what, dtype, axes = f"topic {topic}: {name}", NUMPY_TYPES[kind], 1 + (kind == "vector")
+    dtype, axes = NUMPY_TYPES[kind], 1 + (kind == "vector")
+    if isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes:
+        return values
+    what = f"topic {topic}: {name}"
     try:
         column = given = np.asarray(values)
         if given.dtype != dtype:
@@ -245,8 +248,8 @@ def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
     first = parts[0]
     if len(parts) == 1:
         return first
-    for name, column in first.columns.items():
-        widths = {part.columns[name].shape[1] for part in parts if column.ndim == 2}
+    for name in (name for name, column in first.columns.items() if column.ndim == 2):
+        widths = {part.columns[name].shape[1] for part in parts}
         if len(widths) > 1:
             raise BadInput(
                 f"{where}topic {first.topic}: field {name} has vectors of different lengths "

@@ -9,7 +9,6 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeInt, PositiveFloat
-from scipy.stats import norm, rankdata
 
 from recorders.models.scores import Matcher, score_stream
 from recorders.parameters import Parameters
@@ -123,6 +122,8 @@ def simulate(parameters: BiometricScoresParameters, rng: np.random.Generator) ->
 
 def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> Users:
     """Effects of the users; a few have poor fingers, the others so much better that marginals hold."""
+    from scipy.stats import norm  # which takes long to import
+
     effects = rng.multivariate_normal(np.zeros(12), _user_correlation(), parameters.users, method="eigh")
     genuine, probe, gallery = np.split(effects, 3, axis=1)
     share = parameters.poor_fingers_share
@@ -138,6 +139,8 @@ def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> U
 
 def _impostors(users: Users, rng: np.random.Generator) -> Floats:
     """Standard normals (users, users, matchers) of all comparisons, by rank exactly normal."""
+    from scipy.stats import norm, rankdata  # which take long to import
+
     count = len(users.probe)
     correlation = _rest_correlation()
     rest, other = (

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import compress
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -113,9 +114,10 @@ def filled_rows(
 
 def gather(parts: Sequence[Stream]) -> Ragged:
     """Lay the runs' streams of one topic end to end."""
+    counts = [len(part) for part in parts]
     offsets = np.zeros(len(parts) + 1, np.int64)
-    np.cumsum([len(part) for part in parts], out=offsets[1:])
-    filled = [part for part in parts if len(part)] or list(parts[:1])
+    np.cumsum(counts, out=offsets[1:])
+    filled = parts if all(counts) else [*compress(parts, counts)] or parts[:1]
     return Ragged(join_streams(filled), offsets)
 
 

@@ -11,7 +11,6 @@ from types import FunctionType, ModuleType
 from typing import Any, TypeGuard
 
 import numpy as np
-from numba.core.registry import cpu_target
 
 from recorders.errors import BadInput
 
@@ -133,6 +132,8 @@ def _is_made_here(value: Any) -> bool:
 
 def _is_known_to_numba(function: FunctionType) -> bool:
     """Whether numba has an implementation of its own for it (`numba.extending.overload`)."""
+    from numba.core.registry import cpu_target  # which takes long to import
+
     context = cpu_target.typing_context
     context.refresh()
     try:

@@ -79,8 +79,7 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
 
     Raises BadInput as `concatenate` and `sentences_of` do.
     """
-    stated = {part.metadata.get(REASONS) for part in parts}
-    if len(stated) == 1:
+    if len(parts) == 1 or len({part.metadata.get(REASONS) for part in parts}) == 1:
         return concatenate(parts)
     lists = [_reasons(part) for part in parts]
     merged = list(dict.fromkeys(reason for each in lists for reason in each))

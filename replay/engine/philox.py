@@ -11,7 +11,6 @@ from hashlib import sha256
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from replay.engine.arrays import Floats
 
@@ -23,6 +22,8 @@ _MULTIPLIERS = 0xD2E7470EE14C6C93, 0xCA5A826395121157
 _WEYL = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
 _UNIT = 2.0**-53
 _LAYERS, _TAIL = 256, 3.6541528853610088  # of the ziggurat, and where its tail begins
+# erfc(_TAIL / sqrt 2) of scipy.special, which takes long to import.
+_BEYOND = 0.00025803248765390125
 
 
 def run_key(seed: int, first: Iterable[NDArray]) -> Words:
@@ -65,7 +66,7 @@ def _ziggurat() -> tuple[Floats, Floats, Floats]:
 
     The lowest layer, number 0, has the tail with it: its end is that of a rectangle of the same area.
     """
-    area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * erfc(_TAIL / np.sqrt(2.0))
+    area = _TAIL * np.exp(-0.5 * _TAIL**2) + np.sqrt(0.5 * np.pi) * _BEYOND
     ends = np.zeros(_LAYERS + 1)
     ends[0], ends[1] = area / np.exp(-0.5 * _TAIL**2), _TAIL
     for layer in range(2, _LAYERS):

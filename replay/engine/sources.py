@@ -243,13 +243,27 @@ class MemorySource(_Readable):
 
     def in_order(self, topic: str, order: Clock) -> Stream:
         """A topic by one of the clocks; equal stamps as in the file."""
+        stream = self.stream_of(topic)
+        if is_in_order(gather([stream]), order):
+            return stream
+        return stream.take(np.lexsort((stream.position, stream.times(order))))
+
+    def stream_of(self, topic: str) -> Stream:
+        """A topic as it was recorded; raises BadInput where it is not there."""
         if topic not in self.streams:
             raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
-        stream = self.streams[topic]
-        clock, position = stream.times(order), stream.position
-        if np.all(clock[1:] >= clock[:-1]) and np.all(position[1:] > position[:-1]):
-            return stream
-        return stream.take(np.lexsort((position, clock)))
+        return self.streams[topic]
+
+
+def is_in_order(runs: Ragged, order: Clock) -> bool:
+    """Whether the messages of every run go by one of the clocks, and by their places in the file."""
+    clock, position = runs.stream.times(order), runs.stream.position
+    ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
+    if ordered.all():
+        return True
+    begins = runs.offsets[1:-1]  # where another run begins, or none is left
+    ordered[begins[(begins > 0) & (begins < len(clock))] - 1] = True
+    return bool(ordered.all())
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
@@ -349,11 +363,13 @@ class Ensemble(list[SourceType]):
         return bool(self._recordings) and all(run.is_whole for run in self._recordings)
 
     def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
-        """Topics of recordings."""
+        """Topics of recordings, each run by one of the clocks."""
         for topic in topics:
             if (topic, order) not in self._kept:
-                runs = [source.in_order(topic, order) for source in self._recordings]
-                self._kept[topic, order] = gather(runs)
+                together = gather([source.stream_of(topic) for source in self._recordings])
+                if not is_in_order(together, order):
+                    together = gather([source.in_order(topic, order) for source in self._recordings])
+                self._kept[topic, order] = together
         return {topic: self._kept[topic, order] for topic in topics}
 
 

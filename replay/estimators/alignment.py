@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveFloat
-from scipy.integrate import cumulative_trapezoid
 
 from recorders.errors import BadInput
 from recorders.log import Stream
@@ -378,7 +378,14 @@ def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) 
     since_s = np.asarray((samples.time_ns[since] - start_ns) * _NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
     rate = (samples.rate[since] - bias) @ up
-    return since_s, np.asarray(cumulative_trapezoid(rate, since_s, initial=0.0))
+    return since_s, _integral(rate, since_s)
+
+
+def _integral(values: NDArray, times_s: Floats) -> NDArray:
+    """What values (n,) come to from the first time on, by the trapezoid rule."""
+    from scipy.integrate import cumulative_trapezoid  # which takes long to import
+
+    return np.asarray(cumulative_trapezoid(values, times_s, initial=0.0))
 
 
 def _heading(
@@ -425,9 +432,7 @@ def _mounting(
     if len(rows) < 3:
         return ""
     ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
-    gained = cumulative_trapezoid(
-        (ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s, initial=0.0
-    )
+    gained = _integral((ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s)
     felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
     seen = np.diff(moving.mps[rows, 0] + 1j * moving.mps[rows, 1])
     together = np.vdot(felt, seen)

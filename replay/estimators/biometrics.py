@@ -12,11 +12,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveInt
-from sklearn.calibration import CalibratedClassifierCV
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
-from sklearn.linear_model import LogisticRegression
-from sklearn.neighbors import KNeighborsClassifier
-from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput, choices
@@ -219,6 +214,8 @@ def learn_classifier(
 
     QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
     """
+    from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
+
     vectors = np.nan_to_num(vectors)
     model = _classifier(parameters, int(rng.integers(2**31)))
     if parameters.calibrated:
@@ -247,6 +244,11 @@ def _log_odds(probabilities: Floats) -> Floats:
 
 
 def _classifier(parameters: ClassifierParameters, seed: int) -> Any:
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.neighbors import KNeighborsClassifier
+    from sklearn.svm import SVC
+
     match parameters.classifier:
         case "qda":
             return QuadraticDiscriminantAnalysis(priors=[0.5, 0.5])

@@ -8,7 +8,6 @@ per vector. Recursions: Rabiner, Proc. IEEE 1989; all sequences at once, probabi
 from typing import NamedTuple
 
 import numpy as np
-from sklearn.cluster import KMeans
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats
@@ -79,6 +78,8 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
 
 def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     """States in the order of the vectors: k-means of each, one step at a time, or any after any."""
+    from sklearn.cluster import KMeans  # which takes long to import
+
     states = sequences.shape[1]
     initial, transition = np.full(states, 1 / states), np.full((states, states), 1 / states)
     if how.left_right:

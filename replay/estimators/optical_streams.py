@@ -10,7 +10,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
@@ -100,6 +99,8 @@ def _solve(
 ) -> list[Ragged]:
     position = [_constant(streams[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
     turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     nominal = Rotation.from_quat(turned, scalar_first=True).inv().as_euler("ZYX")
     scene = Scene(np.array(position), nominal, sigma_rad, known_rad)
     seen = gather_sightings([streams[f"/sensor{s}/line_of_sight"] for s in sensors])

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
-from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
@@ -211,6 +210,8 @@ def around(anchors: Floats, parameters: Any) -> list[Floats]:
 
 def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
     """The least of the robust least squares from several starts."""
+    from scipy.optimize import least_squares  # which takes long to import
+
     scale = 3.0 * parameters.sigma_range_m
     fits = [least_squares(residuals, start, loss="soft_l1", f_scale=scale) for start in starts]
     return min(fits, key=lambda fit: float(fit.cost)).x

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
-from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
@@ -184,6 +183,8 @@ def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None
     tried = np.column_stack([np.repeat(meeting, len(aims), axis=0), np.tile(aims, len(meeting))])
     cut = np.minimum(residuals(tried.T[..., None]) ** 2, CUT**2).sum(axis=(1, 2))
     start = tried[np.argmin(cut)]
+    from scipy.optimize import least_squares  # which takes long to import
+
     return least_squares(lambda shot: residuals(shot).ravel(), start, loss="cauchy").x
 
 

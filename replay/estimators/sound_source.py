@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from pydantic import PositiveFloat
-from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
@@ -92,6 +91,8 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
     grid = np.stack(np.meshgrid(*[SOUGHT] * free), axis=-1).reshape(-1, free, 1)
     starts = middle[:free, None] + size * grid
     costs = np.sum(residuals(np.swapaxes(starts, 0, 1)) ** 2, axis=1)
+    from scipy.optimize import least_squares  # which takes long to import
+
     scale = np.full(free, size)
     fits = [
         least_squares(residuals, start[:, 0], x_scale=scale, loss="soft_l1")

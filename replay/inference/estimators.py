@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Annotated, Any
 
 from pydantic import Field, create_model
@@ -42,7 +42,15 @@ from replay.inference.stage import Stage, stage_of
 def combined(model: Model, method: Method) -> type[ModelParameters]:
     """The parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
-    return create_model(name, __base__=(method.parameters, model.parameters))  # type: ignore[arg-type]
+    return _created(name, (method.parameters, model.parameters))
+
+
+def _created(
+    name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
+) -> type[Any]:
+    """A type of parameters; it has no text of its own in which their meanings could be looked for."""
+    says_nothing = {"use_attribute_docstrings": False}
+    return create_model(name, __base__=bases, __cls_kwargs__=says_nothing, **(fields or {}))
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
@@ -51,7 +59,7 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> 
     for name, value in defaults.items():
         field = kind.model_fields[name]
         fields[name] = (_accepted(field), Field(value, description=field.description))
-    return create_model(kind.__name__, __base__=kind, **fields) if fields else kind
+    return _created(kind.__name__, (kind,), fields) if fields else kind
 
 
 def _accepted(field: FieldInfo) -> Any:
@@ -87,13 +95,29 @@ def modelled_by(
 
 def of_any_model(method: Method) -> Estimator[Any]:
     """The estimator that estimates, by one method, the state of the registered model that fits a log."""
-    return Estimator(
-        f"{method.summary}, of any model (`fuselog models` lists them)",
-        " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items()),
-        _any_parameters(method),
-        partial(_bind_fitting, method=method),
-        variant=method.variant,
-    )
+    return _OfAnyModel(method)
+
+
+class _OfAnyModel(Estimator[Any]):
+    """What it needs and its parameters follow from all models; they are made when they are asked for."""
+
+    def __init__(self, method: Method) -> None:
+        vars(self).update(
+            summary=f"{method.summary}, of any model (`fuselog models` lists them)",
+            bind=partial(_bind_fitting, method=method),
+            variant=method.variant,
+            _method=method,
+        )
+
+    @cached_property
+    def needs(self) -> str:
+        """What a log must have."""
+        return " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items())
+
+    @cached_property
+    def parameters(self) -> type[Parameters]:
+        """Those of all models, and of the method."""
+        return _any_parameters(vars(self)["_method"])
 
 
 def registered_models() -> dict[str, Model]:
@@ -119,7 +143,7 @@ def _any_parameters(method: Method) -> type[Parameters]:
                 other, said = fields.get(name, (kind, field))
                 meaning = field.description if field.description == said.description else None
                 fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
-    return create_model(f"Any{method.parameters.__name__}", __base__=method.parameters, **fields)
+    return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
 def _bind_fitting(

@@ -75,9 +75,15 @@ class State(NamedTuple):
 
 
 @lru_cache(maxsize=64)
+def _steps(stage: Stage, method: Method) -> Steps:
+    """The steps that the loop over the runs is made of."""
+    return method.steps(stage)
+
+
+@lru_cache(maxsize=64)
 def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
-    """The loop over the runs, and the steps that it was made of."""
-    steps = method.steps(stage)
+    """The loop over the runs, and its steps."""
+    steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
     return compile_over_runs(loop, allocates=False), steps
@@ -88,7 +94,7 @@ def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler,
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)
-    return tuple(sampling.at(dimension) for dimension in _compiled(stage, method)[1].sampled)
+    return tuple(sampling.at(dimension) for dimension in _steps(stage, method).sampled)
 
 
 @dataclass(frozen=True)
@@ -173,7 +179,7 @@ class Filter:
     def not_driven(self, happenings: Happenings) -> list[Ragged]:
         """What was not used since it was measured in a gap of the control, where that may have some."""
         control = self.stage.model.control
-        if control is None or not control.gap or not _compiled(self.stage, self.method)[1].resumes:
+        if control is None or not control.gap or not _steps(self.stage, self.method).resumes:
             return []
         lost = (happenings.source >= 0) & np.isnan(happenings.data[:, -1])
         reasons = [

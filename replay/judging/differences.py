@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import bootstrap, norm, t
 
 Floats = NDArray[np.float64]
 # What a metric should be: small, large, near a value; None where neither is better.
@@ -121,6 +120,8 @@ def _interval(
 ) -> tuple[float, float, Floats]:
     """Where a statistic of the pairs lies with 95 %, and its resamples."""
     runs = len(first)
+    from scipy.stats import bootstrap, norm, t  # which takes long to import
+
     widened = np.sqrt(runs / (runs - 1)) * t.ppf(0.975, runs - 1)
     done = bootstrap(
         (first, second),

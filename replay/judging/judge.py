@@ -5,12 +5,11 @@ not grow with the length of a log, except by two numbers for each step of NEES.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from recorders.log import schemas
@@ -20,22 +19,24 @@ from replay.engine.sources import Source
 from replay.judging.bounds import Bounds
 from replay.judging.evaluation import (
     Errors,
-    Floats,
     Innovations,
     chi_square_interval,
     errors_at,
     errors_of,
     innovations_of,
-    rmse_interval,
     split_topic,
     unjudged,
 )
 from replay.judging.means import MeansOfAll
 from replay.judging.measuring import Measurement, Metric, Output, Sums, find_metrics, metric_key, plus
-from replay.judging.metrics import covered, estimated_share, step_bounds
+from replay.judging.metrics import covered, estimated_share
+from replay.judging.quantities import Quantities, columns_of
 from replay.judging.set_errors import SetErrors, set_errors
 from replay.judging.sums import BinnedSums
 from replay.judging.truths import Truths
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
@@ -61,24 +62,6 @@ class Judged(NamedTuple):
     errors: list[Errors]
     sets: list[SetErrors]
     innovations: list[Innovations]
-
-
-@dataclass
-class Quantities:
-    """Sums of one estimate stream: what tables and figures are made of.
-
-    The columns of both sums are elapsed time, squared error of the position, of the rotation and of
-    each component, trace of the main quantity's covariance and of its square, and NEES.
-    """
-
-    errors: Errors  # the last block: for names and kinds
-    by_step: BinnedSums
-    by_time: BinnedSums
-
-    def merge(self, other: "Quantities") -> None:
-        """Take in the sums of other runs."""
-        self.by_step.merge(other.by_step)
-        self.by_time.merge(other.by_time)
 
 
 @dataclass
@@ -181,7 +164,7 @@ class Judge:
         self._measured.add(topic, errors)
         if self._on_errors is not None:
             self._on_errors(errors)
-        columns = _columns_of(errors)
+        columns = columns_of(errors)
         if topic not in self._quantities:
             width = columns.shape[1]
             bins = {"width": TIME_BIN_NS, "limit": TIME_BINS, "cells": TIME_CELLS}
@@ -313,48 +296,54 @@ class Judge:
         return said
 
     @property
-    def steps(self) -> dict[str, pd.DataFrame]:
-        """For every estimate stream with truth, by topic, a row per step: see `step_table`."""
+    def steps(self) -> "dict[str, pd.DataFrame]":
+        """For every estimate stream with truth, by topic, a row per step: see `tables.step_table`."""
+        from replay.judging.tables import step_table
+
         return {
             topic: step_table(each, self._bounds.get(split_topic(topic)))
             for topic, each in self._quantities.items()
         }
 
     @property
-    def runs_table(self) -> pd.DataFrame:
+    def runs_table(self) -> "pd.DataFrame":
         """One row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
+        from replay.judging.tables import joined, run_table
+
         return joined(run_table(each) for each in self._quantities.values())
 
     @property
-    def times(self) -> pd.DataFrame:
+    def times(self) -> "pd.DataFrame":
         """The same for each run's spans of time; `until_s` is where a span ends, after the epoch."""
+        from replay.judging.tables import joined, time_table
+
         return joined(time_table(each) for each in self._quantities.values())
 
     @property
-    def modes(self) -> pd.DataFrame:
+    def modes(self) -> "pd.DataFrame":
         """How probable modes are: a row per estimator, case, span of time and mode; see `MeansOfAll`."""
+        from replay.judging.tables import joined
+
         return joined(self._means.modes())
 
     @property
-    def effective(self) -> pd.DataFrame:
+    def effective(self) -> "pd.DataFrame":
         """What share of the particles is effective: a row per estimator, case and span of time."""
+        from replay.judging.tables import joined
+
         return joined(self._means.effective())
 
     @property
-    def late(self) -> pd.DataFrame:
+    def late(self) -> "pd.DataFrame":
         """Messages that came late: a row per estimator, case, what became of them, and span of time."""
+        from replay.judging.tables import joined
+
         return joined(self._means.late())
 
     @property
     def judged(self) -> dict[str, Errors]:
         """Of every estimate stream that has errors, by topic, the last block: its names and kinds."""
         return {topic: each.errors for topic, each in self._quantities.items()}
-
-
-def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """The rows of all tables; what one of them has no column for is NaN there."""
-    filled = [table for table in tables if len(table)]
-    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
 
 
 def _what(topic: str) -> str:
@@ -368,112 +357,3 @@ def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
     verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
     truth = estimates.stream.metadata["truth"]
     return f"{_what(estimates.stream.topic)}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
-
-
-def _columns_of(errors: Errors) -> Floats:
-    """Rows (n, 6 + d) of what is summed; see `Quantities`."""
-    squared = errors.squared
-    main = errors.main.columns
-    covariance = errors.covariance[:, main][:, :, main]
-    return np.column_stack(
-        [
-            errors.elapsed_s,
-            squared[:, errors.position].sum(axis=1),
-            squared[:, errors.rotation].sum(axis=1),
-            squared,
-            np.trace(covariance, axis1=1, axis2=2),
-            np.sum(covariance**2, axis=(1, 2)),
-            errors.nees,
-        ]
-    )
-
-
-def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
-    """Columns of RMSE by quantity and of the mean NEES."""
-    mean = sums / count[:, None]
-    columns: dict[str, Floats] = {}
-    if errors.position:
-        columns["position_rmse_m"] = np.sqrt(mean[:, 1])
-    if errors.rotation:
-        columns["orientation_rmse_deg"] = np.degrees(np.sqrt(mean[:, 2]))
-    for column, name in enumerate(errors.components):
-        columns[f"rmse_{name}"] = np.sqrt(mean[:, 3 + column])
-    return {**columns, "nees": mean[:, -1]}
-
-
-def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
-    """One row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
-
-    Where there are more than `STEPS` steps, a row is of several; `step` is the first of them. Of a bound
-    there is what it is over the ensemble, if there is that.
-    """
-    errors, by_step = quantities.errors, quantities.by_step
-    cells, count, sums = by_step.filled()
-    covariances = bounds.covariances() if bounds else None
-    if covariances is not None and by_step.width == 1 and len(cells) == len(covariances):
-        squared = np.diagonal(covariances, axis1=1, axis2=2)
-        groups = (squared[:, errors.position].sum(axis=1), squared[:, errors.rotation].sum(axis=1))
-        sums[:, 1:-3] = count[:, None] * np.column_stack([*groups, squared])
-    runs = np.ceil(count / by_step.width)
-    low, high = step_bounds(runs, len(errors.components))
-    rmse, _, scale = errors.main
-    rmse_low, rmse_high = rmse_interval(runs, *(sums[:, -3:-1] / count[:, None]).T)
-    columns: dict[str, object] = {
-        "estimator": errors.estimator,
-        "case": errors.case,
-        "step": cells[:, 1] * by_step.width,
-        "runs": runs.astype(np.int64),
-        "elapsed_s": sums[:, 0] / count,
-        **_means(errors, count, sums),
-        f"{rmse}_low": scale * rmse_low,
-        f"{rmse}_high": scale * rmse_high,
-    }
-    return pd.DataFrame({**columns, "nees_low": low, "nees_high": high})
-
-
-def time_table(quantities: Quantities) -> pd.DataFrame:
-    """One row per run and span of time."""
-    errors, by_time = quantities.errors, quantities.by_time
-    cells, count, sums = by_time.filled()
-    columns: dict[str, object] = {
-        "estimator": errors.estimator,
-        "case": errors.case,
-        "run": cells[:, 0],
-        "until_s": (cells[:, 1] + 1) * by_time.width * 1e-9,
-        "estimates": count.astype(np.int64),
-    }
-    return pd.DataFrame({**columns, **_means(errors, count, sums)})
-
-
-def run_table(quantities: Quantities) -> pd.DataFrame:
-    """One row per run."""
-    errors = quantities.errors
-    cells, count, sums = quantities.by_time.filled()
-    runs, place = np.unique(cells[:, 0], return_inverse=True)
-    counts: Floats = np.bincount(place, count, len(runs)).astype(float)
-    totals: Floats = np.stack([np.bincount(place, each, len(runs)) for each in sums.T], axis=1)
-    columns: dict[str, object] = {
-        "estimator": errors.estimator,
-        "case": errors.case,
-        "run": runs,
-        "estimates": counts.astype(np.int64),
-    }
-    return pd.DataFrame({**columns, **_means(errors, counts, totals)})
-
-
-def error_table(errors: Errors) -> pd.DataFrame:
-    """One row per run and step: error and sigma of every component, NEES."""
-    sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
-    columns: dict[str, object] = {
-        "estimator": errors.estimator,
-        "case": errors.case,
-        "run": errors.run,
-        "step": errors.step,
-        "time_ns": errors.time_ns,
-        "elapsed_s": errors.elapsed_s,
-    }
-    for index, name in enumerate(errors.components):
-        columns[f"error_{name}"] = errors.error[:, index]
-        columns[f"sigma_{name}"] = sigma[:, index]
-    columns["nees"] = errors.nees
-    return pd.DataFrame(columns)

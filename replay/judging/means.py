@@ -5,10 +5,9 @@ Such are the probabilities of modes, the effective share of particles, and messa
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from recorders.log import Stream, schemas
 from replay.engine.arrays import Floats
@@ -16,6 +15,9 @@ from replay.engine.failures import sentences_of
 from replay.engine.late import OLDER
 from replay.judging.measuring import Output
 from replay.judging.sums import BinnedSums
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Spans of time: at most so many, of a millisecond times a power of two.
 SPANS = 1024
@@ -92,8 +94,10 @@ class Means:
         self.sums.add(elapsed_ns[tells], columns[tells])
 
     @property
-    def table(self) -> pd.DataFrame:
+    def table(self) -> "pd.DataFrame":
         """One row per span of time: its mean time, how many messages, and the mean of every value."""
+        import pandas as pd  # which takes long to import
+
         _, count, sums = self.sums.filled()
         means = pd.DataFrame(sums / count[:, None], columns=["elapsed_s", *self.names])
         means.insert(0, "estimator", self.estimator)
@@ -127,13 +131,13 @@ class MeansOfAll:
             else:
                 self._of[topic] = means
 
-    def _tables(self, *wanted: str) -> Iterator[tuple[str, pd.DataFrame]]:
+    def _tables(self, *wanted: str) -> "Iterator[tuple[str, pd.DataFrame]]":
         """What is told and its table, of every stream that tells one of what is wanted."""
         for means in self._of.values():
             if means.what in wanted and len(table := means.table):
                 yield means.what, table
 
-    def modes(self) -> Iterator[pd.DataFrame]:
+    def modes(self) -> "Iterator[pd.DataFrame]":
         """How probable modes are: a row per span of time and mode."""
         for what, table in self._tables(MODES, SMOOTHED_MODES):
             fixed = ["index", "estimator", "case", "elapsed_s", "estimates"]
@@ -143,12 +147,12 @@ class MeansOfAll:
             long.insert(2, "smoothed", what == SMOOTHED_MODES)
             yield long
 
-    def effective(self) -> Iterator[pd.DataFrame]:
+    def effective(self) -> "Iterator[pd.DataFrame]":
         """What share of the particles is effective: a row per span of time."""
         for _, table in self._tables(EFFECTIVE):
             yield table.rename(columns={"messages": "estimates"})
 
-    def late(self) -> Iterator[pd.DataFrame]:
+    def late(self) -> "Iterator[pd.DataFrame]":
         """Messages that came late: a row per span of time and what became of them.
 
         `late_s` is their mean delay, `repeated` how many others were used again for one on average.

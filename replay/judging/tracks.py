@@ -5,16 +5,17 @@ be are in the track of their target: a track that swallows two targets counts fo
 """
 
 import operator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from recorders.errors import BadInput
 from recorders.log import schemas
 from replay.judging.measuring import Metric, Output
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Integers = NDArray[np.int64]
 IDENTITY = "identity"
@@ -32,13 +33,16 @@ class Kept(NamedTuple):
     mean_share: float
 
 
-def track_table(targets: Integers, tracks: Integers) -> pd.DataFrame:
+def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
     """One row per target of reports (n,), most reports first.
 
     Columns: target, reports; track, its own, -1 for none; share of its reports in that; largest_share in
     any track; tracks, how many have a report of it; switches, how often successive reports of it are in
     different ones; others, how many reports of other targets its own track has.
     """
+    import pandas as pd  # these take long to import
+    from scipy.optimize import linear_sum_assignment
+
     target, of_target = np.unique(targets, return_inverse=True)
     track, of_track = np.unique(tracks, return_inverse=True)
     counts = np.zeros((len(target), len(track)), np.int64)
@@ -66,7 +70,7 @@ def track_table(targets: Integers, tracks: Integers) -> pd.DataFrame:
     return table.sort_values("reports", ascending=False, kind="stable", ignore_index=True)
 
 
-def kept(table: pd.DataFrame, column: str = "share", reports: int = MANY_REPORTS) -> Kept:
+def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> Kept:
     """How the targets with more than so many reports kept their tracks."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
@@ -124,7 +128,7 @@ def reports_of(output: Output) -> Reports:
     return found
 
 
-def track_tables(reports: Reports) -> list[pd.DataFrame]:
+def track_tables(reports: Reports) -> "list[pd.DataFrame]":
     """A table per run; none where a run has no reports."""
     if not all(reports.values()):
         return []
@@ -144,6 +148,8 @@ def _finish(reports: Reports) -> dict[str, float]:
     tables = track_tables(reports)
     if not tables:
         return {}
+    import pandas as pd
+
     found = pd.concat(tables)
     own, largest = kept(found), kept(found, "largest_share")
     tracks = np.concatenate([each for parts in reports.values() for _, each in parts])

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from scipy.special import ndtri
 
 from recorders.errors import BadInput
 from replay.sampling.distance import Array
@@ -82,6 +81,8 @@ def axis_points(dimension: int, per_axis: int) -> Samples:
     that the whole set has covariance I. An odd D's centre is shared: L = N (D - 1) + 1, otherwise N D.
     With D = 2 this is the cubature rule, with D = 3 the equally weighted unscented set.
     """
+    from scipy.special import ndtri  # which takes long to import
+
     quantiles = ndtri((np.arange(per_axis) + 0.5) / per_axis)
     half = quantiles[(per_axis + 1) // 2 :]
     line = np.concatenate([half, -half])

@@ -5,6 +5,8 @@ The property tests compare the reader with a sort; here nothing of ours stands o
 
 import hashlib
 import struct
+import subprocess
+import sys
 import time
 import zlib
 from itertools import pairwise
@@ -16,6 +18,7 @@ from recorders.errors import BadInput
 from recorders.log import (
     LogWriter,
     RunMetadata,
+    loops,
     make_stream,
     open_log,
     read_blocks,
@@ -280,3 +283,32 @@ def test_the_widths_of_a_topic_are_those_of_its_first_message(tmp_path):
         log.write([value(2)])
         with pytest.raises(BadInput, match="has vectors of widths"):
             log.write([value(3)])
+
+
+def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
+    """Whole, cut off, and with bytes that are changed, so that lengths are of any size."""
+    log = open_log(path)
+    region = log.container.regions[0]
+    whole = open_region(path.read_bytes()[region.offset : region.offset + region.length], 0).data
+    generator = np.random.default_rng(0)
+    for changes in [0, *[1, 2, 8] * 100]:
+        data = whole[: generator.integers(len(whole) // 2, len(whole) + 1)].copy()
+        data[generator.integers(len(data), size=changes)] = generator.integers(256, size=changes)
+        words = loops._words(data), len(data)
+        with np.errstate(over="ignore"):
+            plain = loops._scan(*words)
+        for ours, theirs in zip(plain, loops._compiled(loops._scan)(*words), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_few_bytes_are_read_without_numba(path):
+    code = (
+        "import sys; from recorders.log import loops, open_log, read_streams\n"
+        f"log = open_log({str(path)!r})\n"
+        "few = read_streams(log, ['/scan'])['/scan'], 'numba' in sys.modules\n"
+        "loops._left.clear()\n"
+        "many = read_streams(log, ['/scan'])['/scan'], 'numba' in sys.modules\n"
+        "print(few[0]['scan_id'].tolist() == many[0]['scan_id'].tolist(), few[1], many[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False", "True"]

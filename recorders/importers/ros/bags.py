@@ -14,10 +14,7 @@ from ruamel.yaml.error import YAMLError
 
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
-from recorders.importers.ros.mcap_file import McapFile
 from recorders.importers.ros.raw import BagFile, Batch, Connection, joined
-from recorders.importers.ros.ros1_file import Ros1File
-from recorders.importers.ros.sqlite_file import SqliteFile
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _WANTED = "give a .bag, .db3 or .mcap file of ROS, or the folder of one"
@@ -104,10 +101,16 @@ def _open_file(path: Path, scratch: Path) -> BagFile:
         except zstandard.ZstdError as error:
             raise BadInput(f"{path}: cannot be decompressed ({error})") from None
     if place.suffix == ".mcap":
+        from recorders.importers.ros.mcap_file import McapFile
+
         return McapFile(place)
     if place.suffix == ".db3":
+        from recorders.importers.ros.sqlite_file import SqliteFile
+
         return SqliteFile(place)
     if place.suffix in (".bag", ".active"):
+        from recorders.importers.ros.ros1_file import Ros1File
+
         return Ros1File(place)
     raise BadInput(f"{path}: is not a bag; {_WANTED}")
 

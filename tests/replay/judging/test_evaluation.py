@@ -28,8 +28,9 @@ from replay.engine.covariances import normalized_error_squared
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import truth_at
 from replay.judging.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
-from replay.judging.judge import Judge, error_table
+from replay.judging.judge import Judge
 from replay.judging.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
+from replay.judging.tables import error_table
 from replay.judging.truths import Truths
 
 SECOND = 1_000_000_000

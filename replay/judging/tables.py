@@ -1,0 +1,111 @@
+"""What is judged, as tables: rows per step, per run and span of time, per estimate.
+
+They are made of the judge's sums when they are asked for: what prints metrics alone needs no pandas.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pandas as pd
+
+from replay.judging.bounds import Bounds
+from replay.judging.evaluation import Errors, Floats, rmse_interval
+from replay.judging.metrics import step_bounds
+from replay.judging.quantities import Quantities
+
+
+def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """The rows of all tables; what one of them has no column for is NaN there."""
+    filled = [table for table in tables if len(table)]
+    return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+
+
+def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
+    """One row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
+
+    Where there are more than `judge.STEPS` steps, a row is of several; `step` is the first of them. Of
+    a bound there is what it is over the ensemble, if there is that.
+    """
+    errors, by_step = quantities.errors, quantities.by_step
+    cells, count, sums = by_step.filled()
+    covariances = bounds.covariances() if bounds else None
+    if covariances is not None and by_step.width == 1 and len(cells) == len(covariances):
+        squared = np.diagonal(covariances, axis1=1, axis2=2)
+        groups = (squared[:, errors.position].sum(axis=1), squared[:, errors.rotation].sum(axis=1))
+        sums[:, 1:-3] = count[:, None] * np.column_stack([*groups, squared])
+    runs = np.ceil(count / by_step.width)
+    low, high = step_bounds(runs, len(errors.components))
+    rmse, _, scale = errors.main
+    rmse_low, rmse_high = rmse_interval(runs, *(sums[:, -3:-1] / count[:, None]).T)
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "step": cells[:, 1] * by_step.width,
+        "runs": runs.astype(np.int64),
+        "elapsed_s": sums[:, 0] / count,
+        **_means(errors, count, sums),
+        f"{rmse}_low": scale * rmse_low,
+        f"{rmse}_high": scale * rmse_high,
+    }
+    return pd.DataFrame({**columns, "nees_low": low, "nees_high": high})
+
+
+def time_table(quantities: Quantities) -> pd.DataFrame:
+    """One row per run and span of time."""
+    errors, by_time = quantities.errors, quantities.by_time
+    cells, count, sums = by_time.filled()
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": cells[:, 0],
+        "until_s": (cells[:, 1] + 1) * by_time.width * 1e-9,
+        "estimates": count.astype(np.int64),
+    }
+    return pd.DataFrame({**columns, **_means(errors, count, sums)})
+
+
+def run_table(quantities: Quantities) -> pd.DataFrame:
+    """One row per run."""
+    errors = quantities.errors
+    cells, count, sums = quantities.by_time.filled()
+    runs, place = np.unique(cells[:, 0], return_inverse=True)
+    counts: Floats = np.bincount(place, count, len(runs)).astype(float)
+    totals: Floats = np.stack([np.bincount(place, each, len(runs)) for each in sums.T], axis=1)
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": runs,
+        "estimates": counts.astype(np.int64),
+    }
+    return pd.DataFrame({**columns, **_means(errors, counts, totals)})
+
+
+def error_table(errors: Errors) -> pd.DataFrame:
+    """One row per run and step: error and sigma of every component, NEES."""
+    sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
+    columns: dict[str, object] = {
+        "estimator": errors.estimator,
+        "case": errors.case,
+        "run": errors.run,
+        "step": errors.step,
+        "time_ns": errors.time_ns,
+        "elapsed_s": errors.elapsed_s,
+    }
+    for index, name in enumerate(errors.components):
+        columns[f"error_{name}"] = errors.error[:, index]
+        columns[f"sigma_{name}"] = sigma[:, index]
+    columns["nees"] = errors.nees
+    return pd.DataFrame(columns)
+
+
+def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
+    """Columns of RMSE by quantity and of the mean NEES."""
+    mean = sums / count[:, None]
+    columns: dict[str, Floats] = {}
+    if errors.position:
+        columns["position_rmse_m"] = np.sqrt(mean[:, 1])
+    if errors.rotation:
+        columns["orientation_rmse_deg"] = np.degrees(np.sqrt(mean[:, 2]))
+    for column, name in enumerate(errors.components):
+        columns[f"rmse_{name}"] = np.sqrt(mean[:, 3 + column])
+    return {**columns, "nees": mean[:, -1]}
