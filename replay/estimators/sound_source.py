@@ -106,7 +106,7 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
         for start in starts[np.argsort(costs.round(ALIKE), kind="stable")[:BEST]]
     ]
     best = min(fits, key=lambda fit: round(float(fit.cost), ALIKE))
-    place, told = _settled(residuals, slopes, best.x)
+    place, told = _settled(residuals, slopes, best.x, float(size))
     told = told / WIDER**2 + np.eye(free) / parameters.start_sigma_m**2
     covariance = np.diag([0.0] * free + [parameters.height_sigma_m**2] * (3 - free) + [shared_s2])
     covariance[:free, :free] = np.linalg.inv(told)
@@ -114,10 +114,13 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(time_ns, np.array([*place, *middle[free:], 0.0]), covariance, HOW)
 
 
-def _settled(residuals: Function, slopes: Function, place: Floats) -> tuple[Floats, Floats]:
-    """Where the gradient of a soft_l1 cost is zero, next to a place (n,), and the information (n, n).
+def _settled(
+    residuals: Function, slopes: Function, place: Floats, near_m: float
+) -> tuple[Floats, Floats]:
+    """Where the gradient of a soft_l1 cost is zero, near a place (n,), and the information (n, n) there.
 
     A search by the cost itself ends where rounding hides what is lower, at another place on another CPU.
+    Of a source that nothing tells the distance of, the gradient is zero at infinity: it stays in place.
     """
 
     def cost(there: Floats) -> float:
@@ -128,7 +131,7 @@ def _settled(residuals: Function, slopes: Function, place: Floats) -> tuple[Floa
         return slopes(there).T @ (off / np.sqrt(1.0 + off**2))
 
     found = root(gradient, place, tol=1e-14).x
-    if cost(found) <= cost(place) + 10.0**-ALIKE:
+    if np.linalg.norm(found - place) < near_m and cost(found) <= cost(place) + 10.0**-ALIKE:
         place = found
     weight = (1.0 + residuals(place) ** 2) ** -1.5
     return place, (slopes(place).T * weight) @ slopes(place)

@@ -77,6 +77,24 @@ def test_a_source_is_found_inside_and_outside_of_the_microphones(place: tuple) -
     assert_allclose(found(of).mean[:3], place, atol=1e-2)
 
 
+def test_a_start_does_not_hang_on_rounding_nor_lie_at_infinity() -> None:
+    flat = ARRAY * [1.0, 1.0, 0.0]
+    for array, place in (
+        (ARRAY, [12.0, 40.0, 3.0]),
+        (ARRAY, [-200.0, 10.0, 20.0]),
+        (flat, [0.0, 40.0, 0.0]),
+    ):
+        of = streams(array, np.array(place), np.full(6, 1e-4))
+        of["/owl/differences"]["difference_s"][:] += [2e-4, -1e-4, 3e-4, -2e-4, 1e-4]
+        start = found(of).mean
+        of["/owl/differences"]["difference_s"][:] *= 1.0 + 1e-15
+        assert_allclose(found(of).mean, start, rtol=1e-9, atol=1e-9)
+    # from so far away nothing tells how far: waves are plane, and their differences even a little larger
+    of = streams(flat, np.array([1e9, 2e9, 0.0]), np.full(6, 1e-4))
+    of["/owl/differences"]["difference_s"][:] *= 1.001
+    assert np.linalg.norm(found(of).mean) < 1e7
+
+
 def test_microphones_in_a_plane_have_their_source_there() -> None:
     flat = ARRAY * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.0]
     of = streams(flat[:4], np.array([12.0, 40.0, 2.0]), np.full(4, 1e-5))
