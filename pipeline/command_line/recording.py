@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, FILE, foxglove_option, set_option
+from pipeline.command_line.options import ANY_PATH, COUNT, LOG, foxglove_option, set_option
 from recorders.errors import BadInput, printable
 
 
@@ -17,7 +17,7 @@ from recorders.errors import BadInput, printable
     "fuselog record --again run.mcap -o again.mcap",
 )
 @click.argument("scenario", required=False)
-@click.option("-o", "--out", type=FILE, help="The log to write [default: SCENARIO.mcap].")
+@click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
 @click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
 @click.option("--again", type=ANY_PATH, help="Record the run of this log again, by its own metadata.")
@@ -77,7 +77,7 @@ def record(
 )
 @click.argument("source")
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
+@click.option("-o", "--out", type=LOG, help="The log to write [default: SOURCE.mcap].")
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),

@@ -22,7 +22,7 @@ from pipeline.comparing.sides import (
 )
 from pipeline.door import ResultFolder
 from pipeline.ensemble import Progress, hash_files, judge_logs, no_progress
-from pipeline.outputs import check_folder
+from pipeline.outputs import TIMELINE, check_files, check_folder
 from pipeline.replays import Kind, replay
 from pipeline.results import RESULT_FILE, Outcome, result_folder, write_outcome
 from recorders.errors import BadInput, choices
@@ -158,6 +158,7 @@ class Differences:
         from replay.timeline.show import Drawing  # which takes long to import
 
         sides = self.groups[0]
+        check_files([(save, TIMELINE)], {"input": self.inputs})
         if not self.drawable:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
