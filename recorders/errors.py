@@ -26,7 +26,9 @@ def choices(name: str, known: Collection[str]) -> str:
 
 def check_format(path: object, stated: object, read: int) -> None:
     """Raise BadInput where a file states another format than the one that this fuselog reads."""
-    if isinstance(stated, int) and stated != read:
+    if type(stated) is not int:
+        raise BadInput(f"{path}: its format {stated!r} is none of fuselog's; write it again")
+    if stated != read:
         age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
         raise BadInput(
             f"{path}: {age} version of fuselog wrote it (format {stated}, this version reads {read}); "

@@ -57,7 +57,7 @@ def open_recording(
             _finish(recording, connect)
         elif save is not None:
             new = stack.enter_context(whole_file(save, parents=False))
-            encoded = recording.binary_stream()
+            encoded = rr.binary_stream(recording)
             yield recording
             new.write_bytes(encoded.read() or b"")
 

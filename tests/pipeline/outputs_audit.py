@@ -85,9 +85,8 @@ class Command(NamedTuple):
     @property
     def inputs(self) -> list[str]:
         """The files that it names."""
-        return sorted(
-            {word for word in self.words if re.fullmatch(r"\w\S*\.(mcap|csv|toml|tum|rrd|xz)", word)}
-        )
+        named = re.compile(r"\w\S*\.(mcap|csv|toml|tum|rrd|xz)")
+        return sorted({word for word in self.words if named.fullmatch(word)} - {"new.mcap"})
 
     def with_settings(self) -> "Command":
         """The same with a file of settings."""

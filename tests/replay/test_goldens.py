@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from fuselog.testing import assert_same
-from pipeline.checking.golden import TOLERANCE, Golden, Replayed, Tolerance, discrepancies, read
+from pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, discrepancies
+from pipeline.checking.stored import Golden, read
 from recorders.errors import BadInput
 from recorders.registry import available
 from tests.goldens import store
