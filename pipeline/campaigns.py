@@ -12,7 +12,7 @@ import pickle
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, islice
@@ -256,8 +256,11 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                     waiting.appendleft(following)
                     continue
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    error = future.exception()
-                    if isinstance(error, team.lost):
+                    try:
+                        error = future.exception()
+                    except CancelledError:  # by a scheduler that is not there any more
+                        error = BrokenExecutor("the scheduler has ended")
+                    if isinstance(error, (*team.lost, BrokenExecutor)):
                         lost = error
                         continue
                     number = pending.pop(future)

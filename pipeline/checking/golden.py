@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.checking.stored import FORMAT, Golden
 from pipeline.ensemble import Settings, hash_files, hash_streams, replay_in_memory
 from pipeline.starting import order_of
-from recorders.errors import BadInput
+from recorders.errors import BadInput, some_of
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.engine.sources import LogSource, MemorySource
@@ -253,7 +253,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
     is_same_cpu = golden["arithmetic"] == found["arithmetic"]
     for name, stored, new in _pairs(golden["runs"], found["runs"]):
         if stored is None or new is None:
-            there = ", ".join(golden["runs"])
+            there = some_of(golden["runs"])
             raise BadInput(
                 f"{name}: the golden is of {there}; check the same runs, or write a new one with "
                 "--update"

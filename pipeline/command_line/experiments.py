@@ -21,6 +21,7 @@ from pipeline.command_line.options import (
     settings_option,
     workers_option,
 )
+from recorders.errors import printable
 
 
 @command(
@@ -132,4 +133,4 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     write_report(list(results), out, viewer=viewer)
-    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+    click.echo(printable(f"{out}: {out.stat().st_size / 1e6:.1f} MB"))

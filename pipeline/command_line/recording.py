@@ -138,9 +138,9 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
     command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
-    click.echo(f"{mapping}: read it, then: {command}")
+    click.echo(printable(f"{mapping}: read it, then: {command}"))
 
 
 def say_written(path: Path, messages: int) -> None:
     """Say what was written: the log, its messages and its size."""
-    click.echo(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
+    click.echo(printable(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB"))

@@ -42,8 +42,8 @@ files = {}
 time = {{ column = "t", unit = "s" }}
 [[tables.streams]]
 topic = "/x"
-becomes = "Scalar"
-fields = {{ value = "x" }}
+becomes = "Odometry"
+fields = {{ forward_mps = "x", turn_radps = "x" }}
 """
 Craft = Callable[[np.random.Generator], tuple[str, Iterator[str]]]
 

@@ -3,12 +3,14 @@
 import os
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
+from concurrent.futures import Future
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.executors import Here, Team
 from pipeline.experiment import load_experiment, run_experiment
 from pipeline.kept import Kept, kept_cells
 from recorders.errors import BadInput
@@ -211,4 +213,22 @@ def test_folders_made_for_a_campaign_that_fails_go_again(tmp_path: Path) -> None
     with suppress(InterruptedError), kept_cells(tmp_path / "new" / "result") as kept:
         kept.begin()
         raise InterruptedError
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scheduler_that_ends_is_told(tmp_path: Path) -> None:
+    """Its futures are cancelled, which is no error of the study that waits for them."""
+
+    class Ended(Here):
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.cancel()
+            future.set_running_or_notify_cancel()
+            return future
+
+    name, experiment = load_experiment("landmarks", SETTINGS, {"runs": RUNS})
+    with pytest.raises(
+        BadInput, match=r"runs 0 to 127: the process .* died 3 times \(the scheduler has"
+    ):
+        run_experiment(name, experiment, tmp_path / "result", crew=lambda: nullcontext(Team(Ended(), 1)))
     assert not list(tmp_path.iterdir())

@@ -120,7 +120,7 @@ def test_estimates_of_a_log_in_another_frame(fuselog: Fuselog) -> None:
 def test_numbers_that_cannot_be_squared_end_in_a_sentence(
     align: str, world: Path, tmp_path: Path, fuselog: Fuselog
 ) -> None:
-    """1e308 m once gave half a document of JSON and a traceback, and no alignment of it came to an end."""
+    """1e308 m once gave half a document of JSON and a traceback, and its alignment came to no end."""
     path = tmp_path / "far.tum"
     path.write_text("".join(f"{time} 1e308 {time}e307 -1e308 0 0 0 1\n" for time in range(9)))
     said = fuselog("evaluate", path, "--truth", world / "line.tum", "--align", align, "--json")

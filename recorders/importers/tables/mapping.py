@@ -20,7 +20,7 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, some_of
 from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
 from recorders.importers.tables.files import Format
 from recorders.importers.tables.patterns import fitted, names_in
@@ -224,7 +224,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
             find_files(mapping, [folder])
             folders.append(folder)
     if not folders:
-        patterns = ", ".join(table.files for table in mapping.tables if not table.optional)
+        patterns = some_of([table.files for table in mapping.tables if not table.optional])
         raise BadInput(
             f"{place}: neither it nor a folder in it has the files that the mapping names ({patterns})"
         )
@@ -257,11 +257,11 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], lis
             elif path.is_dir():
                 others.append(file)
             else:
-                patterns = ", ".join(table.files for table in mapping.tables)
+                patterns = some_of([table.files for table in mapping.tables])
                 raise BadInput(f"{file}: is not one of the files that the mapping names ({patterns})")
     for table in mapping.tables:
         if not table.optional and not any(each.table is table for each in found):
-            where = ", ".join(map(str, paths))
+            where = some_of(paths)
             raise BadInput(
                 f"{where}: has no file {table.files}, which the mapping needs; add it, or set "
                 "optional = true for its table"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, some_of
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
@@ -61,7 +61,7 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
         arrays = {name.removesuffix(".npy"): _described(archive, name) for name in archive.namelist()}
     lengths = {each.shape[:1] for each in arrays.values()}
     if len(lengths) != 1 or any(len(each.shape) not in (1, 2) for each in arrays.values()):
-        told = ", ".join(f"{name} {each.shape}" for name, each in arrays.items()) or "none"
+        told = some_of([f"{name} {each.shape}" for name, each in arrays.items()]) or "none"
         raise BadInput(
             f"{path}: its arrays are not columns of one length ({told}); save arrays of the same length"
         )
