@@ -227,7 +227,7 @@ def _refuse_asymmetric_priors(
     for topic in bound.priors.keys() & whole.keys():
         covariance = whole[topic].stream["covariance"]
         size = isqrt(covariance.shape[1])
-        if size**2 != covariance.shape[1]:
+        if not len(covariance) or size**2 != covariance.shape[1]:
             continue
         matrix = covariance.reshape(-1, size, size)
         deviation = np.sqrt(np.abs(matrix.diagonal(0, 1, 2)))

@@ -164,7 +164,7 @@ class Usage:
 
 def _infinite(stream: Stream) -> np.ndarray:
     found = np.zeros(len(stream), bool)
-    for column in stream.columns.values():
+    for column in stream.columns.values() if len(stream) else ():
         if column.dtype.kind == "f":
             found |= np.isinf(column).reshape(len(column), -1).any(axis=1)
     return found

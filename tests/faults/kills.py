@@ -24,12 +24,17 @@ from rerun.chunk import RrdReader
 from tests.faults import Tally
 
 FUSELOG = str(Path(sys.executable).with_name("fuselog"))
-# Each writes OUT; `log.mcap` is there.
+# Each writes OUT; `log.mcap` and `est.mcap` are there.
 COMMANDS = {
     "record": ("record landmarks --set duration_s=20 --seed 1 -o", "new.mcap"),
     "replay": ("replay log.mcap -e ekf -e ukf -o", "new.mcap"),
     "run": ("run landmarks --runs 4 --set duration_s=3 --out", "new"),
     "view": ("view log.mcap --save", "new.rrd"),
+    "sweep": ("sweep landmarks --over robots=1,2 --runs 4 --set duration_s=3 --out", "new"),
+    "evaluate": ("evaluate est.mcap --log log.mcap --out", "new"),
+    "compare": ("compare log.mcap -e ekf -e ukf --out", "new"),
+    "tune": ("tune log.mcap -e ekf --free sigma_range_m --out", "new"),
+    "diagnose": ("diagnose log.mcap -e ekf --out", "new"),
 }
 # How soon after it began to write a command is killed, in seconds, in every second trial.
 _SOON_S = 0.3
@@ -53,6 +58,7 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
         (start / "notes.txt").write_text("mine")
         (start / "new.part").write_text("mine")
         _fuselog("record landmarks -o", "log.mcap", start).communicate()
+        _fuselog("replay log.mcap -e ekf -o", "est.mcap", start).communicate()
         wholes: dict[str, Whole] = {}
         while time.monotonic() < end and tried != most:
             command = list(COMMANDS)[tried % len(COMMANDS)]
