@@ -89,7 +89,12 @@ def _disturbed(
     process.send_signal(number)
     said = process.communicate()[1]
     after = _state(work)
-    left = {name: what for name, what in after.items() if before.get(name) != what}
+    left = {
+        name: what
+        for name, what in after.items()
+        # a campaign keeps its finished cells there, and goes on with them
+        if before.get(name) != what and Path(name).parts[0] != f"{out}.unfinished"
+    }
     lost = before.keys() - after.keys()
     written = {name for name in left if Path(name).parts[0] == out}
     in_pieces = any(after.get(name) != whole.state[name] for name in whole.state if written)
@@ -99,7 +104,7 @@ def _disturbed(
     if number == signal.SIGTERM:
         if left.keys() - written or process.returncode not in (0, 128 + number, -number):
             return done, f"ended with {process.returncode} and left {sorted(left)}: {said[-300:]}"
-        if process.returncode != 0 and said.strip() not in ("fuselog: stopped", ""):
+        if process.returncode != 0 and said.strip().splitlines()[-1:] not in ([], ["fuselog: stopped"]):
             return done, f"said {said[-300:]}"
     again = _fuselog(arguments, out, work)
     said = again.communicate()[1]
