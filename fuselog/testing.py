@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.checking.checking import Checked, check, compared, runs_of
-from pipeline.checking.golden import Golden, Replayed, make, read, write
+from pipeline.checking.golden import Replayed, make
+from pipeline.checking.stored import Golden, read, write
 from pipeline.replays import Kind, settings_of
 from replay.engine.sources import LogSource, MemorySource
 

@@ -12,7 +12,7 @@ import pickle
 import shutil
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, islice
@@ -82,8 +82,8 @@ class Cell:
 
     def packed(self, folder: Path) -> bytes:
         """The same as bytes, which any process can take; BadInput where a metric stands against that."""
+        shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
         if self.draws or self.logs or self.errors:
-            shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
             folder.mkdir()
         done = self.work_off(folder)
         try:
@@ -246,9 +246,21 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                     yield left
                     following += 1
                     continue
+                if following not in waiting and following not in pending.values():
+                    died[following] += 1
+                    if died[following] >= ATTEMPTS:
+                        raise BadInput(
+                            f"{kept.folder}: what is kept there is changed by others, or by the disk; "
+                            "give another --out"
+                        )
+                    waiting.appendleft(following)
+                    continue
                 for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    error = future.exception()
-                    if isinstance(error, team.lost):
+                    try:
+                        error = future.exception()
+                    except CancelledError:  # by a scheduler that is not there any more
+                        error = BrokenExecutor("the scheduler has ended")
+                    if isinstance(error, (*team.lost, BrokenExecutor)):
                         lost = error
                         continue
                     number = pending.pop(future)

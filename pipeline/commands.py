@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.coverage import sentences
 from pipeline.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
 from pipeline.estimates import log_of_estimates, stated_estimators
 from pipeline.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
@@ -90,8 +91,10 @@ def replay_logs(
         "seconds": dict(done.seconds),
         "parameters": done.parameters,
         "parameters_of_log": done.stated,
+        "coverage": [row._asdict() for row in done.coverage],
     }
-    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told)
+    unused = sentences(done.coverage)
+    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told, unused=unused)
 
 
 def companions_if(foxglove: bool) -> Companions | None:
@@ -277,6 +280,7 @@ def _print_outcome(
     written: Sequence[Path],
     told: Mapping[str, Any] | None = None,
     more: Mapping[str, float] | None = None,
+    unused: Sequence[str] = (),
 ) -> None:
     values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
     failures = judge.failures
@@ -289,7 +293,7 @@ def _print_outcome(
             "metrics": values,
             "bounds": judge.bounds,
             "failures": failures,
-            "losses": judge.losses,
+            "losses": [*judge.losses, *unused],
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(told or {}))
@@ -302,7 +306,7 @@ def _print_outcome(
             "show that a filter is consistent, only that it is not far from it; nis_per_component says "
             "more"
         )
-    for sentence in judge.losses:
+    for sentence in [*judge.losses, *unused]:
         say(sentence)
     if told:
         print_table(("estimator", "time (s)"), list(told["seconds"].items()))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from pipeline.coverage import rows_of, untaken
 from pipeline.starting import Origin, start_from
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
@@ -27,6 +28,7 @@ from replay.engine.estimator import Bound, bind
 from replay.engine.late import Late
 from replay.engine.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
+from replay.engine.usage import Row, Usage
 from replay.judging.evaluation import Errors, Innovations, errors_at, split_topic
 from replay.judging.judge import TIME_BINS, Judge
 from replay.judging.measuring import Metric, Output, find_metrics, measure, plus
@@ -96,6 +98,8 @@ class Pass:
         judge: of all runs.
         parameters: of every estimator, defaults included, by label.
         stated: those that are not given, as the first log's channels state them; see `stated_of`.
+        usages: what became of the measurements, by bound estimator.
+        untaken: topics of the first log that estimators do not take.
         seconds: that each estimator took, by label.
         refused: by estimator, why none of the runs can be replayed.
         input_sha256: a hash of the data that went in, where it was asked for.
@@ -107,11 +111,23 @@ class Pass:
     refused: dict[str, BadInput] = field(default_factory=dict)
     input_sha256: str = ""
     stated: dict[str, dict[str, str]] = field(default_factory=dict)
+    usages: dict[str, Usage] = field(default_factory=dict)
+    untaken: list[Row] = field(default_factory=list)
+
+    @property
+    def coverage(self) -> list[Row]:
+        """What became of every topic."""
+        return rows_of(self.usages, self.untaken)
 
     def merge(self, other: "Pass") -> None:
         """Take in what a pass over later runs left."""
         self.judge.merge(other.judge)
         self.seconds = plus(self.seconds, other.seconds)
+        for name, usage in other.usages.items():
+            if name in self.usages:
+                self.usages[name].merge(usage)
+            else:
+                self.usages[name] = usage
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
@@ -211,6 +227,7 @@ def replay_parts(
         judge.close()
         done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
         done.stated = stated_of(bound, part.sources[0])
+        done.usages, done.untaken = report.usages, untaken(part.sources[0], estimators, bound)
         if passes:
             passes[0].merge(done)
         else:

@@ -156,6 +156,8 @@ def dask(scheduler: str) -> Crew:
         except ImportError:
             mend = "pip install 'fuselog[dask]'"
             raise BadInput(f"--scheduler {scheduler}: Dask is not installed; {mend}") from None
+        for name in [each for each in logging.root.manager.loggerDict if each.startswith("distributed")]:
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is raised as well
         with ExitStack() as stack:
             address = scheduler
             if scheduler.startswith("local:"):

@@ -6,6 +6,7 @@ from typing import Any
 
 from pipeline.executors import crew_of
 from pipeline.experiment import (
+    Experiment,
     Stated,
     experiment_of_logs,
     read_experiment,
@@ -53,7 +54,7 @@ def run_named(
     if workers is not None or scheduler is not None:
         require_campaign(experiment, "leave out --workers and --scheduler")
     folder = out or Path("out") / label
-    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
+    inputs = _files_of(named, experiment, settings_file)
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
     crew = crew_of(workers, scheduler, len(experiment.files) or experiment.runs)
     result = run_experiment(
@@ -88,6 +89,13 @@ def _stated_experiment(
     return stated, merge(read_settings(settings_file, stated.labels), parse_settings(settings))
 
 
+def _files_of(named: Sequence[str], experiment: Experiment, settings_file: Path | None) -> list[Path]:
+    """The files that an experiment is read from: its logs, itself, its scenario, its settings."""
+    scenario = "" if experiment.record is None else experiment.record.scenario
+    tables = [Path(each) for each in (*named, scenario) if each.endswith(".toml")]
+    return [*experiment.files, *tables, *filter(None, [settings_file])]
+
+
 def sweep_named(
     named: Sequence[str],
     labels: Sequence[str],
@@ -110,8 +118,7 @@ def sweep_named(
     points = points_of(overs, samples, sampling, experiment.seed)
     at = [stated.with_settings(merge(values, nested(point)), over) for point in points]
     folder = out or Path("out") / f"{stated.name}-sweep"
-    inputs = [*experiment.files, *(Path(each) for each in named if each.endswith(".toml"))]
-    check_folder(folder, {"input": inputs})
+    check_folder(folder, {"input": _files_of(named, experiment, settings_file)})
     crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
     result = run_sweep(stated.name, overs, points, at, folder, crew=crew, progress=progress)
     if as_json:

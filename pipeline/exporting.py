@@ -13,7 +13,7 @@ from urllib.parse import quote
 from pipeline.mot import mot_files
 from pipeline.outputs import Kind, check_files, check_folder
 from recorders.atomic import whole_file, whole_folder
-from recorders.errors import BadInput, UnknownName, choices
+from recorders.errors import BadInput, UnknownName, choices, some_of
 from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
 from recorders.trajectories import Trajectory, kitti_lines, tum_lines
 from replay.judging.trajectories import trajectory_of
@@ -133,7 +133,7 @@ def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list
             raise BadInput(f"{log.path}: has nothing that Foxglove can show; export it as csv")
     without = [topic for topic, messages in written.items() if messages == 0]
     if without:
-        notes.append(f"Foxglove has no message for, left out: {', '.join(without)}")
+        notes.append(f"Foxglove has no message for, left out: {some_of(without)}")
     return Exported({topic: place for topic, messages in written.items() if messages}, notes)
 
 

@@ -1,9 +1,11 @@
 """What a command may write over. No command changes or deletes a file that fuselog did not write for it.
 
 A file that exists is replaced only where it is what the same command writes there, and says so itself.
-An output is never an input, another output or a symbolic link, by whatever names they are given.
+An output is never an input, another output or a symbolic link, by whatever names they are given; what is
+judged is the place that will be written.
 """
 
+import os
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -11,11 +13,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.results import RESULT_FILE, read_result
+from recorders.atomic import settled
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
 
-# The note of a log's run that tells how it was cut, merged or relabelled.
-CHANGES = "changes"
+# The notes of a log's run that tell how it was cut, merged or relabelled, and which command did so last.
+CHANGES, CHANGED_BY = "changes", "changed by"
 
 
 class Kind(NamedTuple):
@@ -34,7 +37,8 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
         inputs: the files that are read, by what they are to the user: `{"log": [...]}`.
     """
     taken = {_identity(path): f"{role} {path}" for role, paths in inputs.items() for path in paths}
-    for path, kind in outputs:
+    for named, kind in outputs:
+        path = settled(named)
         if path.suffix.lower() != kind.suffix:
             raise BadInput(f"{path}: this is to be {kind.what}; give a name that ends in {kind.suffix}")
         _refuse_link(path)
@@ -50,13 +54,26 @@ def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Itera
 
 
 def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
-    """Raise BadInput where a folder that is to be replaced is a link or holds an input."""
+    """Raise BadInput where a folder that is to be replaced is a link, a root or holds an input."""
+    folder = settled(folder)
+    if not folder.name:
+        raise BadInput(f"{folder}: is the root of a file system; give a folder in it with --out")
     _refuse_link(folder)
     for role, paths in inputs.items():
         for path in paths:
-            place = path.resolve()
+            place = Path(os.path.realpath(path))
             if _identity(folder) in map(_identity, (place, *place.parents)):
                 raise BadInput(f"{folder}: the {role} {path} is in it; give another folder with --out")
+
+
+def check_outputs(
+    folder: Path | None, timeline: Path | None, inputs: Mapping[str, Iterable[Path]]
+) -> None:
+    """Raise BadInput where a command may not write its result folder or its timeline, if it does."""
+    if timeline is not None:
+        check_files([(timeline, TIMELINE)], inputs)
+    if folder is not None:
+        check_folder(folder, {**inputs, "output": list(filter(None, [timeline]))})
 
 
 def _refuse_link(path: Path) -> None:
@@ -66,7 +83,7 @@ def _refuse_link(path: Path) -> None:
 
 def _is_of_result(path: Path) -> bool:
     """Whether a result folder lists a file as its own."""
-    place = path.resolve()
+    place = Path(os.path.realpath(path))
     for folder in place.parents:
         if (folder / RESULT_FILE).is_file():
             with suppress(BadInput):
@@ -79,7 +96,7 @@ def _identity(path: Path) -> Hashable:
     try:
         state = path.stat()
     except OSError:
-        return path.parent.resolve(), path.name
+        return os.path.realpath(path.parent), path.name
     return state.st_dev, state.st_ino
 
 
@@ -119,8 +136,14 @@ def _holds_estimates(path: Path) -> bool:
     return run is not None and _is_estimates(run)
 
 
-def _is_changed(path: Path) -> bool:
-    return _run_of(path, is_changed=True) is not None
+def changed(command: str) -> Kind:
+    """The log that one of the commands on logs made of others."""
+
+    def is_changed(path: Path) -> bool:
+        run = _run_of(path, is_changed=True)
+        return run is not None and run.notes.get(CHANGED_BY) == command
+
+    return Kind(".mcap", f"a log that fuselog {command} wrote", is_changed)
 
 
 def imported(source: str) -> Kind:
@@ -169,7 +192,6 @@ MAPPING = Kind(".toml", "a mapping to be made", lambda _: False)
 LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
 RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
 ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)
-CHANGED = Kind(".mcap", "a log that fuselog cut, merged or relabelled", _is_changed)
 TIMELINE = Kind(".rrd", "a timeline of fuselog", _is_timeline)
 PICTURE = Kind(".png", "a picture that fuselog took", _is_picture)
 REPORT = Kind(".html", "a report of fuselog", _is_report)

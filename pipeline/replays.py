@@ -19,6 +19,7 @@ import pandas as pd
 
 from pipeline import door
 from pipeline.charts import draw
+from pipeline.coverage import coverage_table, sentences
 from pipeline.door import ResultFolder
 from pipeline.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
 from pipeline.outputs import TIMELINE, check_files, check_folder
@@ -200,7 +201,12 @@ class Replay:
     @property
     def losses(self) -> list[str]:
         """A sentence for what was not estimated throughout, and for measurements that were not used."""
-        return self.judge.losses
+        return [*self.judge.losses, *sentences(self.done.coverage)]
+
+    @property
+    def coverage(self) -> pd.DataFrame:
+        """What became of the logs' topics: messages, used, gated, skipped and why, by estimator."""
+        return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
         """RMSE and NEES over time, of the first case (`robot1`, say) where none is named.
@@ -264,7 +270,7 @@ class Replay:
         stated = {"arrival_order": self.arrival_order or None, "late": self.late}
         settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
-            outcome = summarise(self.judge)
+            outcome = summarise(self.judge, self.done.coverage)
             outcome.input_sha256 = self.input_sha256
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 

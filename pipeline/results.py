@@ -185,10 +185,7 @@ def result_folder(folder: Path) -> AbstractContextManager[Path]:
     Raises BadInput where something else than a result of ours is in the place, where another process
     is filling it, or where it cannot be written.
     """
-    named = folder.name not in ("", "..")  # as `.` is not
-    return whole_folder(
-        folder if named else folder.resolve(), lambda found: _require_ours(found, folder)
-    )
+    return whole_folder(folder, lambda found: _require_ours(found, folder))
 
 
 def _require_ours(found: Path, place: Path) -> None:
@@ -211,7 +208,9 @@ def _require_ours(found: Path, place: Path) -> None:
         if path.is_symlink() or not (path.is_file() if name in expected else name in parents):
             what = "was not written by fuselog"
         elif (
-            name in expected and name != Path(RESULT_FILE) and expected[name] not in (None, _hash(path))
+            name in expected
+            and name != Path(RESULT_FILE)
+            and expected[name] not in (None, hash_of(path))
         ):
             what = "was changed since fuselog wrote it"
         else:
@@ -231,7 +230,8 @@ def _text(result: Result) -> str:
     return json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
 
 
-def _hash(path: Path) -> str:
+def hash_of(path: Path) -> str:
+    """The SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -324,7 +324,7 @@ def write_outcome(
             bounds={key: bounds for key, bounds in outcome.bounds.items() if key in outcome.metrics},
             claims=[decided(claim) for claim in outcome.claims],
             files={
-                path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else _hash(path)
+                path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
                 for path in written
             },
         )

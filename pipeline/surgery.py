@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.constraints import ConstraintParameters, constraints_of
-from pipeline.outputs import CHANGED, CHANGES, check_files
+from pipeline.outputs import CHANGED_BY, CHANGES, changed, check_files
 from pipeline.starting import span_of
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Log, LogWriter, RunMetadata, Stream, open_log, read_blocks, read_empty, schemas
@@ -74,7 +74,7 @@ def cut(
     {'/robot1/prior': 1, '/robot1/odometry': 4}
     """
     log, target = open_log(path, recover=recover), Path(out)
-    check_files([(target, CHANGED)], {"log": [log.path]})
+    check_files([(target, changed("cut"))], {"log": [log.path]})
     notes = _losses(log)
     source = span_of(LogSource(log), start_s, end_s, "publish_time")
     chosen = _readable(log, _matched(log, topics), notes, asked=topics)
@@ -111,7 +111,7 @@ def cut(
         "decimated": " ".join(f"{name}={rate}" for name, rate in (decimate or {}).items()) or None,
     }
     done = " ".join(["cut", log.path.name, *(f"{key} {value}" for key, value in asked.items() if value)])
-    run = _told(_moved(log, target), done)
+    run = _told(_moved(log, target), "cut", done)
     return _write(target, run, [read_empty(log, topic) for topic in chosen], thinned, notes)
 
 
@@ -149,7 +149,7 @@ def merge(
             f"{', '.join(map(str, paths))}: one log has nothing to be merged with; give at least two"
         )
     logs = [open_log(path, recover=recover) for path in paths]
-    check_files([(target, CHANGED)], {"log": [log.path for log in logs]})
+    check_files([(target, changed("merge"))], {"log": [log.path for log in logs]})
     offsets_ns = _offsets_ns(logs, offsets_s or {})
     notes = [note for log in logs for note in _losses(log)]
     chosen = [_readable(log, _ranked(log), notes) for log in logs]
@@ -172,7 +172,7 @@ def merge(
         f"{log.path.name}{f' {offset_ns * 1e-9:+g} s' if offset_ns else ''}"
         for log, offset_ns in zip(logs, offsets_ns, strict=True)
     ]
-    run = _told(_joined(logs, offsets_ns, target), f"merged {', '.join(told)}")
+    run = _told(_joined(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
     return _write(target, run, empty, blocks, notes)
 
 
@@ -200,7 +200,7 @@ def relabel(
     is in the place of the output.
     """
     log, target = open_log(path, recover=recover), Path(out)
-    check_files([(target, CHANGED)], {"log": [log.path]})
+    check_files([(target, changed("relabel"))], {"log": [log.path]})
     if not topics and not components:
         raise BadInput(f"{log.path}: nothing to rename; give a topic or a component")
     names = _renamed_topics(log, topics or {})
@@ -217,7 +217,7 @@ def relabel(
 
     blocks = ([renamed(stream) for stream in block] for block in _blocks(log, chosen))
     pairs = [f"{old}={new}" for old, new in {**(topics or {}), **(components or {})}.items()]
-    run = _told(_moved(log, target), f"relabelled {log.path.name} {' '.join(pairs)}")
+    run = _told(_moved(log, target), "relabel", f"relabelled {log.path.name} {' '.join(pairs)}")
     return _write(target, run, [renamed(read_empty(log, topic)) for topic in chosen], blocks, notes)
 
 
@@ -244,7 +244,7 @@ def constrain(
     for, or something else is in the place of the output.
     """
     log, target = open_log(path, recover=recover), Path(out)
-    check_files([(target, CHANGED)], {"log": [log.path]})
+    check_files([(target, changed("constrain"))], {"log": [log.path]})
     parameters = build(ConstraintParameters, settings or {}, "constrain")
     chosen_unit = _unit_of(log, unit)
     added = constraints_of(LogSource(log).read([chosen_unit])[chosen_unit], parameters)
@@ -260,7 +260,9 @@ def constrain(
     chosen = _readable(log, _ranked(log), notes)
     empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
     names = " ".join(stream.topic for stream in added)
-    run = _told(_moved(log, target), f"constrained {log.path.name} by {chosen_unit}: {names}")
+    run = _told(
+        _moved(log, target), "constrain", f"constrained {log.path.name} by {chosen_unit}: {names}"
+    )
     return _write(target, run, empty, chain(_blocks(log, chosen), [added]), notes)
 
 
@@ -541,6 +543,8 @@ def _joined(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> Run
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):
         for subject, fact in run.notes.items():
+            if subject == CHANGED_BY:
+                continue
             is_new = notes.get(subject, fact) == fact
             notes[subject if is_new else f"{subject} ({log.path.name})"] = fact
     first, *others = (replace(run, notes=notes) for run in runs)
@@ -549,7 +553,7 @@ def _joined(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> Run
     return RunMetadata(UNKNOWN, epoch_ns=max(0, first.epoch_ns + offsets_ns[0]), notes=notes)
 
 
-def _told(run: RunMetadata, done: str) -> RunMetadata:
-    """The run, with what was done to its log, after what was done before."""
+def _told(run: RunMetadata, command: str, done: str) -> RunMetadata:
+    """The run, with what a command did to its log, after what was done before."""
     before = [run.notes[CHANGES]] if CHANGES in run.notes else []
-    return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done])})
+    return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

@@ -29,6 +29,17 @@ _LOCK, _NEW, _OLD = "fuselog.lock", "new", "old"
 _LOG = logging.getLogger(__name__)
 
 
+def settled(place: Path) -> Path:
+    """The place that will be written where a name leads to, once the folders that are missing are made.
+
+    `MISSING/../FILE` is no other file than FILE, though no system finds it before MISSING is there. What
+    is in the place may be a link, and is not followed.
+    """
+    if place.name in ("", ".."):  # as `.` is
+        return Path(os.path.realpath(place))
+    return Path(os.path.realpath(place.parent), place.name) if ".." in place.parts else place
+
+
 @contextmanager
 def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
     """A path to write; what is there when all went well replaces `place`, in one step.
@@ -39,8 +50,9 @@ def whole_file(place: Path, *, parents: bool = True) -> Iterator[Path]:
 
     Raises BadInput where it cannot be written.
     """
+    named, place = place, settled(place) if parents else place
     _clear_leftovers(place)
-    with _parent_of(place, make=parents), _working_folder(place) as work, _telling(place, work):
+    with parents_of(named, make=parents), _working_folder(place) as work, _telling(place, work):
         new = work / (_NEW + place.suffix)
         yield new
         with new.open("rb+") as file:
@@ -57,13 +69,14 @@ def whole_folder(place: Path, check: Callable[[Path], None]) -> Iterator[Path]:
 
     Raises BadInput where the folder cannot be written, or another process is writing it.
     """
+    named, place = place, settled(place)
     if _clear_leftovers(place):
         raise BadInput(
             f"{place}: another fuselog command is writing it; wait for it, or give another --out"
         )
     if place.exists():
         check(place)
-    with _parent_of(place, make=True), _working_folder(place) as work, _telling(place, work):
+    with parents_of(named, make=True), _working_folder(place) as work, _telling(place, work):
         new, old = work / _NEW, work / _OLD
         new.mkdir()
         yield new
@@ -170,8 +183,11 @@ def _remove(work: Path, place: Path, lock: FileLock) -> None:
 
 
 @contextmanager
-def _parent_of(place: Path, *, make: bool) -> Iterator[None]:
-    """The folder of a place; if it is made here and nothing comes of it, it is removed again."""
+def parents_of(place: Path, *, make: bool = True) -> Iterator[None]:
+    """The folders that a place is in; those that are made here and of which nothing comes go again.
+
+    Raises BadInput where they cannot be made.
+    """
     missing = [folder for folder in place.parents if not folder.exists()] if make else []
     with _telling(place):
         if make:

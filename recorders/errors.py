@@ -1,6 +1,10 @@
 """The one exception for what a user can mend, and how its sentences are worded and shown."""
 
 from collections.abc import Collection
+from itertools import islice
+
+# So many names stand in a sentence; among so many, none of them longer, one nearly the same is sought.
+_NAMED, _COMPARED = 50, 2000
 
 
 class BadInput(Exception):
@@ -20,13 +24,23 @@ def choices(name: str, known: Collection[str]) -> str:
     """The end of a sentence on an unknown name: the one that was probably meant, else all there are."""
     from difflib import get_close_matches  # for a mistake alone, not for every start
 
-    near = get_close_matches(name, known, n=1) or [each for each in known if name and name in each]
-    return f"did you mean '{near[0]}'?" if near else f"there are: {', '.join(known) or 'none'}"
+    few = len(known) <= _COMPARED and all(len(each) <= _COMPARED for each in (name, *known))
+    near = get_close_matches(name, known, n=1) if few else []
+    near = near or [each for each in known if name and name in each]
+    return f"did you mean '{near[0]}'?" if near else f"there are: {some_of(known) or 'none'}"
+
+
+def some_of(names: Collection[object]) -> str:
+    """Names in a sentence: the first ones, and how many more there are."""
+    more = len(names) - _NAMED
+    return ", ".join(map(str, islice(names, _NAMED))) + (f" and {more} more" if more > 0 else "")
 
 
 def check_format(path: object, stated: object, read: int) -> None:
     """Raise BadInput where a file states another format than the one that this fuselog reads."""
-    if isinstance(stated, int) and stated != read:
+    if type(stated) is not int:
+        raise BadInput(f"{path}: its format {stated!r} is none of fuselog's; write it again")
+    if stated != read:
         age, mend = ("a newer", "update fuselog") if stated > read else ("an older", "write it again")
         raise BadInput(
             f"{path}: {age} version of fuselog wrote it (format {stated}, this version reads {read}); "
@@ -35,8 +49,7 @@ def check_format(path: object, stated: object, read: int) -> None:
 
 
 def printable(text: str) -> str:
-    """A text for a terminal: line breaks stay, other control characters are shown by their numbers."""
+    """A text for a line of a terminal: control characters and line breaks are shown by their numbers."""
     return "".join(
-        each if each.isprintable() or each == "\n" else each.encode("unicode_escape").decode()
-        for each in text
+        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
     )

@@ -20,13 +20,15 @@ from recorders.errors import BadInput
 DEEPEST = 50
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str, *, constants: bool = False) -> Any:
     """The value that a JSON text states; raises ValueError where there is none, or it is too deep.
 
-    Numbers that JSON does not know (NaN, and what is beyond the range of a double) are none.
+    Numbers that JSON does not know (NaN, and what is beyond the range of a double) are none, unless
+    `constants` takes them as Python writes them.
     """
+    number = float if constants else _finite
     return _shallow(
-        partial(json.loads, parse_int=_whole, parse_float=_finite, parse_constant=_finite), text
+        partial(json.loads, parse_int=_whole, parse_float=number, parse_constant=number), text
     )
 
 

@@ -23,6 +23,8 @@ Format = Literal["tum", "kitti", "euroc"]
 
 # How far quaternions may be from unit length, and matrices from orthogonal: they are printed numbers.
 TOLERANCE = 1e-3
+# Squares of positions that are farther away, and their sums, may be no numbers any more.
+FARTHEST_M = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,11 @@ class Trajectory:
             values = getattr(self, what)
             if values is not None and values.shape != shape:
                 raise BadInput(f"{self.name}: {what} has shape {values.shape}; expected {shape}")
+        if np.any(np.abs(self.position_m) > FARTHEST_M):
+            raise BadInput(
+                f"{self.name}: has a position beyond {FARTHEST_M:g} m, which cannot be compared; "
+                "leave such poses out"
+            )
         if self.time_ns is not None and np.any(np.diff(self.time_ns) < 0):
             raise BadInput(f"{self.name}: its stamps go back; sort the poses by time")
 

@@ -6,17 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.checking.golden import (
-    SUFFIX,
     Discrepancy,
-    Golden,
     Replayed,
     Tolerances,
     discrepancies,
     first_of,
     make,
-    read,
-    write,
 )
+from pipeline.checking.stored import SUFFIX, Golden, read, write
 from pipeline.ensemble import Settings
 from pipeline.folders import logs_in
 from pipeline.outputs import Kind, check_files
@@ -54,6 +51,8 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
     Raises BadInput where the runs are others than the golden's, or no estimator can follow them.
     """
     stored = golden["settings"]
+    if not estimators and not stored["estimators"]:
+        raise BadInput("the golden names no estimators; give those that it is of")
     replayed = make(
         runs,
         stored["estimators"] if estimators is None else estimators,

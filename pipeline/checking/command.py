@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.checking.checking import check, runs_of, update
-from pipeline.checking.golden import Tolerance, read
+from pipeline.checking.golden import Tolerance
 from pipeline.checking.junit import JUNIT, write_junit
+from pipeline.checking.stored import read
 from pipeline.outputs import check_files
 from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, say

@@ -8,35 +8,29 @@ rows spread evenly, in full precision, and sums over all rows. How long anything
 import base64
 import hashlib
 import json
-import lzma
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.checking.stored import FORMAT, Golden
 from pipeline.ensemble import Settings, hash_files, hash_streams, replay_in_memory
 from pipeline.starting import order_of
-from recorders.atomic import whole_file
-from recorders.errors import BadInput, check_format
+from recorders.errors import BadInput, some_of
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
 from replay.engine.sources import LogSource, MemorySource
 from replay.judging.evaluation import split_topic
 
-SUFFIX = ".golden.xz"
-# Raised when a golden is written in a way that this reader would misread.
-FORMAT = 1
 # Of each stream as many rows as this many numbers of the whole golden allow, between the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32
 TOLERANCE, TOLERANCE_ELSEWHERE = 1e-12, 1e-6
 # Their values are numbers of sentences, which may be worded anew.
 REASONS = {schemas.FAILURE.full_name, schemas.SKIPPED.full_name, schemas.STARTED.full_name}
 
-Golden = dict[str, Any]
 Floats = NDArray[np.float64]
 Outputs = Mapping[str, Stream]
 
@@ -250,29 +244,6 @@ def arithmetic() -> str:
     return _sha256(np.concatenate([np.ravel(part) for part in parts]))
 
 
-def write(path: Path, golden: Golden) -> None:
-    """Keep a golden; the same one gives the same bytes."""
-    text = json.dumps(golden, sort_keys=True, separators=(",", ":"))
-    with whole_file(path) as part:
-        part.write_bytes(lzma.compress(text.encode(), preset=9))
-
-
-def read(path: Path) -> Golden:
-    """A golden that is kept; raises BadInput where it is missing, damaged or of another format."""
-    try:
-        golden = json.loads(lzma.decompress(path.read_bytes()))
-    except FileNotFoundError:
-        raise BadInput(f"{path}: no such golden; --update writes it") from None
-    except (OSError, lzma.LZMAError, ValueError) as error:
-        raise BadInput(
-            f"{path}: is not a golden, or is damaged ({error}); --update writes a new one"
-        ) from None
-    if not isinstance(golden, dict) or "format" not in golden:
-        raise BadInput(f"{path}: is not a golden of fuselog check; --update writes one")
-    check_format(path, golden["format"], FORMAT)
-    return golden
-
-
 def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
     """Everything in which a replay is not the golden, run by run.
 
@@ -282,7 +253,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
     is_same_cpu = golden["arithmetic"] == found["arithmetic"]
     for name, stored, new in _pairs(golden["runs"], found["runs"]):
         if stored is None or new is None:
-            there = ", ".join(golden["runs"])
+            there = some_of(golden["runs"])
             raise BadInput(
                 f"{name}: the golden is of {there}; check the same runs, or write a new one with "
                 "--update"
@@ -308,7 +279,7 @@ def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
         if each.apart <= each.allowed:
             continue
         stream = replayed.outputs.get(each.run, {}).get(each.topic)
-        if each.row is not None and stream is not None:
+        if each.row is not None and stream is not None and each.row < len(stream):
             each = each._replace(stamp_ns=int(stream.publish_time_ns[each.row]))
         yield each
 
@@ -319,6 +290,9 @@ def _distances(
     """How far every part is from the golden's, relative to its size; infinite where one is missing."""
     for key, stored, new in _pairs(golden["metrics"], found["metrics"]):
         before, after = _floats(stored), _floats(new)
+        if before.shape != after.shape:
+            yield missing("", "metric", key)
+            continue
         apart = float(np.max(_relative(_difference(before, after), np.abs(before)), initial=0.0))
         yield missing("", "metric", key)._replace(apart=apart)
     for name, run in golden["runs"].items():

@@ -9,8 +9,8 @@ from pipeline.command_line.help import command
 from pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
-    FILE,
-    FOLDER,
+    PAGE,
+    RESULT,
     arrival_option,
     errors_option,
     json_option,
@@ -21,6 +21,7 @@ from pipeline.command_line.options import (
     settings_option,
     workers_option,
 )
+from recorders.errors import printable
 
 
 @command(
@@ -40,7 +41,7 @@ from pipeline.command_line.options import (
 @late_option
 @errors_option
 @click.option("--data", type=ANY_PATH, help="Where the real data are, for experiments that import.")
-@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT].")
+@click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT].")
 @workers_option
 @scheduler_option
 @parameters_option
@@ -94,7 +95,7 @@ def run(
 @click.option("--sampling", type=click.Choice(["sobol", "random"]), default="sobol", show_default=True)
 @click.option("--runs", type=int, help="Number of Monte Carlo runs at each point.")
 @click.option("--seed", type=int, help="Seed of the random numbers.")
-@click.option("--out", type=FOLDER, help="The result folder [default: out/EXPERIMENT-sweep].")
+@click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT-sweep].")
 @workers_option
 @scheduler_option
 @json_option
@@ -123,7 +124,7 @@ def sweep(
     "fuselog report out/landmarks -o report.html",
 )
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-o", "--out", type=FILE, default=Path("report.html"), show_default=True)
+@click.option("-o", "--out", type=PAGE, default=Path("report.html"), show_default=True)
 @click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
 def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
@@ -132,4 +133,4 @@ def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     write_report(list(results), out, viewer=viewer)
-    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+    click.echo(printable(f"{out}: {out.stat().st_size / 1e6:.1f} MB"))

@@ -8,9 +8,9 @@ import click
 from pipeline.command_line.help import command
 from pipeline.command_line.options import (
     ANY_PATH,
-    FILE,
-    FOLDER,
     FORMAT,
+    RESULT,
+    TIMELINE,
     Seconds,
     TimeOffset,
     errors_option,
@@ -75,7 +75,7 @@ from recorders.errors import BadInput
     help="Add this to the stamps of the estimated trajectory, or find it [default: 0].",
 )
 @click.option("--metric", "metrics", multiple=True, help="A metric (repeatable) [default: all].")
-@click.option("--out", type=FOLDER, help="Write a result folder, as fuselog run does.")
+@click.option("--out", type=RESULT, help="Write a result folder, as fuselog run does.")
 @errors_option
 @recover_option
 @gap_option
@@ -140,8 +140,8 @@ def evaluate(
     show_default=True,
     help="The relative difference of a metric that counts as none.",
 )
-@click.option("--out", type=FOLDER, help="Write a result folder: tables, figures, the timeline.")
-@click.option("--save", type=FILE, help="Write the timeline, side by side, to this .rrd file.")
+@click.option("--out", type=RESULT, help="Write a result folder: tables, figures, the timeline.")
+@click.option("--save", type=TIMELINE, help="Write the timeline, side by side, to this .rrd file.")
 @recover_option
 @gap_option
 @json_option
@@ -165,8 +165,8 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 )
 @click.argument("logs", metavar="LOG", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-e", "--estimator", "label", help="The estimator; by default the only one of estimates.")
-@click.option("--out", type=FOLDER, help="A result folder to write, for fuselog report.")
-@click.option("--save", type=FILE, help="A timeline (.rrd) to write, with the sentences as events.")
+@click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
+@click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
 @click.option("--model", help="The model to estimate, where several fit the log.")
 @recover_option
 @gap_option

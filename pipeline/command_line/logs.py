@@ -9,7 +9,9 @@ import click
 from pipeline.command_line.help import command
 from pipeline.command_line.options import (
     ANY_PATH,
-    FILE,
+    LOG_OR_FOLDER,
+    PICTURE,
+    TIMELINE,
     Seconds,
     gap_option,
     json_option,
@@ -46,11 +48,11 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     "fuselog view out/landmarks --screenshot picture.png --at 30",
 )
 @click.argument("path", type=ANY_PATH)
-@click.option("--screenshot", type=FILE, help="Take the viewer's picture, headless, as PNG.")
+@click.option("--screenshot", type=PICTURE, help="Take the viewer's picture, headless, as PNG.")
 @click.option("--at", "at_s", type=Seconds(), help="Put the time cursor this many seconds into the run.")
 @click.option("--start", "start_s", type=Seconds(), help="Draw from this many seconds into the run on.")
 @click.option("--end", "end_s", type=Seconds(), help="Draw up to this many seconds into the run.")
-@click.option("--save", type=FILE, help="Write the timeline to this .rrd instead of opening it.")
+@click.option("--save", type=TIMELINE, help="Write the timeline to this .rrd instead of opening it.")
 @click.option("--connect", metavar="URL", help="Stream the timeline to this Rerun viewer.")
 @click.option("--focus", help="What to show first, such as robot3.")
 @recover_option
@@ -77,7 +79,7 @@ def view(path: Path, **options: Any) -> None:
 @click.option(
     "-o",
     "--out",
-    type=ANY_PATH,
+    type=LOG_OR_FOLDER,
     help="The folder to write, or with one --topic the file [default: named after PATH].",
 )
 @click.option("--topic", "topics", multiple=True, help="A topic (repeatable) [default: all that fit].")

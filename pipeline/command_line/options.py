@@ -7,11 +7,23 @@ from typing import Any
 import click
 
 
-class OutputFile(click.Path):
+class Output(click.Path):
+    """What a command writes, by which the audit of outputs in tests finds it.
+
+    Attributes:
+        suffix: of the file; empty for what is only ever a folder.
+    """
+
+    def __init__(self, suffix: str = "", **options: Any) -> None:
+        super().__init__(path_type=Path, **options)
+        self.suffix = suffix
+
+
+class OutputFile(Output):
     """A file to write: a new one, or a regular one that is replaced; never a device or a folder."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path, dir_okay=False)
+    def __init__(self, suffix: str) -> None:
+        super().__init__(suffix, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The path."""
@@ -47,8 +59,10 @@ class TimeOffset(Seconds):
         return value if value == "estimate" else super().convert(value, param, ctx)
 
 
-FOLDER = click.Path(path_type=Path, file_okay=False)
-FILE = OutputFile()
+RESULT = Output(file_okay=False)
+LOG_OR_FOLDER = Output(".mcap")
+LOG, TIMELINE, PICTURE, PAGE = map(OutputFile, (".mcap", ".rrd", ".png", ".html"))
+GOLDEN, JUNIT = map(OutputFile, (".xz", ".xml"))
 ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
@@ -80,7 +94,7 @@ parameters_option = click.option(
 recover_option = click.option(
     "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
 )
-out_log_option = click.option("-o", "--out", type=FILE, required=True, help="The log to write.")
+out_log_option = click.option("-o", "--out", type=LOG, required=True, help="The log to write.")
 gap_option = click.option(
     "--gap-limit",
     "gap_limit_s",

@@ -56,6 +56,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code or 0
 
 
+# Of a sentence; a path has up to 4096 characters.
+_LONGEST = 10_000
+
+
 class Stopped(KeyboardInterrupt):
     """A signal asked the process to end: what holds for Ctrl-C holds for it."""
 
@@ -105,6 +109,8 @@ def _sentence(error: Exception, place: str) -> str:
 
 def _fail(sentence: str) -> int:
     line = printable(sentence.strip().replace("\n", " "))
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
     click.echo(f"fuselog: {line}", err=True)
     return 2
 

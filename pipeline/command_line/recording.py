@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, FILE, foxglove_option, set_option
+from pipeline.command_line.options import ANY_PATH, COUNT, LOG, foxglove_option, set_option
 from recorders.errors import BadInput, printable
 
 
@@ -17,7 +17,7 @@ from recorders.errors import BadInput, printable
     "fuselog record --again run.mcap -o again.mcap",
 )
 @click.argument("scenario", required=False)
-@click.option("-o", "--out", type=FILE, help="The log to write [default: SCENARIO.mcap].")
+@click.option("-o", "--out", type=LOG, help="The log to write [default: SCENARIO.mcap].")
 @click.option("--seed", type=COUNT, help="Seed of the random numbers [default: 0].")
 @click.option("--run", type=COUNT, help="Which run of the seed [default: 0].")
 @click.option("--again", type=ANY_PATH, help="Record the run of this log again, by its own metadata.")
@@ -77,7 +77,7 @@ def record(
 )
 @click.argument("source")
 @click.argument("paths", metavar="PATH...", nargs=-1, required=True, type=ANY_PATH)
-@click.option("-o", "--out", type=FILE, help="The log to write [default: SOURCE.mcap].")
+@click.option("-o", "--out", type=LOG, help="The log to write [default: SOURCE.mcap].")
 @click.option(
     "--clock",
     type=click.Choice(["header", "bag"]),
@@ -138,9 +138,9 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
     command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
-    click.echo(f"{mapping}: read it, then: {command}")
+    click.echo(printable(f"{mapping}: read it, then: {command}"))
 
 
 def say_written(path: Path, messages: int) -> None:
     """Say what was written: the log, its messages and its size."""
-    click.echo(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB")
+    click.echo(printable(f"{path}: {messages} messages, {path.stat().st_size / 1e6:.1f} MB"))

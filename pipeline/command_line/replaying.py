@@ -9,8 +9,11 @@ from pipeline.command_line.help import command
 from pipeline.command_line.options import (
     ANY_PATH,
     COUNT,
-    FILE,
-    FOLDER,
+    GOLDEN,
+    JUNIT,
+    LOG_OR_FOLDER,
+    RESULT,
+    TIMELINE,
     Seconds,
     arrival_option,
     foxglove_option,
@@ -39,7 +42,7 @@ from pipeline.command_line.options import (
 @click.option(
     "-o",
     "--out",
-    type=ANY_PATH,
+    type=LOG_OR_FOLDER,
     help="The folder for LOG.estimates.mcap, or for one log a file .mcap [default: beside the log].",
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
@@ -68,7 +71,7 @@ from pipeline.command_line.options import (
     help="Standard deviation of a component for --start-from truth (repeatable) [default: the prior's].",
 )
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
-@click.option("--save", type=FILE, help="Also write the timeline of the first log to this .rrd.")
+@click.option("--save", type=TIMELINE, help="Also write the timeline of the first log to this .rrd.")
 @click.option("--connect", metavar="URL", help="Also stream the timeline to this Rerun viewer.")
 @foxglove_option
 @recover_option
@@ -130,7 +133,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
 )
 @click.option(
-    "--out", type=FOLDER, default=Path("out/tune"), show_default=True, help="The result folder."
+    "--out", type=RESULT, default=Path("out/tune"), show_default=True, help="The result folder."
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
 @workers_option
@@ -159,7 +162,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     "fuselog check run.mcap --against ekf.golden.xz",
 )
 @click.argument("path", type=ANY_PATH)
-@click.option("--against", "golden", type=FILE, required=True, help="The golden, a .golden.xz file.")
+@click.option("--against", "golden", type=GOLDEN, required=True, help="The golden, a .golden.xz file.")
 @click.option("--update", "is_update", is_flag=True, help="Write the golden instead of checking.")
 @click.option(
     "-e",
@@ -185,7 +188,9 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     help="With --update: how far apart, relative to its size, such a 'TOPIC COLUMN' may be (repeatable) "
     "[default: 1e-12, 1e-6 on another CPU].",
 )
-@click.option("--junit", type=FILE, help="Write the results for continuous integration, as JUnit's XML.")
+@click.option(
+    "--junit", type=JUNIT, help="Write the results for continuous integration, as JUnit's XML."
+)
 @json_option
 @settings_option
 @set_option

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.comparing.comparing import compare
-from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.outputs import check_outputs
 from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, print_table, progress, say, warn
 
@@ -40,11 +40,7 @@ def compare_sides(
     settings: Sequence[str],
 ) -> None:
     """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
-    inputs = {"input": [*sides, *filter(None, [truth, settings_file])]}
-    if out is not None:
-        check_folder(out, inputs)
-    if save is not None:
-        check_files([(save, TIMELINE)], inputs)
+    check_outputs(out, save, {"input": [*sides, *filter(None, [truth, settings_file])]})
     chosen = settings_of_estimators(labels, settings, settings_file)
     found = compare(
         *sides,

@@ -22,10 +22,10 @@ from pipeline.comparing.sides import (
 )
 from pipeline.door import ResultFolder
 from pipeline.ensemble import Progress, hash_files, judge_logs, no_progress
-from pipeline.outputs import check_folder
+from pipeline.outputs import TIMELINE, check_files, check_folder
 from pipeline.replays import Kind, replay
 from pipeline.results import RESULT_FILE, Outcome, result_folder, write_outcome
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, some_of
 from recorders.log import NotMcap, RunMetadata, open_log, schemas
 from recorders.trajectories import read_trajectory
 from replay.engine.sources import LogSource, MemorySource, Source
@@ -158,6 +158,7 @@ class Differences:
         from replay.timeline.show import Drawing  # which takes long to import
 
         sides = self.groups[0]
+        check_files([(save, TIMELINE)], {"input": self.inputs})
         if not self.drawable:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
@@ -359,7 +360,7 @@ def _truth_topic(source: Source, case: str | None) -> str:
     if case is None and len(truths) == 1:
         return next(iter(truths.values()))
     if case not in truths:
-        known = ", ".join(truths) or "none"
+        known = some_of(truths) or "none"
         raise BadInput(
             f"{source.name}: name with --case the truth that trajectories are judged by: {known}"
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.outputs import TIMELINE, check_files, check_folder
+from pipeline.outputs import check_outputs
 from pipeline.results import plain
 from pipeline.settings import settings_of_estimators
 from pipeline.terminal import print_json, print_metrics, print_table, say, status
@@ -36,10 +36,7 @@ def diagnose_log(
             f"{len(logs)} logs: one log is diagnosed at a time; give each by itself, and all of them to "
             "fuselog tune"
         )
-    if out is not None:
-        check_folder(out, {"log": [log]})
-    if save is not None:
-        check_files([(save, TIMELINE)], {"log": [log]})
+    check_outputs(out, save, {"log": [log], "settings": list(filter(None, [settings_file]))})
     if label is not None:
         given = settings_of_estimators([label], settings, settings_file, model=model)[label]
     elif settings_file is not None:

@@ -189,7 +189,7 @@ class Diagnosis:
         """
         place = Path(folder)
         check_folder(place, {"input": self.replay.paths})
-        outcome = summarise(self.replay.judge)
+        outcome = summarise(self.replay.judge, self.replay.done.coverage)
         outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
         outcome.figures |= self.profiles
         outcome.input_sha256 = self.replay.input_sha256

@@ -4,14 +4,16 @@ It is what most experiments need: record or import, replay, judge, draw. Familie
 add their own tables, figures and claims.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import pandas as pd
 
 from pipeline.campaigns import judge
 from pipeline.charts import Axis, Chart, Panel, Style, band, curve, thinned
+from pipeline.coverage import coverage_table
 from pipeline.experiment import Experiment, Setting, Study
 from pipeline.results import MetricValue, Outcome, split_metric
+from replay.engine.usage import Row
 from replay.judging.evaluation import Errors
 from replay.judging.judge import Judge
 from replay.judging.means import INSERTED
@@ -20,14 +22,16 @@ from replay.judging.means import INSERTED
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.experiment.Study`."""
     done = judge(experiment, setting)
-    outcome = summarise(done.judge)
+    outcome = summarise(done.judge, done.coverage)
     outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters
     return outcome
 
 
-def summarise(judge: Judge) -> Outcome:
-    """Metrics, tables and figures of a judged replay."""
+def summarise(judge: Judge, coverage: Sequence[Row] = ()) -> Outcome:
+    """Metrics, tables and figures of a judged replay, and what became of the log's topics in it."""
     outcome = Outcome()
+    if coverage:
+        outcome.tables["coverage"] = coverage_table(coverage)
     outcome.metrics.update(judge.metrics)
     outcome.bounds.update(judge.bounds)
     outcome.tables["summary"] = summary_table(outcome.metrics)

@@ -41,7 +41,7 @@ def tune_logs(
     """Say what is tuned on and what is held out, tune, write the result folder, print what was found."""
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
-    check_folder(out, {"log": [*logs, *held_out]})
+    check_folder(out, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))})
     chosen = settings_of_estimators([label], settings, settings_file, model=model)
     if not as_json:
         say(f"tuned on {_in_words(logs)}; held out: {_in_words(held_out)}")

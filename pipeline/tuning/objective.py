@@ -6,6 +6,7 @@ points are shared among threads, whose kernels run side by side, or among the wo
 
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
@@ -211,6 +212,10 @@ class Objective:
             ]
             try:
                 return [[sums for part in of_run for sums in part.result()] for of_run in working]
+            except CancelledError:
+                raise BadInput(
+                    f"the scheduler ended while it tuned {self.label}; start it again"
+                ) from None
             except team.lost as error:
                 raise BadInput(
                     f"a process that tunes {self.label} died ({error}); try fewer workers"

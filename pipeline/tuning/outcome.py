@@ -336,7 +336,7 @@ class Tuning:
         check_folder(place, {"input": [path for each in self.replays for path in each.paths]})
         outcome = Outcome(input_sha256=self.replay.input_sha256)
         for each in self.replays:
-            found = summarise(each.judge)
+            found = summarise(each.judge, each.done.coverage)
             outcome.metrics |= found.metrics
             outcome.bounds |= found.bounds
             if each is self.replay:

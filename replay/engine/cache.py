@@ -6,6 +6,7 @@ file, and then the content.
 
 import logging
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -39,27 +40,39 @@ def cache_folder() -> Path:
 def is_private(folder: Path) -> bool:
     """Whether only this user can have written to a folder of the cache; what speaks against it is said.
 
-    A folder that is not there yet is private: `write_checked` makes it so. Systems without user numbers
-    (Windows) keep a user's folders apart by themselves.
+    A folder that is not there yet is private: `write_checked` makes it so. Of the folder that it lies in
+    others may be owners or writers where that is sticky, as /tmp is: nobody else moves an entry away.
     """
-    if not hasattr(os, "getuid"):
-        return True
     for place in (folder.parent, folder):
         try:
             status = place.stat()
         except OSError:
             continue
-        if status.st_uid != os.getuid():
+        sticky = place != folder and status.st_mode & stat.S_ISVTX and status.st_uid in (0, _user())
+        if sticky or is_own(status):
+            continue
+        if status.st_uid != _user():
             say_once(
                 f"the cache {place} is not used: another user owns it; set FUSELOG_CACHE to your own"
             )
-            return False
-        if status.st_mode & _OTHERS_MAY_WRITE:
+        else:
             say_once(
                 f"the cache {place} is not used: other users may write to it; chmod go-w forbids them"
             )
-            return False
+        return False
     return True
+
+
+def is_own(status: os.stat_result) -> bool:
+    """Whether a file or folder is this user's, and nobody else may write to it.
+
+    Systems without user numbers (Windows) keep a user's folders apart by themselves.
+    """
+    return _user() is None or (status.st_uid == _user() and not status.st_mode & _OTHERS_MAY_WRITE)
+
+
+def _user() -> int | None:
+    return os.getuid() if hasattr(os, "getuid") else None
 
 
 @cache
@@ -76,17 +89,30 @@ def kept_files() -> Iterator[Path]:
             yield path
 
 
+def read_own(path: Path) -> bytes | None:
+    """As `read_checked`, and None too where others may have written the file, whatever its folder is."""
+    try:
+        with path.open("rb") as file:
+            return _content(file.read()) if is_own(os.fstat(file.fileno())) else None
+    except OSError:
+        return None
+
+
 def read_checked(source: Path | Traversable) -> bytes | None:
     """The content that `write_checked` wrote, or None where the file is damaged or not there."""
     try:
-        header, _, content = source.read_bytes().partition(b"\n")
+        return _content(source.read_bytes())
     except OSError:
         return None
+
+
+def _content(written: bytes) -> bytes | None:
+    header, _, content = written.partition(b"\n")
     return content if header.startswith(_digest(content)) else None
 
 
 def write_checked(path: Path, content: bytes, made_by: str) -> None:
-    """Write a file, which appears whole or not at all, in folders of this user alone.
+    """Write a file for this user alone, which appears whole or not at all, in folders of such.
 
     Raises BadInput, which begins with the path, where that cannot be done.
     """
@@ -96,6 +122,7 @@ def write_checked(path: Path, content: bytes, made_by: str) -> None:
         raise BadInput(f"{path}: cannot be written ({error.strerror})") from error
     with whole_file(path, parents=False) as new:
         new.write_bytes(_digest(content) + f" {made_by}\n".encode() + content)
+        new.chmod(0o600)
 
 
 @contextmanager

@@ -26,11 +26,11 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
     error = np.where(np.isinf(np.diagonal(covariance, axis1=-2, axis2=-1)), 0.0, error)
     # |L^-1 e|^2 by the Cholesky factors L of all P at once
     factor, whitened = _factors(covariance), np.empty_like(error)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for row in range(size):
             reached = np.sum(factor[..., row, :row] * whitened[..., :row], axis=-1)
             whitened[..., row] = (error[..., row] - reached) / factor[..., row, row]
-    return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
+        return np.sum(whitened**2, axis=-1) if size else np.full(whitened.shape[:-1], np.nan)
 
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:

@@ -6,7 +6,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
+from math import isqrt
 from typing import Any
+
+import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock
@@ -16,10 +19,13 @@ from replay.engine.late import Late, taking_late
 from replay.engine.priors import start_of_runs
 from replay.engine.sources import Ensemble, Source, ensemble_of
 from replay.engine.supervision import Watch
+from replay.engine.usage import Usage
 
 BLOCK_MESSAGES = 1 << 18
 # Of a run, those that an opening looks at.
 FIRST_MESSAGES = 1 << 15
+# Of the product of two standard deviations: rounding is far below.
+ASYMMETRIC = 1e-6
 # The state of what can start in no run.
 _REFUSED = object()
 
@@ -32,11 +38,13 @@ class Report:
         seconds: how long each estimator worked, by label; compiling is part of a first use.
         coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
         refused: by estimator, why no run of a part can be replayed.
+        usages: by estimator, what became of its measurements.
     """
 
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     coverage: list[Ragged] = field(default_factory=list)
     refused: dict[str, BadInput] = field(default_factory=dict)
+    usages: dict[str, Usage] = field(default_factory=dict)
 
 
 def replay(
@@ -74,11 +82,15 @@ def replay(
     wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
     for bound, whole in zip(estimators, wholes, strict=True):
         _refuse_old_priors(bound, ensemble, whole, order)
+        _refuse_asymmetric_priors(bound, ensemble, whole)
     stamps: Clock = order if late is None else "publish_time"
     watches = [
         Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
+    for watch, whole in zip(watches, wholes, strict=True):
+        watch.whole = whole
+        watch.usage.note_start(whole)
     told: list[Ragged] = []
     opening = partial(_open, ensemble, order, stamps, told)
     states, refused = _start(estimators, watches, wholes, opening)
@@ -111,6 +123,7 @@ def replay(
                 report.refused[watch.name] = watch.refused
             report.seconds[watch.name.partition("/")[0]] += watch.seconds
             report.coverage += watch.coverage()
+            report.usages[watch.name] = watch.usage
 
 
 def _open(
@@ -205,6 +218,26 @@ def _refuse_old_priors(
                     f"{(start_ns - int(times_ns[0])) * 1e-9:g} s before the span; say what "
                     "to start from with --start-from truth or --start-from ESTIMATES"
                 )
+
+
+def _refuse_asymmetric_priors(
+    bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged]
+) -> None:
+    """Raise BadInput where a prior's covariance is none, whose triangles would give two answers."""
+    for topic in bound.priors.keys() & whole.keys():
+        covariance = whole[topic].stream["covariance"]
+        size = isqrt(covariance.shape[1])
+        if not len(covariance) or size**2 != covariance.shape[1]:
+            continue
+        matrix = covariance.reshape(-1, size, size)
+        deviation = np.sqrt(np.abs(matrix.diagonal(0, 1, 2)))
+        apart = np.abs(matrix - matrix.swapaxes(1, 2))
+        wrong = (apart > ASYMMETRIC * deviation[:, :, None] * deviation[:, None, :]).any(axis=(1, 2))
+        if wrong.any():
+            run = int(np.searchsorted(whole[topic].offsets, np.argmax(wrong), "right")) - 1
+            raise BadInput(
+                f"{ensemble[run].name}: the covariance of {topic} is not symmetric; mend the prior"
+            )
 
 
 def _required(

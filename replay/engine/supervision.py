@@ -22,6 +22,7 @@ from replay.engine.blocks import Ragged, join, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.covariances import ROUNDING
 from replay.engine.failures import Failure, failure_stream, reason_of
+from replay.engine.usage import Usage
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -52,6 +53,8 @@ class Watch:
         name: the bound estimator's.
         runs: how many there are.
         seconds: how long the estimator worked.
+        usage: what became of its measurements.
+        whole: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
     """
 
@@ -59,6 +62,8 @@ class Watch:
         self, name: str, runs: int, order: Clock, *, is_batch: bool, is_part: bool = False
     ) -> None:
         self.seconds = 0.0
+        self.usage = Usage(name)
+        self.whole: Mapping[str, Ragged] = {}
         self.refused: BadInput | None = None
         self.name = name
         self.runs = runs
@@ -88,6 +93,7 @@ class Watch:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
+        self.usage.note_given(streams, self.whole)
         began = time.perf_counter()
         try:
             try:
@@ -102,6 +108,7 @@ class Watch:
         """A block's outputs without what is no estimate and all after it; failures are held back."""
         cuts = [self._unsound(each) for each in outputs]
         sound = [self._cut(each, cut) for each, cut in zip(outputs, cuts, strict=True)]
+        self.usage.note_outputs(sound)
         passed = []
         for each in sound:
             topic, schema = each.stream.topic, each.stream.schema.full_name

@@ -81,8 +81,9 @@ class Errors:
 
     @property
     def squared(self) -> Floats:
-        """(n, d) the squares of the errors, of a bound what they are at least."""
-        return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
+        """(n, d) the squares of the errors, of a bound what they are at least; infinite if too large."""
+        with np.errstate(over="ignore"):
+            return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
     @property
     def position(self) -> list[int]:

@@ -1,7 +1,9 @@
-"""Where a timeline goes: a file, a live viewer, or both from one pass.
+"""Where a timeline goes: a file, or a live viewer.
 
-A file appears under its name only when it is whole. A live receiver is asked before anything is sent,
-because Rerun itself waits many seconds for one that is not there, and forever for one that is silent.
+A file appears under its name only when it is whole. Rerun encodes it into memory, and it is written from
+here: Rerun's own writer of files tells nobody of a disk that is full as it ends, and may wait forever.
+A live receiver is asked before anything is sent, because Rerun itself waits many seconds for one that is
+not there, and forever for one that is silent.
 """
 
 import os
@@ -35,28 +37,29 @@ def open_recording(
         application_id: what the viewer keeps one layout for.
         recording_id: recordings of one id are one recording to a viewer.
         save: the .rrd file to write, in a folder that exists.
-        connect: a receiver, `rerun+http://HOST:PORT/proxy`.
+        connect: in place of a file a receiver, `rerun+http://HOST:PORT/proxy`.
 
     Raises BadInput where neither is given, the file cannot be written, or the receiver is not there or
     goes away; then no file is left.
     """
-    if save is None and connect is None:
-        raise BadInput("a timeline needs a destination: give --save FILE.rrd, --connect URL, or both")
-    sinks: list[rr.GrpcSink | rr.FileSink] = []
     if connect is not None:
         _require_receiver(connect)
-        sinks.append(rr.GrpcSink(connect))
+    elif save is None:
+        raise BadInput("a timeline needs a destination: give --save FILE.rrd, --connect URL, or both")
     with ExitStack() as stack:
-        if save is not None:
-            new = stack.enter_context(whole_file(save, parents=False))
-            sinks.append(rr.FileSink(new))
         recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         stack.callback(_close, recording, _GIVEN_UP_S)
-        recording.set_sinks(*sinks)
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
-        yield recording
-        _finish(recording, save, connect)
+        if connect is not None:
+            recording.set_sinks(rr.GrpcSink(connect))
+            yield recording
+            _finish(recording, connect)
+        elif save is not None:
+            new = stack.enter_context(whole_file(save, parents=False))
+            encoded = rr.binary_stream(recording)
+            yield recording
+            new.write_bytes(encoded.read() or b"")
 
 
 def rerun_path(path: Path) -> str:
@@ -70,7 +73,7 @@ def rerun_path(path: Path) -> str:
         raise BadInput(f"{path}: Rerun opens only files whose names are UTF-8; rename it") from None
 
 
-def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | None) -> None:
+def _finish(recording: rr.RecordingStream, connect: str) -> None:
     """Hand over everything that is still queued, and close."""
     failure: Exception | None = None
     try:
@@ -78,17 +81,17 @@ def _finish(recording: rr.RecordingStream, save: Path | None, connect: str | Non
     except RuntimeError as error:
         failure = error
     is_closed = _close(recording, _FLUSH_S if failure is None else _GIVEN_UP_S)
-    if connect is not None and not _answers(connect):  # which a flush does not always notice
+    if not _answers(connect):  # which a flush does not always notice
         raise BadInput(
             f"--connect {connect}: the connection to the receiver was lost; start it again"
         ) from failure
     if failure is not None or not is_closed:
         why = failure or "Rerun does not end"
-        raise BadInput(f"{save or connect}: the timeline could not be written ({why})") from failure
+        raise BadInput(f"{connect}: the timeline could not be sent ({why})") from failure
 
 
 def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
-    """Disconnect; whether that ended: of a file that cannot be written, Rerun may wait forever."""
+    """Disconnect; whether that ended: for a receiver that is silent, Rerun may wait forever."""
     closing = threading.Thread(target=recording.disconnect, daemon=True)
     closing.start()
     closing.join(limit_s)

@@ -40,6 +40,14 @@ COMMANDS = {
     "run dead.toml --runs 1 --out OUT": "result",
     "run ais --data ANY --out OUT": "result",
     "report ANY -o OUT.html": "page",
+    "cut ANY --end 0.5 -o OUT.mcap": "cut",
+    "relabel ANY --component x_m=a -o OUT.mcap": "relabelled",
+    "merge ANY ANY -o OUT.mcap": "merged",
+    "run dead.toml --runs 1 --settings ANY --out OUT": "result",
+    "sweep dead.toml --over duration_s=1,2 --runs 1 --out OUT": "result",
+    "compare ANY ANY --out OUT --save OUT.rrd": "result timeline",
+    "check ANY --update -e dead-reckoning --against OUT.golden.xz": "golden",
+    "export ANY --to csv -o OUT": "tables",
 }
 NAMES = (
     *("a.mcap", "b.mcap", "c.mcap", "a.rrd", "b.rrd", "a.html", "r", "s", "data", "data/ais.csv"),
@@ -58,13 +66,17 @@ NAMES = (
         "./r",
         "r/../s",
         "new/a.mcap",
+        "none/../a.mcap",
+        "none/../r",
+        "none/../user.rrd",
+        "none/../link",
         "a.mcap.part",
         "r.old",
         ".a.mcap.x.part",
     ),
 )
-FLAGS = ("-o", "--out", "--save")
-LIKELY = {"mcap": "abc", "rrd": "ab", "html": "a", "": "rs"}
+FLAGS = ("-o", "--out", "--save", "--against")
+LIKELY = {"mcap": "abc", "rrd": "ab", "html": "a", "golden.xz": "a", "": "rs"}
 
 
 def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Tally:

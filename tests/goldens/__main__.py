@@ -5,7 +5,8 @@ from pathlib import Path
 
 import click
 
-from pipeline.checking.golden import discrepancies, read, write
+from pipeline.checking.golden import discrepancies
+from pipeline.checking.stored import read, write
 from recorders.errors import choices
 from tests.goldens import store
 from tests.goldens.recipes import DATA, RECIPES, data_option, index, unpack

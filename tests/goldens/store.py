@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.checking.golden import SUFFIX, Golden, Replayed, Tolerance, Tolerances, golden_of, make
+from pipeline.checking.golden import Replayed, Tolerance, Tolerances, golden_of, make
+from pipeline.checking.stored import SUFFIX, Golden
 from pipeline.experiment import run_experiment
 from tests.goldens.recipes import RECIPES, first_log
 

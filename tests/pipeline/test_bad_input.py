@@ -94,7 +94,7 @@ TABLE: dict[str, tuple[str, ...]] = {
     "cut log.mcap": ("Missing option '-o'",),
     "cut log.mcap -o new.csv": ("new.csv", "ends in .mcap"),
     "cut log.mcap -o log.mcap": ("would replace the log log.mcap",),
-    "cut log.mcap -o other.mcap": ("other.mcap: exists", "cut, merged or relabelled"),
+    "cut log.mcap -o other.mcap": ("other.mcap: exists", "a log that fuselog cut wrote"),
     "cut cut.mcap -o new.mcap": ("cut.mcap", "--recover"),
     "cut damaged.mcap -o new.mcap": ("damaged.mcap", "--recover"),
     "cut log.mcap --start 3 -o new.mcap": ("no messages in this span", "from 0 to 2 s"),

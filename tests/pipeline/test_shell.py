@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from tests.pipeline.conftest import Said
+
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 RUN = ["run", "landmarks", "--runs", "3", "--set", "duration_s=2", "--logs", "0"]
@@ -65,3 +67,40 @@ def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable
         out, _ = process.communicate()
     assert b"%" in shown
     assert json.loads(out)["experiment"] == "landmarks"
+
+
+@pytest.mark.unix
+def test_a_file_s_name_forges_no_line(
+    world: Path, tmp_path: Path, fuselog: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of what a command says when all went well."""
+    monkeypatch.chdir(tmp_path)
+    name = "a\nfuselog: all is well\x1b[2J.mcap"
+    shutil.copy(world / "log.mcap", name)
+    for arguments in (
+        ("cut", name, "--end", "1", "-o", f"cut {name}"),
+        ("record", "landmarks", "--set", "duration_s=1", "-o", f"new {name}"),
+        ("replay", name, "-e", "dead-reckoning", "-o", f"est {name}"),
+        ("info", name),
+        ("export", name, "--to", "csv", "--topic", "/robot1/odometry", "-o", f"{name}.csv"),
+        ("report", name),
+        ("replay", f"missing {name}", "-e", "ekf"),
+    ):
+        said = fuselog(*arguments)
+        lines = (said.out + said.err).splitlines()
+        assert not any(line.startswith("fuselog: all is well") for line in lines), arguments
+        assert "\x1b" not in said.out + said.err
+
+
+def test_of_very_many_names_some_are_said(tmp_path: Path, fuselog: Callable[..., Said]) -> None:
+    table, mapping = tmp_path / "wide.csv", tmp_path / "map.toml"
+    names = [f"c{number}" for number in range(9_000)]
+    table.write_text("\n".join([",".join(names), ",".join("1" * len(names))]))
+    mapping.write_text(
+        '[[tables]]\ntime = { column = "time", unit = "s" }\n[[tables.streams]]\ntopic = "/x"\n'
+        'becomes = "Odometry"\nfields = { forward_mps = "c1", turn_radps = "c2" }\n'
+    )
+    said = fuselog("import", "table", table, "--mapping", mapping, "-o", tmp_path / "new.mcap")
+    assert said.code == 2
+    assert said.err.endswith("and 8950 more\n")
+    assert len(said.err) < 1000

@@ -55,7 +55,8 @@ def test_a_span_keeps_what_was_said_once(log: Path, fuselog: Fuselog) -> None:
     whole, part = fl.open(log), fl.open("part.mcap")
     assert part.run is not None
     assert whole.run is not None
-    assert part.run == replace(whole.run, notes={"changes": "cut run.mcap from 1 s to 3 s"})
+    notes = {"changes": "cut run.mcap from 1 s to 3 s", "changed by": "cut"}
+    assert part.run == replace(whole.run, notes=notes)
     for topic, stream in whole.items():
         seconds = (stream.publish_time_ns - whole.epoch_ns) * 1e-9
         stays = (seconds >= 1) & (seconds < 3) | (topic in (LANDMARKS, PRIOR))

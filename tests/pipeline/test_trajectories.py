@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import fuselog as fl
-from recorders.log import write_log
+from recorders.log import open_log, read_streams, write_log
 from recorders.recording import record_run
 from recorders.trajectories import Trajectory, tum_lines
 
@@ -114,3 +114,31 @@ def test_estimates_of_a_log_in_another_frame(fuselog: Fuselog) -> None:
         "pose-errors-robot1.svg",
         "error-along-path-ekf-robot1.svg",
     } <= figures
+
+
+@pytest.mark.parametrize("align", ["none", "yaw", "se2", "se3", "sim3"])
+def test_numbers_that_cannot_be_squared_end_in_a_sentence(
+    align: str, world: Path, tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """1e308 m once gave half a document of JSON and a traceback, and its alignment came to no end."""
+    path = tmp_path / "far.tum"
+    path.write_text("".join(f"{time} 1e308 {time}e307 -1e308 0 0 0 1\n" for time in range(9)))
+    said = fuselog("evaluate", path, "--truth", world / "line.tum", "--align", align, "--json")
+    assert (said.code, said.out) == (2, "")
+    assert said.err.startswith(f"fuselog: {path}: has a position beyond 1e+100 m")
+
+
+def test_estimates_that_cannot_be_squared_are_nulls(
+    world: Path, tmp_path: Path, fuselog: Fuselog
+) -> None:
+    log = open_log(world / "log.estimates.mcap")
+    streams = read_streams(log, list(log.topics))
+    for topic, stream in streams.items():
+        if "mean" in stream.columns:
+            columns = {**stream.columns, "mean": np.full_like(stream["mean"], 1e308)}
+            streams[topic] = replace(stream, columns=columns)
+    path = tmp_path / "far.mcap"
+    write_log(path, list(streams.values()), log.run)
+    said = fuselog("evaluate", path, "--log", world / "log.mcap", "--json")
+    assert (said.code, said.err) == (0, "")
+    assert said.json["metrics"]["ekf.position_rmse_m.robot1"] is None

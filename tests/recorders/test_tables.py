@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
-from recorders.importers.tables import files
+from recorders.importers.tables import blocks, files
 from recorders.importers.tables.mapping import read_mapping, recordings_in, shipped
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
@@ -545,7 +545,8 @@ def test_blocks_make_no_difference(
     ]
     text = "t,lat,lon,h\n" + "\n".join(rows)
     whole, notes = imported(text, FIX)
-    monkeypatch.setattr(files, "_BLOCK_BYTES", 100)
+    for module in (blocks, files):
+        monkeypatch.setattr(module, "BLOCK_BYTES", 100)
     parts, notes_of_parts = imported(text, FIX)
     assert notes_of_parts == notes
     assert notes["origin"] == "50.0041, 8 deg, 100 m, the first fix"

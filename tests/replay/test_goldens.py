@@ -10,15 +10,8 @@ from typing import Any
 import pytest
 
 from fuselog.testing import assert_same
-from pipeline.checking.golden import (
-    TOLERANCE,
-    Golden,
-    Replayed,
-    Tolerance,
-    arithmetic,
-    discrepancies,
-    read,
-)
+from pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, arithmetic, discrepancies
+from pipeline.checking.stored import Golden, read
 from recorders.errors import BadInput
 from recorders.registry import available
 from tests.goldens import store

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, some_of
 from recorders.importers.ros.bags import Bag
 from recorders.importers.ros.layouts import MessageType, Undecodable, definitions_of
 from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
@@ -66,8 +66,8 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
     if parameters.truth is not None:
         _check_truth(bag, parameters.truth, found.readers)
     if not found.readers:
-        listed = ", ".join(f"{topic} ({why})" for topic, why in sorted(found.not_taken.items()))
-        raise BadInput(f"{bag.path}: has no topic that can be imported: {listed or 'no topics'}")
+        told = some_of([f"{topic} ({why})" for topic, why in sorted(found.not_taken.items())])
+        raise BadInput(f"{bag.path}: has no topic that can be imported: {told or 'no topics'}")
     return found
 
 

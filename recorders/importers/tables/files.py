@@ -6,10 +6,8 @@ benchmarks. A batch has an Arrow array for each column that is asked for; memory
 
 import bz2
 import gzip
-import io
 import lzma
 import re
-import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -26,6 +24,9 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput, choices
+from recorders.importers.tables.blocks import BLOCK_BYTES, COMMENTS, Utf8, blocks_of, delimited, lines_of
+from recorders.importers.tables.npz import columns_of
+from recorders.parsing import DEEPEST
 from recorders.trajectories import read_trajectory
 
 Format = Literal["csv", "parquet", "json", "npz", "rtklib", "trajectory"]
@@ -37,9 +38,11 @@ _SUFFIXES: dict[str, Format] = {
     ".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".npz": "npz", ".pos": "rtklib",
 }  # fmt: skip
 _OPENERS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-_BLOCK_BYTES = 1 << 23
 _BLOCK_ROWS = 1 << 17
-_COMMENTS = (b"%", b"#")
+# Arrow takes 10 kB for a column, however few rows there are.
+MOST_COLUMNS = 10_000
+# Of JSON, such as a quotation mark that ends no string.
+_ESCAPED = re.compile(rb"\\.", re.DOTALL)
 _DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
 
 
@@ -52,6 +55,9 @@ class Table:
     _read: Read
     left_out: Counter[str] = field(default_factory=Counter)
     mended: str = ""
+
+    def __post_init__(self) -> None:
+        _check_width(self.path, len(self.columns))
 
     def column(self, name: str) -> str:
         """A column by its name, or by its number from 1 on; raises BadInput where there is none."""
@@ -129,6 +135,11 @@ def _open(path: Path) -> BinaryIO:
     return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
 
 
+def _check_width(path: Path, width: int) -> None:
+    if width > MOST_COLUMNS:
+        raise BadInput(f"{path}: has {width} columns, of which at most {MOST_COLUMNS} can be read")
+
+
 # Text.
 
 
@@ -138,21 +149,22 @@ def _open_text(
     comments: list[str] = []
     skipped = 0
     with _open(path) as file:
-        for line in file:
+        for line in lines_of(file):
             text = line.decode("utf-8-sig" if skipped == 0 else "utf-8").strip("\r\n")
-            if text.strip() and not line.startswith(_COMMENTS):
+            if text.strip() and not line.startswith(COMMENTS):
                 break
             if text.strip():
                 comments.append(text.lstrip("#% "))
             skipped += 1
         else:
             raise BadInput(f"{path}: has no rows; give a table with rows")
-        following = file.readline().decode("utf-8")
+        following = next(lines_of(file), b"").decode("utf-8")
     # the first line may be cut, as that of a logger whose file began in the middle of one
     whole = following.strip() or text
     delimiter = delimiter or next((each for each in (";", "\t", "|", ",") if each in whole), " ")
     cells = _cells(text, delimiter)
     width = max(len(cells), len(_cells(following, delimiter)))
+    _check_width(path, width)
     if has_header or (has_header is None and not any(map(_is_value, cells))):
         named, skipped = cells, skipped + 1
         if not following.strip():
@@ -206,8 +218,8 @@ def _text_batches(
 
     is_spaced = delimiter == " "
     batches = pyarrow.csv.open_csv(
-        _Delimited(file) if is_spaced else file,
-        pyarrow.csv.ReadOptions(column_names=columns, block_size=_BLOCK_BYTES),
+        Utf8(delimited(blocks_of(file)) if is_spaced else blocks_of(file)),
+        pyarrow.csv.ReadOptions(column_names=columns, block_size=BLOCK_BYTES),
         pyarrow.csv.ParseOptions(
             delimiter="," if is_spaced else delimiter, invalid_row_handler=leave_out
         ),
@@ -225,37 +237,17 @@ def _text_batches(
             for name in wanted:
                 if wanted[name]:
                     batch[name] = pc.replace_substring(batch[name], decimal, ".")
+        for name in wanted:
+            if wanted[name] and pc.any(pc.match_substring(batch[name], "\ufffd")).as_py():
+                raise ValueError(f"column {name} holds text that is not UTF-8")
         yield batch
-
-
-class _Delimited(io.RawIOBase):
-    """Lines whose cells stand between white space, as such with commas; comments are passed over."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self._rest = file, b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        while not self._rest:
-            lines = self._file.readlines(len(buffer))
-            if not lines:
-                return 0
-            self._rest = b"".join(
-                b",".join(line.split()) + b"\n" for line in lines if not line.startswith(_COMMENTS)
-            )
-        size = min(len(buffer), len(self._rest))
-        buffer[:size] = self._rest[:size]
-        self._rest = self._rest[size:]
-        return size
 
 
 def _open_rtklib(path: Path) -> Table:
     """A solution of RTKLIB: its header names two columns, date and time, by one word."""
     named: list[str] = []
     with _open(path) as file:
-        for line in file:
+        for line in lines_of(file):
             if not line.startswith(b"%"):
                 break
             words = line[1:].decode("utf-8", "replace").replace(",", " ").split()
@@ -290,9 +282,9 @@ def _open_parquet(path: Path) -> Table:
 def _open_json(path: Path) -> Table:
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
         with _open(path) as file:
-            while lines := file.readlines(_BLOCK_BYTES):
-                block = pa.BufferReader(b"".join(lines))
-                for batch in _flat_batches(pyarrow.json.read_json(block)):
+            for block in blocks_of(file):
+                _check_depth(block)
+                for batch in _flat_batches(pyarrow.json.read_json(pa.BufferReader(block))):
                     missing = pa.nulls(len(next(iter(batch.values()))))
                     yield {name: batch.get(name, missing) for name in wanted} or batch
 
@@ -302,32 +294,23 @@ def _open_json(path: Path) -> Table:
     return Table(path, list(first), read)
 
 
+def _check_depth(block: bytes) -> None:
+    """Raise ValueError where JSON is nested so deeply that Arrow, which recurses, dies of it."""
+    text = np.frombuffer(_ESCAPED.sub(b"__", block), np.uint8)
+    outside = np.cumsum(text == ord('"'), dtype=np.uint8) % 2 == 0
+    step = np.isin(text, list(b"{[")).astype(np.int32) - np.isin(text, list(b"}]"))
+    if np.cumsum(step * outside).max(initial=0) > DEEPEST:
+        raise ValueError(f"it is nested more than {DEEPEST} levels deep")
+
+
 def _open_npz(path: Path) -> Table:
-    """Arrays of one length; those with a second axis are columns NAME.0, NAME.1, ..."""
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-    except zipfile.BadZipFile as error:
-        raise ValueError(error) from None
-    flat: dict[str, np.ndarray] = {}
-    for name, array in arrays.items():
-        if array.ndim == 2:
-            flat |= {f"{name}.{index}": column for index, column in enumerate(array.T)}
-        else:
-            flat[name] = array
-    sizes = {name: array.shape for name, array in flat.items()}
-    if not flat or len(set(sizes.values())) > 1 or next(iter(flat.values())).ndim != 1:
-        told = ", ".join(f"{name} {arrays[name].shape}" for name in arrays) or "none"
-        raise BadInput(
-            f"{path}: its arrays are not columns of one length ({told}); save arrays of the same length"
-        )
+    names, read = columns_of(path, MOST_COLUMNS, BLOCK_BYTES)
 
-    def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        for begin in range(0, len(next(iter(flat.values()))), _BLOCK_ROWS):
-            rows = slice(begin, begin + _BLOCK_ROWS)
-            yield {name: pa.array(flat[name][rows]) for name in wanted}
+    def batches(wanted: Mapping[str, bool]) -> Iterator[Batch]:
+        for block in read(wanted):
+            yield {name: pa.array(column) for name, column in block.items()}
 
-    return Table(path, list(flat), read)
+    return Table(path, names, batches)
 
 
 def _open_trajectory(path: Path) -> Table:
@@ -360,6 +343,8 @@ def _flat_batches(table: pa.Table) -> Iterator[Batch]:
                 columns[name] = column
                 continue
             width = pc.max(pc.list_value_length(column)).as_py() or 0
+            if width + len(columns) > MOST_COLUMNS:
+                raise ValueError(f"{name} has lists of {width}; at most {MOST_COLUMNS} can be read")
             if pc.min(pc.list_value_length(column)).as_py() == width:
                 columns |= {f"{name}.{index}": pc.list_element(column, index) for index in range(width)}
         yield columns

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import checked, mapped, schema_of
 from recorders.importers.tables.mapping import (
     ConstantStream,
@@ -98,7 +98,7 @@ def _blocks(
     told.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
     not_taken = {other.name for other in others} - {source.tag_name for source in sources}
     if not_taken:
-        told.notes["files not taken"] = ", ".join(sorted(not_taken))
+        told.notes["files not taken"] = some_of(sorted(not_taken))
 
 
 def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:

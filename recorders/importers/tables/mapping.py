@@ -11,18 +11,19 @@ fields = { specific_force_mps2 = ["ax", "ay", "az"], turn_rate_radps = ["gx", "g
 units = { specific_force_mps2 = "g", turn_rate_radps = "deg/s" }
 """
 
-import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
-from recorders.errors import BadInput, choices
+from recorders.errors import BadInput, choices, some_of
 from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
 from recorders.importers.tables.files import Format
+from recorders.importers.tables.patterns import fitted, names_in
 from recorders.importers.tables.times import TimeMapping
 from recorders.parameters import Parameters, build
 from recorders.parsing import read_toml
@@ -85,12 +86,19 @@ class TableStream(StreamMapping):
         return self
 
 
+def _once(pattern: str) -> str:
+    twice = [name for name, count in Counter(names_in(pattern)).items() if count > 1]
+    if twice:
+        raise ValueError(f"{{{twice[0]}}} is there twice; give each a name of its own")
+    return pattern
+
+
 class TableMapping(Parameters):
     """The files of one kind, and the streams of their rows.
 
     Attributes:
         files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
-            stand for anything, ? for one letter.
+            stand for anything, ? for one letter; each name in braces comes once.
         optional: there may be none.
         format, columns, header, delimiter, decimal: what the content does not tell; see `open_table`.
         time: when a row was measured.
@@ -98,7 +106,7 @@ class TableMapping(Parameters):
         geodetic, attitude: columns that are made of others.
     """
 
-    files: str = "*"
+    files: Annotated[str, AfterValidator(_once)] = "*"
     optional: bool = False
     format: Format | None = None
     columns: list[str] = []
@@ -216,7 +224,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
             find_files(mapping, [folder])
             folders.append(folder)
     if not folders:
-        patterns = ", ".join(table.files for table in mapping.tables if not table.optional)
+        patterns = some_of([table.files for table in mapping.tables if not table.optional])
         raise BadInput(
             f"{place}: neither it nor a folder in it has the files that the mapping names ({patterns})"
         )
@@ -249,11 +257,11 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], lis
             elif path.is_dir():
                 others.append(file)
             else:
-                patterns = ", ".join(table.files for table in mapping.tables)
+                patterns = some_of([table.files for table in mapping.tables])
                 raise BadInput(f"{file}: is not one of the files that the mapping names ({patterns})")
     for table in mapping.tables:
         if not table.optional and not any(each.table is table for each in found):
-            where = ", ".join(map(str, paths))
+            where = some_of(paths)
             raise BadInput(
                 f"{where}: has no file {table.files}, which the mapping needs; add it, or set "
                 "optional = true for its table"
@@ -267,15 +275,8 @@ def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> I
         pattern = (
             table.files if "/" not in table.files or "/" in name else table.files.rpartition("/")[2]
         )
-        parts = re.split(r"\{(\w+)\}", pattern)
-        expression = "".join(
-            f"(?P<{part}>[^/]+)"
-            if index % 2
-            else re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
-            for index, part in enumerate(parts)
-        )
-        match = re.fullmatch(expression, name)
-        if match:
-            yield Found(file, table, match.groupdict())
+        names = fitted(pattern, name)
+        if names is not None:
+            yield Found(file, table, names)
         elif is_alone and len(mapping.tables) == 1:
-            yield Found(file, table, dict.fromkeys(parts[1::2], file.stem))
+            yield Found(file, table, dict.fromkeys(names_in(pattern), file.stem))

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from recorders.errors import BadInput
+from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
 from recorders.importers.tables.files import Batch, Table, open_table
 from recorders.importers.tables.mapping import Attitude, Found, Origin, TableStream
@@ -311,7 +311,7 @@ class Rows:
         topics = ", ".join(self._filled(stream.topic) for stream in self.mapping.streams)
         notes = {name: f"{self.count} rows as {topics}"}
         if rest := [each for each in self.table.columns if each not in self._texts | self._numbers]:
-            notes[f"{name}: columns not taken"] = ", ".join(rest)
+            notes[f"{name}: columns not taken"] = some_of(rest)
         if self.table.mended:
             notes[f"{name}, mended"] = self.table.mended
         for reason, count in self.table.left_out.items():

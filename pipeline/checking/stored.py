@@ -1,0 +1,166 @@
+"""Goldens as files: packed JSON, which a reader believes nothing but what it has looked at."""
+
+import base64
+import json
+import lzma
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    ValidationError,
+    model_validator,
+)
+
+from recorders.atomic import whole_file
+from recorders.errors import BadInput, check_format
+from recorders.parsing import parse_json
+
+SUFFIX = ".golden.xz"
+# Raised when a golden is written in a way that this reader would misread.
+FORMAT = 1
+# No golden is larger, in bytes of its text and in numbers, lists and tables; a small archive may be.
+MOST_BYTES, MOST_VALUES = 64 << 20, 4_000_000
+# xz's own best presets take a quarter of it.
+_UNPACKING_BYTES = 256 << 20
+
+Golden = dict[str, Any]
+
+
+def _numbers(values: Any) -> Any:
+    """Refuse what is no array of numbers; a null is NaN."""
+    try:
+        np.asarray(values, float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("it is no array of numbers") from None
+    return values
+
+
+Numbers = Annotated[Any, AfterValidator(_numbers)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Column(_Part):
+    """Some rows of a column, and over all rows how many are missing, their sum and that of squares."""
+
+    kept: Numbers
+    missing: Numbers
+    sum: Numbers
+    sum_of_squares: Numbers
+
+    @model_validator(mode="after")
+    def _is_of_one_shape(self) -> Self:
+        shapes = [np.shape(each) for each in (self.missing, self.sum, self.sum_of_squares)]
+        kept = np.shape(self.kept)
+        if not kept or any(shape != kept[1:] for shape in shapes):
+            raise ValueError("its rows and its sums are of different shapes")
+        return self
+
+
+class _Stream(_Part):
+    rows: NonNegativeInt
+    publish_times: str
+    log_times: str
+    metadata: dict[str, str]
+    checksums: str
+    columns: dict[str, _Column]
+
+    @model_validator(mode="after")
+    def _has_rows(self) -> Self:
+        checked = len(base64.b64decode(self.checksums, validate=True))
+        if checked not in (0, 2 * self.rows):
+            raise ValueError(f"it has checksums of {checked / 2:g} rows, and {self.rows} rows")
+        for column in self.columns.values():
+            if not (0 < len(column.kept) <= self.rows or len(column.kept) == self.rows == 0):
+                raise ValueError(f"it keeps {len(column.kept)} of {self.rows} rows")
+        return self
+
+
+class _Run(_Part):
+    input: str
+    recorded: bool
+    streams: dict[str, _Stream]
+
+
+class _Tolerance(_Part):
+    relative: NonNegativeFloat
+    reason: str = ""
+    elsewhere: bool = False
+
+
+class _Settings(_Part):
+    estimators: dict[str, dict[str, Any]] = {}
+    late: str | None = None
+    arrival_order: bool = False
+    columns: list[str] = Field(default=["*"])
+
+
+class _Golden(_Part):
+    format: int
+    arithmetic: str
+    settings: _Settings
+    tolerances: dict[str, _Tolerance]
+    runs: dict[str, _Run]
+    metrics: dict[str, Numbers]
+
+
+def write(path: Path, golden: Golden) -> None:
+    """Keep a golden; the same one gives the same bytes. Raises BadInput where none could be so large."""
+    text = json.dumps(golden, sort_keys=True, separators=(",", ":")).encode()
+    if not _is_small(text):
+        raise BadInput(
+            f"{path}: would have {len(text) / 1e6:.0f} MB of text, more than a golden may; take a part "
+            "of the log with fuselog cut, or keep fewer columns with --keep"
+        )
+    with whole_file(path) as part:
+        part.write_bytes(lzma.compress(text, preset=9))
+
+
+def read(path: Path) -> Golden:
+    """A golden that is kept; raises BadInput where it is missing, damaged or of another format."""
+    try:
+        golden = parse_json(_unpacked(path).decode(), constants=True)
+    except FileNotFoundError:
+        raise BadInput(f"{path}: no such golden; --update writes it") from None
+    except (OSError, lzma.LZMAError, ValueError) as error:
+        raise BadInput(
+            f"{path}: is not a golden, or is damaged ({error}); --update writes a new one"
+        ) from None
+    if not isinstance(golden, dict) or "format" not in golden:
+        raise BadInput(f"{path}: is not a golden of fuselog check; --update writes one")
+    check_format(path, golden["format"], FORMAT)
+    try:
+        return _Golden.model_validate(golden).model_dump()
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = " ".join(map(str, first["loc"])) or "it"
+        why = first["msg"].removeprefix("Value error, ")
+        raise BadInput(
+            f"{path}: is not a golden, or is damaged ({where}: {why}); --update writes a new one"
+        ) from None
+
+
+def _unpacked(path: Path) -> bytes:
+    """The text; raises ValueError where it is more than a golden may have, and unpacks no more."""
+    with path.open("rb") as file:
+        packed = file.read(MOST_BYTES)
+    unpacking = lzma.LZMADecompressor(memlimit=_UNPACKING_BYTES)
+    text = unpacking.decompress(packed, MOST_BYTES + 1)
+    if not _is_small(text):
+        raise ValueError("it unpacks to more than a golden may have")
+    if not unpacking.eof or unpacking.unused_data:
+        raise ValueError("it does not end where it should")
+    return text
+
+
+def _is_small(text: bytes) -> bool:
+    return len(text) <= MOST_BYTES and sum(map(text.count, (b",", b"[", b"{"))) <= MOST_VALUES
