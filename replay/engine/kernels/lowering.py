@@ -61,11 +61,9 @@ def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tup
         except DoesNotCompile:
             raise
         except Exception as error:
-            _, file, above = definition_of(function)
             reason = f"{type(error).__name__}: {error}"
-            place = f"{file}, line {above + lowering.line}"
             raise DoesNotCompile(
-                f"{function.__qualname__} does not compile ({place}): {reason}"
+                f"{function.__qualname__} does not compile ({lowering.place_in_source()}): {reason}"
             ) from error
 
 

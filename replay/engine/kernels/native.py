@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
+from pathlib import Path
 from threading import Lock
 from types import FunctionType
 from typing import Any
@@ -41,7 +42,7 @@ class Kernel:
 
     def __init__(self, run_once: FunctionType) -> None:
         self._function = run_once
-        self._entries: dict[Any, Callable[..., None]] = {}
+        self._entries: dict[Any, Callable[..., Any]] = {}
         self._lock = Lock()
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
@@ -51,12 +52,15 @@ class Kernel:
             *(_described(each, words, 1) for each in arguments),
             *(_described(each, words, 0) for each in scratch),
         )
-        entry = self._entries.get(kinds)
+        is_checked = os.environ.get("FUSELOG_BOUNDSCHECK") == "1"
+        key = kinds, is_checked
+        entry = self._entries.get(key)
         if entry is None:
             with self._lock:
-                entry = self._entries.get(kinds) or self._entries.setdefault(
-                    kinds, _entry(self._function, kinds)
-                )
+                entry = self._entries.get(key)
+                if entry is None:
+                    made = _checked_entry if is_checked else _entry
+                    entry = self._entries[key] = made(self._function, kinds)
         found, given = entry, (ctypes.c_int64 * len(words))(*words)
 
         def loop(first: int, end: int, kept: Any = (arguments, scratch)) -> None:  # noqa: ARG001
@@ -125,9 +129,12 @@ def _value_of(kind: Any, emitter: Emitter) -> Any:
 # --- making -----------------------------------------------------------------------------------------
 
 
-def text_of(function: FunctionType, kinds: Sequence[Any]) -> str:
-    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run."""
-    program, emitter = Program(lower), Emitter()
+def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool = False) -> Program:
+    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
+
+    It returns 0, or where indices are checked the number of the first fault.
+    """
+    program, emitter = Program(lower, is_checked=is_checked), Emitter()
     place = 0
     arguments = []
     for kind in kinds:
@@ -144,28 +151,46 @@ def text_of(function: FunctionType, kinds: Sequence[Any]) -> str:
     body = Emitter()
     body.fresh = emitter.fresh  # type: ignore[method-assign]
     program.call(body, function, [Number(WHOLE, "%run"), *arguments])
+    stop = ["stop:", "  %why = load i64, ptr %fault", "  ret i64 %why"] if body.can_fail else []
     lines = [
-        "define void @kernel(i64 %first, i64 %end, ptr %words) {",
+        "define i64 @kernel(i64 %first, i64 %end, ptr %words) {",
         "entry:",
+        *body.allocated,
         *emitter.lines,
         "  br label %loop",
         "loop:",
-        "  %run = phi i64 [ %first, %entry ], [ %next, %body ]",
+        "  %run = phi i64 [ %first, %entry ], [ %next, %following ]",
         "  %more = icmp slt i64 %run, %end",
         "  br i1 %more, label %body, label %done",
         "body:",
         *body.lines,
+        "  br label %following",
+        "following:",
         "  %next = add nsw i64 %run, 1",
         "  br label %loop",
         "done:",
-        "  ret void",
+        "  ret i64 0",
+        *stop,
         "}",
     ]
     program.functions.append("\n".join(lines))
-    return program.text()
+    return program
 
 
-def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+def _checked_entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+    """The kernel's entry, which raises IndexError where an index is beyond its array; it is not kept."""
+    program = program_of(function, kinds, is_checked=True)
+    kernel = _loaded(object_code(program.text()))
+
+    def checked(*arguments: Any) -> None:
+        fault = kernel(*arguments)
+        if fault:
+            raise IndexError(f"an index is beyond its array in {program.faults[fault - 1]}")
+
+    return checked
+
+
+def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., int]:
     """The kernel's entry: kept, or made."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
@@ -174,7 +199,7 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None
         path = cache_folder() / "kernels" / f"{function.__name__}-{key}.bin"
     if path is not None and not is_private(path.parent):
         path = None
-    code = None if path is None else read_checked(path)
+    code = None if path is None else _kept(path, key)
     if code is None:
         title = f"{function.__module__}.{function.__name__}"
         if path is None:
@@ -182,12 +207,19 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None
                 code = _made(function, kinds)
         else:
             with compiling(title), in_turn(path) as waited:
-                code = (read_checked(path) if waited else None) or _made(function, kinds)
-                _keep(path, code)
+                code = (_kept(path, key) if waited else None) or _made(function, kinds)
+                _keep(path, key.encode() + code)
     return _loaded(code)
 
 
-def _keep(path: Any, code: bytes) -> None:
+def _kept(path: Path, key: str) -> bytes | None:
+    """The object code that a file holds; None where it is damaged, or another kernel's."""
+    found = read_checked(path)
+    own = key.encode()
+    return found.removeprefix(own) if found is not None and found.startswith(own) else None
+
+
+def _keep(path: Path, code: bytes) -> None:
     try:
         write_checked(path, code, _MADE_BY)
     except BadInput as error:
@@ -243,7 +275,7 @@ def _target() -> Any:
 def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
     """The kernel's object code."""
     with _without_garbage():
-        return object_code(text_of(function, kinds))
+        return object_code(program_of(function, kinds).text())
 
 
 def object_code(text: str) -> bytes:
@@ -264,12 +296,12 @@ def object_code(text: str) -> bytes:
 _ENGINES: list[Any] = []  # what is loaded stays
 
 
-def _loaded(code: bytes) -> Callable[..., None]:
+def _loaded(code: bytes) -> Callable[..., int]:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _fresh_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
-    entry = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
+    entry = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
     return entry(engine.get_function_address("kernel"))
 
 
