@@ -235,6 +235,8 @@ _OPERATORS: dict[Any, Any] = {
     np.bitwise_and: operator.and_,
     np.logical_or: operator.or_,
     np.bitwise_or: operator.or_,
+    np.logical_xor: operator.xor,
+    np.bitwise_xor: operator.xor,
     np.logical_not: operator.not_,
     np.invert: operator.not_,
     np.remainder: operator.mod,
@@ -249,7 +251,7 @@ PRIMITIVES = (
     *(np.absolute, np.sign, np.copysign, np.fmod, np.floor, np.ceil, np.trunc, np.rint),
     *(np.isnan, np.isfinite, np.isinf, np.signbit),
 )
-_LOGICAL = (operator.and_, operator.or_, operator.not_)
+_LOGICAL = (operator.and_, operator.or_, operator.xor, operator.not_)
 _OF_TABLES = (np.interp, np.searchsorted, np.choose)
 
 

@@ -237,7 +237,11 @@ def _divided(emitter: Emitter, operation: Any, x: Number, y: Number) -> Number:
     floor = emitter.call("llvm.floor.f64", quotient)
     over = emitter.number(REAL, f"fsub double {quotient.code}, {floor.code}")
     up = emitter.number(REAL, f"fadd double {floor.code}, {constant(1.0).code}")
-    return emitter.select(compare(emitter, operator.gt, over, constant(0.5)), up, floor)
+    snapped = emitter.select(compare(emitter, operator.gt, over, constant(0.5)), up, floor)
+    exact = emitter.number(REAL, f"fdiv double {x.code}, {y.code}")
+    signed_zero = emitter.call("llvm.copysign.f64", zero, exact)
+    found = emitter.select(compare(emitter, operator.eq, quotient, zero), signed_zero, snapped)
+    return emitter.select(compare(emitter, operator.eq, y, zero), exact, found)
 
 
 def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -65,7 +66,7 @@ class Program:
 
     def name(self, stem: str) -> str:
         """A name that no other function or table has."""
-        return f"@{stem}_{next(self._names)}"
+        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
 
     def table(self, numbers: np.ndarray) -> Array:
         """A constant array."""
