@@ -151,6 +151,13 @@ def _shared(loop: Loop) -> Callable[..., None]:
     return over_runs
 
 
+def use_cores(count: int) -> None:
+    """Have kernels of this process use so many cores."""
+    os.environ["NUMBA_NUM_THREADS"] = str(count)
+    core_count.cache_clear()
+    _helpers.cache_clear()
+
+
 @cache
 def core_count() -> int:
     """How many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
