@@ -273,7 +273,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
     try:
         return follow({})
     except Exception as error:
-        raise BadInput(f"{_where(function, error)}: {_said(error)}") from error
+        raise BadInput(f"{place_of(function, error)}: {_said(error)}") from error
 
 
 def _said(error: Exception) -> str:
@@ -322,7 +322,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
     return Result(returned, yes.is_number, written)
 
 
-def _where(function: Callable[..., Any], error: Exception | None = None) -> str:
+def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
     """A function's name, with its file and line, or with those at which its own code stopped."""
     own = [
         frame
@@ -363,7 +363,7 @@ def traced(function: Any, *arguments: Argument) -> Any:
         return known
     if TracedFunction(function, arguments).kernel_identity() != made.kernel_identity():
         raise BadInput(
-            f"{_where(function)}: it gives something else when it is called again; a clock, random "
+            f"{place_of(function)}: it gives something else when it is called again; a clock, random "
             "numbers and what changes meanwhile are no part of a model, so take them as parameters"
         )
     _KNOWN[id(function), arguments] = made  # which holds the function, whose id is no other's then
