@@ -410,7 +410,7 @@ class Expressions:
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
-        if isinstance(function, FunctionType):
+        if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
         raise TypeError(f"a kernel cannot call {getattr(function, '__name__', function)}")
 

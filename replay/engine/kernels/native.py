@@ -156,7 +156,7 @@ def _letters(kind: Any) -> str:
         return "q"
     if isinstance(kind, tuple):
         return "".join(map(_letters, kind[1]))
-    return {REAL: "d", WORD: "Q"}.get(kind, "q")
+    return {REAL: "d", WORD: "Q", TRUTH: "?7x"}.get(kind, "q")
 
 
 def _value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
