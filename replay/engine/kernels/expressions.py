@@ -412,7 +412,8 @@ class Expressions:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
         if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
-        raise TypeError(f"a kernel cannot call {getattr(function, '__name__', function)}")
+        name = getattr(function, "__name__", function)
+        raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
 
     def new_array(self, like: Any, dtype: Any = float, *, is_zero: bool) -> Array:
         """`np.empty`, `np.zeros` and the like, of known sizes: there until the function returns."""

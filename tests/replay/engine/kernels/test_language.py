@@ -405,7 +405,7 @@ REFUSED = {
     with_a_list: "a kernel has no List",
     with_itself: "with_itself calls itself",
     with_what_could_change: "an array that could change is part of a kernel; pass it as an argument",
-    with_a_sum: "a kernel cannot call sum",
+    with_a_sum: "a kernel that makes no arrays cannot call sum; others have allocates=True",
     with_two_kinds: "found is a tuple here and a Number before",
     with_mixed_signs: "signed and unsigned integers together; convert one of them",
 }
