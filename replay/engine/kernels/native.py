@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
-from importlib.resources import files
 from itertools import count
 from pathlib import Path
 from struct import Struct
@@ -28,7 +27,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.cache import cache_folder, in_turn, is_private, read_checked, say_once, write_checked
-from replay.engine.kernels.identity import identity
+from replay.engine.kernels.identity import digest_of, identity
 from replay.engine.kernels.lowering import lower
 from replay.engine.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
 from replay.engine.kernels.program import Program
@@ -305,13 +304,10 @@ def _named(kinds: Any) -> Any:
 @cache
 def _surroundings() -> str:
     """What beside a kernel's own sources its code depends on."""
-    room = files("replay.engine.kernels")
-    sources = sorted(each.name for each in room.iterdir() if each.name.endswith(".py"))
-    digest = sha256(b"".join(room.joinpath(name).read_bytes() for name in sources)).hexdigest()
     machine = _machine()
     return "\n".join(
         [
-            digest,
+            digest_of("replay.engine.kernels"),
             platform.python_version(),
             f"llvmlite {llvmlite.__version__}",
             str(llvm.get_process_triple()),
@@ -329,8 +325,8 @@ def _machine() -> tuple[str, str]:
     return name or llvm.get_host_cpu_name(), features
 
 
-@cache
-def _target() -> Any:
+def _new_target() -> Any:
+    """LLVM's description of the machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = _machine()
@@ -351,7 +347,7 @@ def object_code(text: str) -> bytes:
 
     Without the SLP vectoriser, which costs as much as all else and gains these kernels nothing.
     """
-    target = _target()
+    target = _new_target()
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = target.triple, str(target.target_data)
     options = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -365,22 +361,13 @@ _ENGINES: list[Any] = []  # what is loaded stays
 
 
 def _loaded(code: bytes) -> Callable[..., int]:
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _fresh_target())
+    """The entry of a kernel's object code; the engine owns its target."""
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
     entry = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p)
     return entry(engine.get_function_address("kernel"))
-
-
-def _fresh_target() -> Any:
-    """An engine owns its target."""
-    _target()
-    name, features = _machine()
-    target = llvm.Target.from_triple(llvm.get_process_triple())
-    return target.create_target_machine(
-        cpu=name, features=features, opt=3, reloc="pic", codemodel="jitdefault"
-    )
 
 
 @contextmanager
