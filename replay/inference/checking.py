@@ -5,7 +5,6 @@ angle, numbers of components, variances. What it finds is one sentence with the 
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -40,7 +39,7 @@ from replay.inference.model import (
     switching_of,
 )
 from replay.inference.parameters import number_fields, settings_type
-from replay.tracing.functions import arguments_like, traced
+from replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
 DURATION_S = 0.1
@@ -142,24 +141,19 @@ def check_model(
                 _check_noise(sensor.noise, (numbers,), sensor.noises or len(sensor.measured))
 
 
-def _place(function: Function) -> str:
-    code = function.__code__
-    return f"{function.__name__} ({Path(code.co_filename).name}, line {code.co_firstlineno})"
-
-
 def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
     inputs = {"control": (model.controls, False)}
     if motion.noises:
         inputs["noise"] = (motion.noises, True)
     rest = (DURATION_S, numbers)
-    return _Call(_place(motion.move), motion.move, model.state, model.state, inputs, rest)
+    return _Call(place_of(motion.move), motion.move, model.state, model.state, inputs, rest)
 
 
 def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
     about = tuple(rng.normal(size=sensor.about_size))
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
     rest = (about, numbers)
-    return _Call(_place(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
+    return _Call(place_of(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
 
 
 def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
@@ -226,12 +220,12 @@ def _check_correction(
             end, start = (np.array(moved(at, tuple(step), slope)) for step in (small, -small))
             slopes = _difference(end, start, model.kinds) / (2.0 * STEP)
             if not np.allclose(slopes, small / STEP, atol=1e-6):
-                place = _place(moved)
+                place = place_of(moved)
                 raise AssertionError(f"{place}: a small step of {name} moves other components too")
     step = 0.3 * rng.normal(size=model.tangent)
     again = correct.step(at, correct.back(at, tuple(step), slope), slope)
     if not np.allclose(again, step, atol=1e-9):
-        both = f"{_place(correct.step)} does not find the step of {_place(correct.back)}"
+        both = f"{place_of(correct.step)} does not find the step of {place_of(correct.back)}"
         raise AssertionError(both)
 
 
@@ -386,4 +380,4 @@ def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, 
         adding_noise(size, block)(matrix, numbers)
         smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
     if not smallest >= -scale:
-        raise AssertionError(f"{_place(noise)} gives a negative variance, {smallest:.6g}")
+        raise AssertionError(f"{place_of(noise)} gives a negative variance, {smallest:.6g}")

@@ -8,7 +8,6 @@ every model that gives what the method needs.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.tangent import are_kinds
 from replay.inference.generate import function_of, tangent_size
+from replay.tracing.functions import place_of
 
 FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
@@ -535,8 +535,7 @@ def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
 
 
 def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
-    code = function.__code__
-    what = f"{where}: {function.__name__} ({Path(code.co_filename).name}, line {code.co_firstlineno})"
+    what = f"{where}: {place_of(function)}"
     with np.errstate(all="ignore"):
         try:
             found = function(*arguments)

@@ -5,27 +5,28 @@ arrays that it changes; it returns a tuple of numbers, or one number. What it is
 `Argument`s. It is called once for every way through its conditions, which selections join.
 """
 
+import re
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.kernels.identity import digest_of, identity
+from replay.engine.kernels.identity import digest_of
 from replay.engine.kernels.numbers import REAL, Emitter, Number, constant
 from replay.engine.kernels.program import Instance, Program, called
 from replay.engine.kernels.values import Array, Record, entries, load, part_of, store
 from replay.tracing.derivatives import slopes_of
 from replay.tracing.emission import emit, python_of
 from replay.tracing.graph import INPUT, Graph, Node, described, needed
-from replay.tracing.traced import CannotTrace, Trace
+from replay.tracing.traced import MOST_WAYS, CannotTrace, Trace, refused, too_many_ways
 
-MOST_WAYS = 256
+# Files in whose lines nobody looks for a model's mistake.
+_NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
@@ -259,10 +260,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
         nonlocal ways
         ways += 1
         if ways > MOST_WAYS:
-            raise CannotTrace(
-                f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that "
-                "are not known before; write np.clip or np.where, and a fixed number of rounds"
-            )
+            raise too_many_ways()
         here = Trace(graph, dict(decisions))
         given = [_given(here, index, kind) for index, kind in enumerate(arguments)]
         with np.errstate(all="ignore"):
@@ -275,17 +273,21 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
 
     try:
         return follow({})
-    except RecursionError as error:
-        raise BadInput(
-            f"{_where(function, error)}: it has a loop that does not end; use fixed rounds"
-        ) from error
     except Exception as error:
-        said = (
-            str(error)
-            if isinstance(error, CannotTrace | BadInput)
-            else f"{type(error).__name__}: {error}"
-        )
-        raise BadInput(f"{_where(function, error)}: {said}") from error
+        raise BadInput(f"{place_of(function, error)}: {_said(error)}") from error
+
+
+def _said(error: Exception) -> str:
+    """What stopped a function; what NumPy says of traced numbers in our words."""
+    if isinstance(error, CannotTrace | BadInput):
+        return str(error)
+    no_method = re.search(r"which has no callable (\w+) method", str(error))
+    if no_method:
+        function = no_method[1]
+        return f"it uses np.{function} of an array in which some numbers are known; write it of each one"
+    if isinstance(error, IndexError) and "only integers" in str(error):
+        return str(refused("an index"))
+    return f"{type(error).__name__}: {error}"
 
 
 def _result(trace: Trace, returned: Any, given: Sequence[Any]) -> Result:
@@ -302,10 +304,11 @@ def _result(trace: Trace, returned: Any, given: Sequence[Any]) -> Result:
 
 
 def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
-    if len(yes.returned) != len(no.returned):
-        raise CannotTrace(
-            f"it returns {len(yes.returned)} numbers on one way and {len(no.returned)} on another"
-        )
+    if len(yes.returned) != len(no.returned) or yes.is_number != no.is_number:
+        ways = [
+            "a number" if each.is_number else f"a tuple of {len(each.returned)}" for each in (yes, no)
+        ]
+        raise CannotTrace(f"it returns {' on one way and '.join(ways)} on another; return one of them")
     returned = tuple(
         graph.select(condition, *both) for both in zip(yes.returned, no.returned, strict=True)
     )
@@ -320,15 +323,19 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
     return Result(returned, yes.is_number, written)
 
 
-def _where(function: Callable[..., Any], error: Exception) -> str:
-    """A function's name, with the file and line at which its own code stopped."""
-    code = getattr(function, "__code__", None)
-    name = getattr(function, "__name__", "a model's function")
+def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
+    """A function's name, with its file and line, or with those at which its own code stopped."""
     own = [
         frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if Path(frame.filename).parent != Path(__file__).parent and "numpy" not in frame.filename
+        for frame in (traceback.extract_tb(error.__traceback__) if error else ())
+        if not frame.filename.endswith(".pyx")
+        and not any(Path(frame.filename).is_relative_to(each) for each in _NOT_THEIRS)
     ]
+    while isinstance(function, partial):
+        function = function.func
+    called = function if hasattr(function, "__code__") else type(function).__call__
+    name = getattr(function, "__name__", type(function).__name__)
+    code = getattr(called, "__code__", None)
     if own:
         return f"{name} ({Path(own[-1].filename).name}, line {own[-1].lineno})"
     return f"{name} ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else name
@@ -339,21 +346,27 @@ def _digest(words: Sequence[str]) -> str:
     return sha256("\n".join([digest_of("replay.tracing"), *words]).encode()).hexdigest()
 
 
-_KNOWN: dict[Any, tuple[str, TracedFunction, Any]] = {}
+_KNOWN: dict[Any, TracedFunction] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
-    """A function as a traced one; the same again while it, and what it uses, has not changed.
+    """A function as a traced one; the same again while it does the same.
 
+    It is called anew every time: that takes milliseconds, and whatever it is made of may have changed.
     None for None, and what is traced already is as it was.
+
+    Raises BadInput where it cannot be traced, or gives something else when it is traced again.
     """
     if function is None or isinstance(function, TracedFunction):
         return function
-    key = id(function), arguments
-    own = identity(function) if isinstance(function, FunctionType) else ""
-    known = _KNOWN.get(key)
-    if known is None or known[0] != own or known[2] is not function:
-        made = TracedFunction(function, arguments)
-        made.result  # noqa: B018 - what cannot be traced is said here
-        known = _KNOWN[key] = own, made, function
-    return known[1]
+    made = TracedFunction(function, arguments)
+    known = _KNOWN.get((id(function), arguments))
+    if known is not None and known.kernel_identity() == made.kernel_identity():
+        return known
+    if TracedFunction(function, arguments).kernel_identity() != made.kernel_identity():
+        raise BadInput(
+            f"{place_of(function)}: it gives something else when it is called again; a clock, random "
+            "numbers and what changes meanwhile are no part of a model, so take them as parameters"
+        )
+    _KNOWN[id(function), arguments] = made  # which holds the function, whose id is no other's then
+    return made

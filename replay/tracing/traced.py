@@ -7,6 +7,7 @@ not known, such as float() or an index, is refused with the mend.
 
 import linecache
 import operator
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -20,17 +21,30 @@ class CannotTrace(TypeError):
     """What a function does that no graph holds, and what to write instead."""
 
 
+MOST_WAYS = 256
 _MENDS = {
     "float()": "leave the number as it is, or write np.where(condition, a, b)",
-    "int()": "write np.floor or np.trunc, and no index",
-    "an index": "write np.interp(x, table_x, table_y), np.take(table, x) or np.where",
+    "an array of float": "put the array together from its numbers: np.array([a, b])",
+    "int()": "write np.floor or np.trunc, and np.choose for an index",
+    "an index": "write np.interp(x, table_x, table_y), or np.choose(np.searchsorted(bounds, x), "
+    "numbers)",
     "math.*": "write np.* of it",
 }
+_INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 
 
 def refused(what: str) -> CannotTrace:
     """The sentence for something that is refused."""
-    return CannotTrace(f"it uses {what} of a number that is not known before; {_MENDS[what]}")
+    mend = _MENDS.get(what, "write it with operators, np.where and functions such as np.exp")
+    return CannotTrace(f"it uses {what} of a number that is not known before; {mend}")
+
+
+def too_many_ways() -> CannotTrace:
+    """The sentence for conditions that are too many, also of a loop that does not end."""
+    return CannotTrace(
+        f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that are not "
+        "known before; write np.clip or np.where, and a fixed number of rounds"
+    )
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
@@ -47,18 +61,22 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         options.pop("out", None)  # of `x += y`, for which a new number does as well
-        if method != "__call__" or options:
+        if method != "__call__":
             raise CannotTrace(f"it uses np.{ufunc.__name__}.{method}; write it with operators")
+        if options:
+            raise CannotTrace(
+                f"it uses np.{ufunc.__name__} with {', '.join(options)}; write np.where around it"
+            )
         return apply(ufunc, inputs)
 
     def __array_function__(self, function: Any, _: Any, inputs: Any, options: dict[str, Any]) -> Any:
-        return apply(function, (*inputs, *options.values()) if function is np.clip else inputs, options)
+        return apply(function, inputs, options)
 
     def __bool__(self) -> bool:
         return self.trace.decided(self)
 
     def __round__(self, decimals: int = 0) -> Any:
-        return apply(np.round, (self, decimals) if decimals else (self,))
+        return apply(np.round, (self, decimals))
 
     def __divmod__(self, other: Any) -> Any:
         return self // other, self % other
@@ -66,7 +84,10 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
     def __float__(self) -> float:
         frame = sys._getframe(1)
         line = linecache.getline(frame.f_code.co_filename, frame.f_lineno)
-        raise refused("float()" if "float(" in line else "math.*")
+        into_an_array = _INTO_AN_ARRAY.search(line)
+        raise refused(
+            "float()" if "float(" in line else "an array of float" if into_an_array else "math.*"
+        )
 
     def __int__(self) -> int:
         raise refused("int()")
@@ -96,6 +117,8 @@ class Trace:
         if node.is_constant:
             return bool(node.value)
         if node not in self.decisions:
+            if len(self.more) == MOST_WAYS:  # each of which is tried the other way
+                raise too_many_ways()
             self.decisions[node] = True
             self.more.append(node)
         return self.decisions[node]
@@ -123,33 +146,50 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
     return trace.number(trace.graph.select(test, trace.node_of(yes), trace.node_of(no)))
 
 
-def _interpolated(x: Any, table_x: Any, table_y: Any) -> Any:
+def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
     """`np.interp` over a table that is known: the straight line of the last knot before x."""
-    known_x, known_y = np.asarray(table_x, float), np.asarray(table_y, float)
-    found: Any = float(known_y[0])
+    known_x, known_y = (_known("np.interp", each) for each in (xp, fp))
+    found = where(np.isnan(x), x, known_y[0] if left is None else left)
     for k in range(len(known_x) - 1):
         slope = (known_y[k + 1] - known_y[k]) / (known_x[k + 1] - known_x[k])
-        found = where(
-            x >= float(known_x[k]), float(slope) * (x - float(known_x[k])) + float(known_y[k]), found
-        )
-    return where(x >= float(known_x[-1]), float(known_y[-1]), found)
+        found = where(x >= known_x[k], slope * (x - known_x[k]) + known_y[k], found)
+    found = where(x >= known_x[-1], known_y[-1], found)
+    return found if right is None else where(x > known_x[-1], right, found)
 
 
-def _sorted_in(table: Any, x: Any, side: str = "left") -> Any:
+def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
     """`np.searchsorted` in a table that is known: how many of its numbers are less."""
     count: Any = 0.0
-    for each in np.asarray(table, float).tolist():
-        count = count + where(x > each if side == "left" else x >= each, 1.0, 0.0)
+    for each in _known("np.searchsorted", a):
+        count = count + where(v > each if side == "left" else v >= each, 1.0, 0.0)
     return count
 
 
-def _taken(table: Any, index: Any) -> Any:
-    """`np.take` of a table that is known."""
-    numbers = np.asarray(table, float).tolist()
-    found: Any = numbers[0]
-    for place, each in enumerate(numbers[1:], 1):
-        found = where(index >= float(place), each, found)
+def _chosen(a: Any, choices: Any) -> Any:
+    """`np.choose`; `np.take` does not tell NumPy's functions of its index."""
+    found, *others = choices
+    for place, each in enumerate(others, 1):
+        found = where(a >= float(place), each, found)
     return found
+
+
+def _known(what: str, table: Any) -> list[float]:
+    """The numbers of a table."""
+    if any(isinstance(each, Traced) for each in np.ravel(np.asarray(table, object))):
+        raise CannotTrace(f"it uses {what} of a table that is not known before; write np.where")
+    return np.asarray(table, float).tolist()
+
+
+def _clipped(x: Any, a_min: Any = None, a_max: Any = None, **named: Any) -> Any:
+    """`np.clip`."""
+    low, high = named.get("min", a_min), named.get("max", a_max)
+    x = x if low is None else np.maximum(x, low)
+    return x if high is None else np.minimum(x, high)
+
+
+def _rounded(x: Any, decimals: int = 0) -> Any:
+    """`np.round`."""
+    return np.rint(x * 10.0**decimals) / 10.0**decimals if decimals else np.rint(x)
 
 
 def _log_of_sum(x: Any, y: Any) -> Any:
@@ -163,7 +203,9 @@ _COMPOSED: dict[Any, Callable[..., Any]] = {
     np.where: where,
     np.minimum: lambda x, y: where((x <= y) | np.isnan(x), x, y),
     np.maximum: lambda x, y: where((x >= y) | np.isnan(x), x, y),
-    np.clip: lambda x, low, high: np.minimum(np.maximum(x, low), high),
+    np.clip: _clipped,
+    np.round: _rounded,
+    np.around: _rounded,
     np.divmod: lambda x, y: (x // y, x % y),
     np.square: lambda x: x * x,
     np.reciprocal: lambda x: 1.0 / x,
@@ -174,7 +216,7 @@ _COMPOSED: dict[Any, Callable[..., Any]] = {
     np.degrees: lambda x: x * (180.0 / np.pi),
     np.interp: _interpolated,
     np.searchsorted: _sorted_in,
-    np.take: _taken,
+    np.choose: _chosen,
     np.logaddexp: _log_of_sum,
 }
 _OPERATORS: dict[Any, Any] = {
@@ -193,12 +235,12 @@ _OPERATORS: dict[Any, Any] = {
     np.bitwise_and: operator.and_,
     np.logical_or: operator.or_,
     np.bitwise_or: operator.or_,
+    np.logical_xor: operator.xor,
+    np.bitwise_xor: operator.xor,
     np.logical_not: operator.not_,
     np.invert: operator.not_,
     np.remainder: operator.mod,
     np.floor_divide: operator.floordiv,
-    np.around: np.rint,
-    np.round: np.rint,
     np.fabs: np.absolute,
 }
 # What a graph holds as it is, beside the operators.
@@ -209,35 +251,24 @@ PRIMITIVES = (
     *(np.absolute, np.sign, np.copysign, np.fmod, np.floor, np.ceil, np.trunc, np.rint),
     *(np.isnan, np.isfinite, np.isinf, np.signbit),
 )
-_LOGICAL = (operator.and_, operator.or_, operator.not_)
+_LOGICAL = (operator.and_, operator.or_, operator.xor, operator.not_)
+_OF_TABLES = (np.interp, np.searchsorted, np.choose)
 
 
 def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None = None) -> Any:
     """What a function of NumPy's gives for traced and other numbers, or arrays of them."""
-    if function in (np.interp, np.searchsorted, np.take):
-        tables, numbers = (
-            [each for each in inputs if np.ndim(each)],
-            [each for each in inputs if not np.ndim(each)],
-        )
-        if any(isinstance(entry, Traced) for table in tables for entry in np.ravel(table)):
-            raise CannotTrace(f"it uses np.{function.__name__} of a table that is not known before")
-        if len(numbers) + len(tables) == len(inputs):
-            return _COMPOSED[function](*inputs, **(options or {}))
-    if any(np.ndim(each) for each in inputs if not isinstance(each, Traced)):
+    if function in _OF_TABLES:
+        return _COMPOSED[function](*inputs, **(options or {}))
+    if any(not isinstance(each, Traced) and np.ndim(each) for each in inputs):
         return _over_arrays(function, inputs)
     if function in _COMPOSED:
-        return _COMPOSED[function](*inputs)
+        return _COMPOSED[function](*inputs, **(options or {}))
     trace = next(each.trace for each in inputs if isinstance(each, Traced))
     if function is np.power:
         return _power(trace, *inputs)
     operation = _OPERATORS.get(function, function)
     if operation not in PRIMITIVES and function not in _OPERATORS:
-        raise CannotTrace(
-            f"it uses np.{getattr(function, '__name__', function)} of a number that is not known before"
-        )
-    if operation is np.rint and len(inputs) == 2:
-        scale = 10.0 ** inputs[1]
-        return apply(np.rint, (inputs[0] * scale,)) / scale
+        raise refused(f"np.{getattr(function, '__name__', function)}")
     nodes = [trace.node_of(each) for each in inputs]
     if operation in _LOGICAL:
         nodes = [

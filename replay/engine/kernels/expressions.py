@@ -24,7 +24,7 @@ from replay.engine.kernels.numbers import (
     is_static,
     negative,
 )
-from replay.engine.kernels.program import Program
+from replay.engine.kernels.program import Program, definition_of
 from replay.engine.kernels.values import Array, Record, entries, load, made, part_of, store
 
 _OPERATORS: dict[type[ast.AST], Any] = {
@@ -87,12 +87,23 @@ class Expressions:
 
     def __init__(self, program: Program, function: FunctionType) -> None:
         self.program = program
-        self.emitter = Emitter()
+        self.emitter = Emitter(self.fault if program.is_checked else None)
+        self.function = function
         self.line = 0
         self.known: dict[str, Any] = {}
         self._outside = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
         self._globals = function.__globals__
         self._labels = count()
+
+    def place_in_source(self) -> str:
+        """The file and the line at work."""
+        _, file, above = definition_of(self.function)
+        return f"{file}, line {above + self.line}"
+
+    def fault(self) -> int:
+        """The number that stands for an index of the line at work that is beyond its array."""
+        self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
+        return len(self.program.faults)
 
     def label(self, stem: str) -> str:
         """A name for a block."""
@@ -399,9 +410,10 @@ class Expressions:
                 pass
         if is_number:
             return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
-        if isinstance(function, FunctionType):
+        if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
             return self.program.call(self.emitter, function, _given(function, arguments, named))
-        raise TypeError(f"a kernel cannot call {getattr(function, '__name__', function)}")
+        name = getattr(function, "__name__", function)
+        raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
 
     def new_array(self, like: Any, dtype: Any = float, *, is_zero: bool) -> Array:
         """`np.empty`, `np.zeros` and the like, of known sizes: there until the function returns."""

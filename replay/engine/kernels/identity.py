@@ -4,7 +4,8 @@ Two functions with the same words do the same. They are found without reading so
 bytecode, closures and the globals that it names.
 """
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
@@ -13,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
+# Whose parts are known by their names alone.
+_OF_PYTHON = {"numpy", *sys.stdlib_module_names}
+
 
 def identity(function: FunctionType) -> str:
     """The words of a function, each thing that it needs described once."""
     told: dict[int, int] = {}
     kept: list[Any] = []  # whose ids are keys
-    return "\n".join(_words(function, told, kept))
+    return "\n".join(_words(function, told, kept, ()))
 
 
 @cache
@@ -29,43 +33,69 @@ def digest_of(room: str) -> str:
     return sha256(b"".join(sources)).hexdigest()
 
 
-def _words(value: Any, told: dict[int, int], kept: list[Any]) -> Iterator[str]:
+def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[str]) -> Iterator[str]:
+    """The words of what is used by code that has these names, among them its attributes."""
+
+    def of(part: Any) -> Iterator[str]:
+        return _words(part, told, kept, names)
+
     own = getattr(value, "kernel_identity", None)
     if callable(own) and not isinstance(value, type):  # it knows what it is, see replay.tracing
         yield own()
-    elif isinstance(value, FunctionType):
-        if id(value) in told:
-            yield f"again {told[id(value)]}"
-            return
-        told[id(value)] = len(told)
-        kept.append(value)
-        yield f"def {value.__name__} {value.__defaults__!r}"
-        yield from _code(value.__code__)
-        for cell in value.__closure__ or ():
-            yield from _words(cell.cell_contents, told, kept)
-        wrapped = getattr(value, "__wrapped__", None)
-        if wrapped is not None:
-            yield from _words(wrapped, told, kept)
-        for name in sorted(set(_names(value.__code__))):
-            if name in value.__globals__:
-                yield name
-                yield from _words(value.__globals__[name], told, kept)
-    elif isinstance(value, ModuleType):
-        yield f"module {value.__name__}"
-    elif isinstance(value, type):
-        yield f"type {value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
-    elif isinstance(value, tuple | list):
-        yield f"{type(value).__qualname__} of {len(value)}"
-        for each in value:
-            yield from _words(each, told, kept)
-    elif isinstance(value, np.ndarray):
-        yield f"{value.dtype} {value.shape} {sha256(value.tobytes()).hexdigest()}"
     elif isinstance(value, bool | int | float | complex | str | bytes | None | np.generic):
         yield repr(value)
+    elif isinstance(value, tuple | list):
+        yield f"{type(value).__qualname__} of {len(value)} {getattr(value, '_fields', '')}"
+        for each in value:
+            yield from of(each)
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape} {sha256(value.tobytes()).hexdigest()}"
+    elif isinstance(value, FunctionType):
+        if _is_told(value, told, kept):
+            yield f"again {told[id(value)]}"
+            return
+        yield f"def {value.__name__} {value.__defaults__!r}"
+        yield from _code(value.__code__)
+        names = sorted(set(_names(value.__code__)))
+        for cell in value.__closure__ or ():
+            yield from of(cell.cell_contents)
+        if hasattr(value, "__wrapped__"):
+            yield from of(value.__wrapped__)
+        for name in names:
+            if name in value.__globals__:
+                yield name
+                yield from of(value.__globals__[name])
+    elif isinstance(value, ModuleType | type):
+        module = value.__name__ if isinstance(value, ModuleType) else value.__module__
+        yield f"{module} {getattr(value, '__qualname__', '')} {getattr(value, '_fields', '')}"
+        if module.partition(".")[0] not in _OF_PYTHON:
+            for name in names:
+                if name in vars(value):
+                    yield name
+                    yield from of(vars(value)[name])
+    elif hasattr(value, "__dict__") and not callable(value):
+        if _is_told(value, told, kept):
+            yield f"again {told[id(value)]}"
+            return
+        yield from of(type(value))
+        for name, each in sorted(vars(value).items()):
+            yield name
+            yield from of(each)
     elif callable(value):
         yield f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', repr(value))}"
+        if hasattr(value, "__wrapped__"):
+            yield from of(value.__wrapped__)
     else:
         yield repr(value)
+
+
+def _is_told(value: Any, told: dict[int, int], kept: list[Any]) -> bool:
+    """Whether it was described before, which it is from now on."""
+    if id(value) in told:
+        return True
+    told[id(value)] = len(told)
+    kept.append(value)
+    return False
 
 
 def _code(code: CodeType) -> Iterator[str]:

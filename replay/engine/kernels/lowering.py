@@ -26,6 +26,7 @@ from replay.engine.kernels.numbers import (
 from replay.engine.kernels.program import DoesNotCompile, Program, definition_of
 from replay.engine.kernels.values import (
     Array,
+    Record,
     at_run_time,
     entries,
     is_local,
@@ -61,11 +62,9 @@ def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tup
         except DoesNotCompile:
             raise
         except Exception as error:
-            _, file, above = definition_of(function)
             reason = f"{type(error).__name__}: {error}"
-            place = f"{file}, line {above + lowering.line}"
             raise DoesNotCompile(
-                f"{function.__qualname__} does not compile ({place}): {reason}"
+                f"{function.__qualname__} does not compile ({lowering.place_in_source()}): {reason}"
             ) from error
 
 
@@ -156,23 +155,32 @@ class _Lowering(Expressions):
 
     def fitting(self, name: str, value: Any) -> Any:
         """The value as one that its place holds; raises `_Wider` where the place has to be another."""
-        value = _unsure(at_run_time(value))
-        if name in self._kinds and isinstance(value, Number):
-            value = self.emitter.as_kind(value, self._kinds[name])
-        if name in self._places and signature(self._places[name]) != signature(value):
-            place = self._places[name]
-            if isinstance(place, Number) and isinstance(value, Number):
-                self._kinds[name] = kind = common_kind(place, value)
-                if kind != place.kind:
-                    raise _Wider
-                return self.emitter.as_kind(value, kind)
-            value = self.converted(name, value, place)
+        value = self.widened(name, _unsure(at_run_time(value)))
+        if name in self._places:
+            value = self.converted(name, value, self._places[name])
         return value
 
+    def widened(self, name: str, value: Any) -> Any:
+        """The value with the kinds of numbers that its place was found to need."""
+        if isinstance(value, Number):
+            kind = self._kinds.get(name, value.kind)
+            return self.emitter.as_kind(value, common_kind(value, Number(kind, "")))
+        parts = entries(value)
+        if parts is None:
+            return value
+        made = tuple(self.widened(f"{name}[{place}]", each) for place, each in enumerate(parts))
+        return Record(value.type, made) if isinstance(value, Record) else made
+
     def converted(self, name: str, value: Any, place: Any) -> Any:
-        """A tuple's numbers as those of the place."""
+        """A number, or a tuple's numbers, as those of the place; `_Wider` where it cannot hold them."""
+        if signature(value) == signature(place):
+            return value
         if isinstance(value, Number) and isinstance(place, Number):
-            return self.emitter.as_kind(value, place.kind)
+            kind = common_kind(place, value)
+            if kind != place.kind:
+                self._kinds[name] = kind
+                raise _Wider
+            return self.emitter.as_kind(value, kind)
         parts, places = entries(value), entries(place)
         if parts is None or places is None or len(parts) != len(places):
             if isinstance(value, Array) and isinstance(place, Array):
@@ -180,7 +188,10 @@ class _Lowering(Expressions):
             raise TypeError(
                 f"{name} is a {type(value).__name__} here and a {type(place).__name__} before"
             )
-        made = tuple(self.converted(name, *each) for each in zip(parts, places, strict=True))
+        made = tuple(
+            self.converted(f"{name}[{at}]", *both)
+            for at, both in enumerate(zip(parts, places, strict=True))
+        )
         return rebuilt(place, iter([code for each in made for _, code in leaves(each)]))
 
     def lookup(self, name: str) -> Any:
@@ -282,17 +293,11 @@ class _Lowering(Expressions):
         if self._depth == 0 and not self._exit:
             self._returned, self._ended = value, True
             return
-        value = _unsure(at_run_time(value))
+        value = self.widened("what is returned", _unsure(at_run_time(value)))
         if not self._exit:
             self._exit = self.label("exit")
-            if "return" in self._kinds and isinstance(value, Number):
-                value = self.emitter.as_kind(value, self._kinds["return"])
             self._returned = self.place(value)
-        elif signature(value) != signature(self._returned):
-            if isinstance(value, Number) and isinstance(self._returned, Number):
-                kind = self._kinds["return"] = common_kind(value, self._returned)
-                if kind != self._returned.kind:
-                    raise _Wider
+        else:
             value = self.converted("what is returned", value, self._returned)
         self.write(self._returned, value)
         self.go(self._exit)
@@ -412,18 +417,12 @@ class _Lowering(Expressions):
             self.begin(label)
             values.append(_unsure(at_run_time(self.value(expression))))
             blocks.append(self.emitter.lines)
-        kept = values[0]
-        if all(isinstance(each, Number) for each in values):
-            kept = values[0]._replace(kind=common_kind(*values))
-        place = self.place(kept)
+        place = self.place(_common(*values))
         self.emitter.lines = before
         self.branch(condition, *labels)
         for value, block in zip(values, blocks, strict=True):
             self.emitter.lines = block
-            is_alike = signature(value) == signature(place)
-            self.write(
-                place, value if is_alike else self.converted("one side of a choice", value, place)
-            )
+            self.write(place, self.converted("one side of a choice", value, place))
             self.go(after)
             before += block
         self.emitter.lines = before
@@ -434,6 +433,17 @@ class _Lowering(Expressions):
 def _unsure(value: Any) -> Any:
     """A number of which it is not known whether it is negative."""
     return value._replace(natural=False) if isinstance(value, Number) else value
+
+
+def _common(one: Any, other: Any) -> Any:
+    """The one value, with numbers of the kinds that hold the other's too."""
+    if isinstance(one, Number) and isinstance(other, Number):
+        return one._replace(kind=common_kind(one, other))
+    parts, others = entries(one), entries(other)
+    if parts is None or others is None or len(parts) != len(others):
+        return one
+    made = tuple(map(_common, parts, others))
+    return Record(one.type, made) if isinstance(one, Record) else made
 
 
 class _Names(ast.NodeVisitor):

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from itertools import count
+from pathlib import Path
 from struct import Struct
 from threading import Lock
 from types import FunctionType
@@ -42,13 +43,13 @@ class Kernel:
 
     def __init__(self, run_once: FunctionType) -> None:
         self._function = run_once
-        self._entries: dict[Any, tuple[Struct, Callable[..., None]]] = {}
-        self._loaded: dict[Any, Callable[..., None]] = {}
+        self._entries: dict[Any, tuple[Struct, Callable[..., Any]]] = {}
+        self._loaded: dict[Any, Callable[..., Any]] = {}
         self._lock = Lock()
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
         """The loop over the runs from `first` up to `end` for these arguments, which it holds."""
-        kinds: list[Any] = []
+        kinds: list[Any] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Any] = []
         for each in arguments:
             _describe(each, 1, kinds, numbers)
@@ -71,11 +72,13 @@ class Kernel:
 
     def _entry(
         self, arguments: Sequence[Any], kinds: Iterator[Any]
-    ) -> tuple[Struct, Callable[..., None]]:
+    ) -> tuple[Struct, Callable[..., Any]]:
+        is_checked = next(kinds)
         described = tuple(_with_types(each, kinds) for each in arguments)
-        if described not in self._loaded:
-            self._loaded[described] = _entry(self._function, described)
-        return Struct(f"={''.join(map(_letters, described))}"), self._loaded[described]
+        key = is_checked, described
+        if key not in self._loaded:
+            self._loaded[key] = (_checked_entry if is_checked else _entry)(self._function, described)
+        return Struct(f"={''.join(map(_letters, described))}"), self._loaded[key]
 
 
 # --- arguments --------------------------------------------------------------------------------------
@@ -102,7 +105,9 @@ def _describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> 
     So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
     """
     if isinstance(value, np.ndarray):
-        kinds.append((value.dtype.char, value.ndim, value.shape[varies:], value.flags.c_contiguous))
+        flags, dtype = value.flags, value.dtype
+        is_usual = flags.aligned and dtype.isnative
+        kinds.append((dtype.char, value.ndim, value.shape[varies:], flags.c_contiguous, is_usual))
         numbers.append(id(value))
     elif isinstance(value, tuple):
         kinds.append((type(value), len(value)))
@@ -124,9 +129,10 @@ def _with_types(value: Any, kinds: Iterator[Any]) -> Any:
     if isinstance(value, tuple):
         return type(value), tuple(_with_types(each, kinds) for each in value)
     if isinstance(value, np.ndarray):
-        letter, axes, known, is_packed = kind
-        if letter not in _LETTERS or value.dtype.byteorder == ">":
-            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}")
+        letter, axes, known, is_packed, is_usual = kind
+        if letter not in _LETTERS or not is_usual:
+            why = "" if is_usual else ", unaligned or in another machine's order"
+            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
         shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
         return Kept(letter, shape, is_packed)
     for types, name in _SCALARS:
@@ -149,7 +155,7 @@ def _letters(kind: Any) -> str:
         return "q"
     if isinstance(kind, tuple):
         return "".join(map(_letters, kind[1]))
-    return {REAL: "d", WORD: "Q"}.get(kind, "q")
+    return {REAL: "d", WORD: "Q", TRUTH: "?7x"}.get(kind, "q")
 
 
 def _value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
@@ -202,35 +208,56 @@ def _array_of(kind: Kept, emitter: Emitter, structure: str) -> Array:
 # --- making -----------------------------------------------------------------------------------------
 
 
-def text_of(function: FunctionType, kinds: Sequence[Any]) -> str:
-    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run."""
-    program, emitter, words = Program(lower), Emitter(), count()
+def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool = False) -> Program:
+    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
+
+    It returns 0, or where indices are checked the number of the first fault.
+    """
+    program, emitter, words = Program(lower, is_checked=is_checked), Emitter(), count()
     arguments = [_value_of(kind, emitter, words) for kind in kinds]
     body = Emitter()
     body.fresh = emitter.fresh  # type: ignore[method-assign]
     program.call(body, function, [Number(WHOLE, "%run"), *arguments])
+    stop = ["stop:", "  %why = load i64, ptr %fault", "  ret i64 %why"] if body.can_fail else []
     lines = [
-        "define void @kernel(i64 %first, i64 %end, ptr %words) {",
+        "define i64 @kernel(i64 %first, i64 %end, ptr %words) {",
         "entry:",
+        *body.allocated,
         *emitter.lines,
         "  br label %loop",
         "loop:",
-        "  %run = phi i64 [ %first, %entry ], [ %next, %body ]",
+        "  %run = phi i64 [ %first, %entry ], [ %next, %following ]",
         "  %more = icmp slt i64 %run, %end",
         "  br i1 %more, label %body, label %done",
         "body:",
         *body.lines,
+        "  br label %following",
+        "following:",
         "  %next = add nsw i64 %run, 1",
         "  br label %loop",
         "done:",
-        "  ret void",
+        "  ret i64 0",
+        *stop,
         "}",
     ]
     program.functions.append("\n".join(lines))
-    return program.text()
+    return program
 
 
-def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+def _checked_entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+    """The kernel's entry, which raises IndexError where an index is beyond its array; it is not kept."""
+    program = program_of(function, kinds, is_checked=True)
+    kernel = _loaded(object_code(program.text()))
+
+    def checked(*arguments: Any) -> None:
+        fault = kernel(*arguments)
+        if fault:
+            raise IndexError(f"an index is beyond its array in {program.faults[fault - 1]}")
+
+    return checked
+
+
+def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., int]:
     """The kernel's entry: kept, or made."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
@@ -239,7 +266,7 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None
         path = cache_folder() / "kernels" / f"{function.__name__}-{key}.bin"
     if path is not None and not is_private(path.parent):
         path = None
-    code = None if path is None else read_checked(path)
+    code = None if path is None else _kept(path, key)
     if code is None:
         title = f"{function.__module__}.{function.__name__}"
         if path is None:
@@ -247,12 +274,19 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None
                 code = _made(function, kinds)
         else:
             with compiling(title), in_turn(path) as waited:
-                code = (read_checked(path) if waited else None) or _made(function, kinds)
-                _keep(path, code)
+                code = (_kept(path, key) if waited else None) or _made(function, kinds)
+                _keep(path, key.encode() + code)
     return _loaded(code)
 
 
-def _keep(path: Any, code: bytes) -> None:
+def _kept(path: Path, key: str) -> bytes | None:
+    """The object code that a file holds; None where it is damaged, or another kernel's."""
+    found = read_checked(path)
+    own = key.encode()
+    return found.removeprefix(own) if found is not None and found.startswith(own) else None
+
+
+def _keep(path: Path, code: bytes) -> None:
     try:
         write_checked(path, code, _MADE_BY)
     except BadInput as error:
@@ -305,7 +339,7 @@ def _new_target() -> Any:
 def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
     """The kernel's object code."""
     with _without_garbage():
-        return object_code(text_of(function, kinds))
+        return object_code(program_of(function, kinds).text())
 
 
 def object_code(text: str) -> bytes:
@@ -326,13 +360,13 @@ def object_code(text: str) -> bytes:
 _ENGINES: list[Any] = []  # what is loaded stays
 
 
-def _loaded(code: bytes) -> Callable[..., None]:
+def _loaded(code: bytes) -> Callable[..., int]:
     """The entry of a kernel's object code; the engine owns its target."""
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
-    entry = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p)
+    entry = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p)
     return entry(engine.get_function_address("kernel"))
 
 

@@ -55,12 +55,17 @@ def is_static(value: Any) -> TypeGuard[Static]:
 
 
 class Emitter:
-    """Writes the instructions of one function."""
+    """Writes the instructions of one function.
 
-    def __init__(self) -> None:
+    `fault`, where indices are checked, gives the number (1, ...) that stands for the line at work.
+    """
+
+    def __init__(self, fault: Callable[[], int] | None = None) -> None:
         self.lines: list[str] = []
         self.allocated: list[str] = []  # memory of the function, which is taken once
         self.declared: set[str] = set()
+        self.fault = fault
+        self.can_fail = False
         self._names = count()
 
     def fresh(self) -> str:
@@ -89,6 +94,18 @@ class Emitter:
         self.declared.add(f"declare double @{name}({parameters}) #0")
         given = ", ".join(f"double {each.code}" for each in arguments)
         return self.number(REAL, f"call double @{name}({given})")
+
+    def stop_if(self, condition: Number, fault: Number) -> None:
+        """Leave the function, and all that called it, with a fault; see `Program.define`."""
+        if not self.can_fail:
+            self.can_fail = True
+            self.allocated += ["  %fault = alloca i64", "  store i64 0, ptr %fault"]
+        failed, on = self.fresh()[1:], self.fresh()[1:]
+        self.add(f"br i1 {condition.code}, label %{failed}, label %{on}")
+        self.lines.append(f"{failed}:")
+        self.add(f"store i64 {fault.code}, ptr %fault")
+        self.add("br label %stop")
+        self.lines.append(f"{on}:")
 
     # --- conversions ---
 
@@ -220,7 +237,11 @@ def _divided(emitter: Emitter, operation: Any, x: Number, y: Number) -> Number:
     floor = emitter.call("llvm.floor.f64", quotient)
     over = emitter.number(REAL, f"fsub double {quotient.code}, {floor.code}")
     up = emitter.number(REAL, f"fadd double {floor.code}, {constant(1.0).code}")
-    return emitter.select(compare(emitter, operator.gt, over, constant(0.5)), up, floor)
+    snapped = emitter.select(compare(emitter, operator.gt, over, constant(0.5)), up, floor)
+    exact = emitter.number(REAL, f"fdiv double {x.code}, {y.code}")
+    signed_zero = emitter.call("llvm.copysign.f64", zero, exact)
+    found = emitter.select(compare(emitter, operator.eq, quotient, zero), signed_zero, snapped)
+    return emitter.select(compare(emitter, operator.eq, y, zero), exact, found)
 
 
 def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.kernels.numbers import Emitter, Number
+from replay.engine.kernels.numbers import WHOLE, Emitter, Number
 from replay.engine.kernels.values import Array, leaves, rebuilt, signature, table
 
 FEW = 30  # lines of a function that is always written where it is called
@@ -23,20 +24,32 @@ class DoesNotCompile(BadInput):
 
 
 class Instance(NamedTuple):
-    """A function lowered for some arguments: its name, the type of what it returns, and that value."""
+    """A function lowered for some arguments: its name, the type of what it returns, and that value.
+
+    One that `can_fail` returns the number of its fault too, 0 for none.
+    """
 
     name: str
     type: str
     returned: Any
+    can_fail: bool
 
 
 class Program:
-    """The text of a kernel while it grows."""
+    """The text of a kernel while it grows.
+
+    Where indices are checked, `faults` are the lines at which one can be beyond its array.
+    """
 
     def __init__(
-        self, lower: Callable[["Program", FunctionType, list[Any]], tuple[Emitter, Any]]
+        self,
+        lower: Callable[["Program", FunctionType, list[Any]], tuple[Emitter, Any]],
+        *,
+        is_checked: bool = False,
     ) -> None:
         self._lower = lower
+        self.is_checked = is_checked
+        self.faults: list[str] = []
         self.functions: list[str] = []
         self.declared: set[str] = set()
         self.tables: dict[Any, tuple[str, Array]] = {}
@@ -53,7 +66,7 @@ class Program:
 
     def name(self, stem: str) -> str:
         """A name that no other function or table has."""
-        return f"@{stem}_{next(self._names)}"
+        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
 
     def table(self, numbers: np.ndarray) -> Array:
         """A constant array."""
@@ -83,7 +96,8 @@ class Program:
     ) -> Instance:
         """Add a function whose body ends before what it returns is given back."""
         found = list(leaves(returned))
-        kind = "void" if not found else "{ " + ", ".join(each for each, _ in found) + " }"
+        results = [*found, ("i64", "0")] if body.can_fail else found
+        kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"
         name = self.name(stem)
         given = ", ".join(f"{kind} {code}" for each in parameters for kind, code in each)
         inlined = " alwaysinline" if len(body.lines) < FEW else ""
@@ -94,13 +108,20 @@ class Program:
             *body.lines,
         ]
         last = "undef"
-        for place, (each, code) in enumerate(found):
+        for place, (each, code) in enumerate(results):
             lines.append(f"  %out{place} = insertvalue {kind} {last}, {each} {code}, {place}")
             last = f"%out{place}"
-        lines += ["  ret void" if not found else f"  ret {kind} {last}", "}"]
-        self.functions.append("\n".join(lines))
+        lines.append(f"  ret {kind} {last}" if results else "  ret void")
+        if body.can_fail:
+            lines += [
+                "stop:",
+                "  %why = load i64, ptr %fault",
+                f"  %stopped = insertvalue {kind} undef, i64 %why, {len(found)}",
+                f"  ret {kind} %stopped",
+            ]
+        self.functions.append("\n".join([*lines, "}"]))
         self.declared |= body.declared
-        return Instance(name, kind, returned)
+        return Instance(name, kind, returned, body.can_fail)
 
     def _parameter(self, index: int, value: Any) -> tuple[Any, list[tuple[str, str]]]:
         """An argument as the function that it is given to knows it, and its leaves there."""
@@ -125,6 +146,9 @@ def called(emitter: Emitter, instance: Instance, arguments: Sequence[Any]) -> An
     for place, _ in enumerate(leaves(instance.returned)):
         names.append(emitter.fresh())
         emitter.add(f"{names[-1]} = extractvalue {instance.type} {result}, {place}")
+    if instance.can_fail:
+        fault = emitter.number(WHOLE, f"extractvalue {instance.type} {result}, {len(names)}")
+        emitter.stop_if(emitter.truth(fault), fault)
     return rebuilt(instance.returned, iter(names))
 
 

@@ -161,7 +161,16 @@ def combined(emitter: Emitter, operation: Any, left: Size, right: Size) -> Size:
 
 
 def place_in(emitter: Emitter, index: Scalar, size: Size) -> Size:
-    """Where an index points to, counted from the end where it is negative."""
+    """Where an index points to, counted from the end where it is negative; checked if that is asked."""
+    place = _counted(emitter, index, size)
+    if emitter.fault is not None:
+        code, end = (emitter.as_kind(whole(each), WHOLE).code for each in (place, size))
+        is_beyond = emitter.number(TRUTH, f"icmp uge i64 {code}, {end}")
+        emitter.stop_if(is_beyond, constant(emitter.fault()))
+    return place
+
+
+def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
     if not isinstance(index, Number):
         return int(index) if index >= 0 else combined(emitter, operator.add, size, int(index))
     number = emitter.as_kind(index, WHOLE) if index.kind == TRUTH else index
@@ -196,7 +205,7 @@ def part_of(emitter: Emitter, array: Array, index: tuple[Any, ...]) -> Array:
 
 def _within(emitter: Emitter, bound: Scalar, size: Size) -> Size:
     """A bound of a slice: no further than the end."""
-    place = place_in(emitter, bound, size)
+    place = _counted(emitter, bound, size)
     if isinstance(place, int) and isinstance(size, int):
         return min(max(place, 0), size)
     both = [emitter.as_kind(whole(each), WHOLE) for each in (place, size)]

@@ -1,4 +1,4 @@
-"""Kernels are compiled once per source text, wherever they come from and whatever the cache allows."""
+"""Kernels, ours and numba's, are compiled once, from wherever, and whatever the cache allows."""
 
 import ast
 import inspect
@@ -24,12 +24,14 @@ from recorders.log import loops
 from replay.engine.cache import cache_folder, in_turn
 from replay.engine.compile import compile_over_runs, compiled
 from replay.engine.keeping import load
+from replay.engine.kernels import native
+from replay.engine.kernels.native import Kernel
+from replay.engine.through_numba import loop_of
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
 MODULE = """
     import numpy as np
     from typing import NamedTuple
-    from replay.engine.compile import compile_over_runs
 
     GAIN = 3.0
 
@@ -47,11 +49,26 @@ MODULE = """
         return one
 
     columns = Columns(np.arange(3.0), np.zeros(3))
-    loop = compile_over_runs(kernel(model), allocates=False)
-    loop(3, columns)
-    compiled = loop.keywords["loop"]
-    print(*columns.found, "cached" if compiled.stats.cache_hits else "compiled")
 """
+BY_NUMBA = f"""{MODULE}
+    from replay.engine.through_numba import loop_of
+
+    loop = loop_of(kernel(model))
+    loop.of((columns,))(0, 3)
+    print(*columns.found, "cached" if loop._loop.stats.cache_hits else "compiled")
+"""
+OURS = f"""{MODULE}
+    from replay.engine.kernels import native
+
+    made, make = [], native._made
+    native._made = lambda *given: made.append(given) or make(*given)
+    native.Kernel(kernel(model)).of((columns,))(0, 3)
+    print(*columns.found, "compiled" if made else "cached")
+"""
+BOTH = pytest.mark.parametrize(
+    "module",
+    [pytest.param(BY_NUMBA, marks=pytest.mark.paper, id="numba"), pytest.param(OURS, id="ours")],
+)
 
 
 def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]:
@@ -63,6 +80,7 @@ def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]
         env={
             "HOME": str(folder),
             "FUSELOG_CACHE": str(cache),
+            "PYTHONDONTWRITEBYTECODE": "1",  # a file changed within a second would be run as it was
             "PYTHONPATH": str(
                 Path(replay.engine.compile.__file__).parents[2]
             ),  # the tree that is under test
@@ -75,20 +93,18 @@ def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]
     return done.stdout.splitlines()
 
 
-@pytest.mark.paper
-def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(tmp_path: Path):
+@BOTH
+def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(
+    tmp_path: Path, module: str
+):
     """Neither a compilation at every start, nor the old model after a change."""
     cache = tmp_path / "cache"
-    assert imported(MODULE, tmp_path, cache)[0] == "1.0 4.0 7.0 compiled"
-    assert imported(MODULE, tmp_path, cache)[0] == "1.0 4.0 7.0 cached"
-    changed = MODULE.replace("value + 1.0", "value - 1.0")
+    assert imported(module, tmp_path, cache)[0] == "1.0 4.0 7.0 compiled"
+    assert imported(module, tmp_path, cache)[0] == "1.0 4.0 7.0 cached"
+    changed = module.replace("value + 1.0", "value - 1.0")
     assert imported(changed, tmp_path, cache)[0] == "-1.0 2.0 5.0 compiled"
 
 
-# Both are ready before either compiles.
-TOGETHER = MODULE.replace(
-    "    loop(3, columns)", '    print("ready", flush=True)\n    input()\n    loop(3, columns)'
-)
 # Keeps the others waiting until it is killed.
 HOLDER = """
     import sys
@@ -107,11 +123,14 @@ def started(text: str, *arguments: str | Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
+@BOTH
 def test_of_two_processes_that_want_a_kernel_one_compiles(
-    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch, module: str
 ):
     """The other waits, and loads what the first has kept; no lock is left behind."""
-    (tmp_path / "third_party.py").write_text(textwrap.dedent(TOGETHER))
+    ready = '    print("ready", flush=True)\n    input()\n'  # both are, before either compiles
+    together = re.sub(r"(?m)^    (loop|native\.Kernel).*\.of\(", lambda line: ready + line[0], module)
+    (tmp_path / "third_party.py").write_text(textwrap.dedent(together))
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
     both = [started("import third_party") for _ in range(2)]
     assert [process.stdout.readline() for process in both] == ["ready\n"] * 2
@@ -138,7 +157,7 @@ def test_nobody_waits_long_for_a_kernel_and_not_at_all_for_the_killed(
         assert not waited
 
 
-# A function that numba compiles by what another module says of it, as jets are.
+# A function that numba compiles by what another module says of it.
 EXTENSION = """
     from numba.extending import overload
 
@@ -155,7 +174,7 @@ EXTENSION = """
 def test_what_is_imported_by_name_is_compiled_anew_when_its_module_changes(tmp_path: Path):
     """By itself numba goes on with the old one: it looks at the file of the kernel alone."""
     cache = tmp_path / "cache"
-    user = MODULE.replace("GAIN = 3.0", "from extension import gain").replace(
+    user = BY_NUMBA.replace("GAIN = 3.0", "from extension import gain").replace(
         "GAIN * value", "gain(value)"
     )
     for extension, expected in (
@@ -185,17 +204,21 @@ CALLED_FROM_PYTHON = """
 
 @pytest.mark.paper
 def test_a_change_in_another_file_is_noticed(tmp_path: Path):
-    """Of a function, and of the order of a named tuple's fields: numba sees neither."""
+    """Which numba by itself does not see."""
     cache = tmp_path / "cache"
     for change, expected in ((1.0, "1.0 2.0 3.0"), (2.0, "2.0 3.0 4.0")):
         (tmp_path / "model.py").write_text(f"def moved(x):\n    return x + {change}\n")
         assert imported(CALLED_FROM_PYTHON, tmp_path, cache) == [expected]
-    head, fields = MODULE.split("class Columns(NamedTuple):")[0], ("given", "found")
-    rest = MODULE.split("found: np.ndarray", 1)[1].replace(
-        "Columns(np.arange(3.0), np.zeros(3))", "MADE"
+
+
+@BOTH
+def test_the_order_of_a_named_tuples_fields_is_part_of_a_kernel(tmp_path: Path, module: str):
+    cache = tmp_path / "cache"
+    head, rest = module.split("class Columns(NamedTuple):")
+    rest = rest.split("found: np.ndarray", 1)[1].replace(
+        "Columns(np.arange(3.0), np.zeros(3))", "Columns(given=np.arange(3.0), found=np.zeros(3))"
     )
-    rest = rest.replace("MADE", "Columns(given=np.arange(3.0), found=np.zeros(3))")
-    for names in (fields, fields[::-1]):
+    for names in (("given", "found"), ("found", "given")):
         body = "".join(f"    {name}: np.ndarray\n" for name in names)
         text = f"import numpy as np\nfrom typing import NamedTuple\nclass Columns(NamedTuple):\n{body}"
         (tmp_path / "columns.py").write_text(text)
@@ -204,11 +227,12 @@ def test_a_change_in_another_file_is_noticed(tmp_path: Path):
         )
 
 
-def test_a_cache_that_cannot_be_written_does_not_stop_the_work(tmp_path: Path):
+@BOTH
+def test_a_cache_that_cannot_be_written_does_not_stop_the_work(tmp_path: Path, module: str):
     """The kernel is compiled for this process alone, and nothing is left behind."""
     (tmp_path / "file").touch()
-    assert imported(MODULE, tmp_path, tmp_path / "file" / "cache") == ["1.0 4.0 7.0 compiled"]
-    assert {path.name for path in tmp_path.iterdir()} == {"file", "third_party.py", "__pycache__"}
+    assert imported(module, tmp_path, tmp_path / "file" / "cache") == ["1.0 4.0 7.0 compiled"]
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "third_party.py"}
 
 
 @pytest.fixture
@@ -218,20 +242,37 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "kernels"
 
 
-def found_in_the_cache() -> bool:
-    """Whether a kernel, which gives the right number, is loaded rather than compiled."""
+def by_numba() -> bool:
+    """Whether numba's kernel, which gives the right number, is loaded rather than compiled."""
     load.cache_clear()
-    loop, found = compile_over_runs(divide, allocates=False), np.zeros(1)
-    loop(1, np.array([4.0]), found)
+    loop, found = loop_of(divide), np.zeros(1)
+    loop.of((np.array([4.0]), found))(0, 1)
     assert found[0] == 0.25
-    return bool(loop.keywords["loop"].stats.cache_hits)
+    return bool(loop._loop.stats.cache_hits)
 
 
-@pytest.mark.paper
+def ours() -> bool:
+    """The same of our own kernel."""
+    made, found, make = [], np.zeros(1), native._made
+    with pytest.MonkeyPatch.context() as counted:
+        counted.setattr(native, "_made", lambda *given: made.append(given) or make(*given))
+        Kernel(divide).of((np.array([4.0]), found))(0, 1)
+    assert found[0] == 0.25
+    return not made
+
+
+EITHER = pytest.mark.parametrize(
+    "found_in_the_cache", [pytest.param(by_numba, marks=pytest.mark.paper), ours]
+)
+
+
+@EITHER
 @pytest.mark.parametrize(
     "damage", ["emptied", "cut", "flipped", "unlike its checksum", "not ours", "another kernel's"]
 )
-def test_a_damaged_file_is_compiled_anew_and_replaced(kernels: Path, damage: str):
+def test_a_damaged_file_is_compiled_anew_and_replaced(
+    kernels: Path, damage: str, found_in_the_cache: Callable[[], bool]
+):
     """As a loss of power leaves it; what is executed has to be what was written."""
     assert not found_in_the_cache()
     assert found_in_the_cache()
@@ -247,8 +288,11 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(kernels: Path, damage: str
     }
     path.write_bytes(changed.get(damage, whole))
     if damage == "another kernel's":
-        loop = compile_over_runs(sorted_copy)
-        loop(1, np.array([[3.0, 1.0]]), np.zeros(1))
+        values, found = np.array([[3.0, 1.0]]), np.zeros(1)
+        if found_in_the_cache is ours:
+            Kernel(root).of((values, found))(0, 1)
+        else:
+            compile_over_runs(sorted_copy)(1, values, found)
         (other,) = set(kernels.iterdir()) - {path}
         other.replace(path)
     assert not found_in_the_cache()
@@ -256,17 +300,21 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(kernels: Path, damage: str
     assert list(kernels.iterdir()) == [path]
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("kernels")
 def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
     """A whole file that cannot be loaded all the same."""
-    assert not found_in_the_cache()
+    assert not by_numba()
     with monkeypatch.context() as broken:
         broken.setattr("replay.engine.keeping.pickle.loads", lambda _: 1 / 0)
-        assert not found_in_the_cache()
-    assert found_in_the_cache()
+        assert not by_numba()
+    assert by_numba()
 
 
-def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog):
+@EITHER
+def test_a_full_disk_is_said_once(
+    kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog, found_in_the_cache: Callable[[], bool]
+):
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -280,9 +328,10 @@ def test_a_full_disk_is_said_once(kernels: Path, monkeypatch: pytest.MonkeyPatch
     ]
 
 
+@EITHER
 @pytest.mark.unix
 def test_only_a_folder_of_this_user_alone_is_used(
-    kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog
+    kernels: Path, monkeypatch: pytest.MonkeyPatch, caplog, found_in_the_cache: Callable[[], bool]
 ):
     """The cache executes what it finds. Windows, which has no user numbers, uses its folder as it is."""
     before = os.umask(0)
@@ -313,9 +362,7 @@ def test_only_a_folder_of_this_user_alone_is_used(
 def test_every_kernel_of_replay_is_compiled_here():
     """A raw `njit(cache=True)` would not notice a change in another file."""
     users = {path.name: path for path in Path("replay").rglob("*.py") if "numba" in imports_of(path)}
-    assert users.keys() == {"bundling.py", "compile.py", "inlining.py", "keeping.py", "jets.py"}
-    # jets are a type of their own to numba; a kernel that uses them has a hash of that file in its key
-    assert "njit" not in users["jets.py"].read_text(encoding="utf-8")
+    assert users.keys() == {"bundling.py", "inlining.py", "keeping.py", "through_numba.py"}
 
 
 @pytest.mark.parametrize(
@@ -385,6 +432,10 @@ def test_the_loop_does_every_run_once_whatever_the_cores(monkeypatch: pytest.Mon
     loop(0, values, found, scratch=lambda: np.empty(200))
 
 
+def root(run: int, values: np.ndarray, found: np.ndarray) -> None:
+    found[run] = np.sqrt(values[run, 0])
+
+
 def sorted_copy(run: int, values: np.ndarray, found: np.ndarray) -> None:
     found[run] = np.sort(values[run])[:2] @ np.ones(2)
 
@@ -394,7 +445,7 @@ def test_a_kernel_that_allocates_says_so():
     values, found = np.array([[3.0, 1.0, 2.0]]), np.zeros(1)
     compile_over_runs(sorted_copy)(1, values, found)
     assert found[0] == 3.0
-    with pytest.raises(BadInput, match="a kernel that makes arrays is compiled with allocates=True"):
+    with pytest.raises(BadInput, match="cannot call sort; others have allocates=True"):
         compile_over_runs(sorted_copy, allocates=False)(1, values, found)
 
 

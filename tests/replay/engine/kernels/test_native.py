@@ -1,0 +1,226 @@
+"""A kernel's key is all that it is made of, and nothing else; what is kept serves every process."""
+
+import os
+import pickle
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from replay.engine.arrays import varying
+from replay.engine.compile import compile_over_runs
+from replay.engine.kernels import native
+from replay.engine.kernels.identity import identity
+
+# --- the key -----------------------------------------------------------------------------------------
+
+GAIN = 2.0
+SETTINGS = SimpleNamespace(gain=2.0)
+
+
+class Gains:
+    """Constants of a class."""
+
+    gain = 2.0
+
+
+def doubled(x: float) -> float:
+    return 2.0 * x
+
+
+def tripled(x: float) -> float:
+    return 3.0 * x
+
+
+called = doubled
+
+
+def by_a_global(x: float) -> float:
+    return GAIN * x
+
+
+def by_an_object(x: float) -> float:
+    return SETTINGS.gain * x
+
+
+def by_a_class(x: float) -> float:
+    return Gains.gain * x
+
+
+def by_a_callee(x: float) -> float:
+    return called(x)
+
+
+def by_a_module(x: float) -> float:
+    return native.gain(x)
+
+
+def by_a_default(x: float, gain: float = 2.0) -> float:
+    return gain * x
+
+
+def closing_over(*parts: Any) -> Callable[[float], float]:
+    gain, function = parts
+
+    def scaled(x: float) -> float:
+        return gain * function(x)
+
+    return scaled
+
+
+def kernel_of(function: Callable[[float], float]) -> Callable[..., None]:
+    def one(run: int, x: np.ndarray, out: np.ndarray) -> None:
+        out[run] = function(x[run])
+
+    return one
+
+
+@pytest.fixture
+def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache; where its kernels will lie."""
+    monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "kernels"
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What is compiled rather than loaded."""
+    found, make = [], native._made
+    monkeypatch.setattr(native, "_made", lambda *given: found.append(given) or make(*given))
+    return found
+
+
+def result_of(function: Callable[[float], float]) -> float:
+    out = np.zeros(1)
+    compile_over_runs(kernel_of(function), allocates=False)(1, np.array([1.5]), out)
+    return out[0]
+
+
+@pytest.mark.parametrize(
+    ("function", "place", "name", "before", "after"),
+    [
+        (by_a_global, globals(), "GAIN", 2.0, 4.0),
+        (by_an_object, vars(SETTINGS), "gain", 2.0, 4.0),
+        (by_a_callee, globals(), "called", doubled, tripled),
+        (by_a_module, vars(native), "gain", doubled, tripled),
+    ],
+    ids=["a global", "an object's", "a callee", "a module's"],
+)
+def test_what_a_kernel_uses_is_part_of_its_key(
+    function: Any, place: Any, name: str, before: Any, after: Any, kernels: Path, made: list[Any]
+):
+    """Changed it makes another file, changed back it finds the first."""
+    with pytest.MonkeyPatch.context() as changed:
+        for number, value in enumerate((before, after, before, after)):
+            changed.setitem(place, name, value)
+            assert result_of(function) == function(1.5)
+            assert len(made) == min(number + 1, 2)
+    assert len(list(kernels.iterdir())) == 2
+
+
+def test_closures_classes_and_defaults_are_part_of_a_key(monkeypatch: pytest.MonkeyPatch):
+    keys = [identity(closing_over(*parts)) for parts in ((2.0, doubled), (2.5, doubled), (2.0, tripled))]
+    keys += [identity(by_a_default), identity(by_a_class)]
+    monkeypatch.setattr(by_a_default, "__defaults__", (3.0,))
+    monkeypatch.setattr(Gains, "gain", 3.0)
+    keys += [identity(by_a_default), identity(by_a_class)]
+    assert len({*keys}) == 7
+    assert identity(closing_over(2.0, doubled)) == keys[0]
+
+
+@varying(1, grid=2)
+class Scene(NamedTuple):
+    """Rows of which the number varies, and a grid of any size."""
+
+    rows: np.ndarray
+    grid: np.ndarray
+
+
+def looked_at(run: int, scene: Scene, out: np.ndarray) -> None:
+    out[run] = scene.rows.shape[1] * 1000.0 + scene.grid.shape[1] + scene.rows[run, 0]
+
+
+def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, made: list[Any]):
+    loop = compile_over_runs(looked_at, allocates=False)
+    for count, (runs, columns, width) in enumerate(
+        [(1, 3, 5), (2, 4, 5), (2, 64, 5), (2, 65, 5), (1, 3, 7), (9, 100, 70), (3, 64, 1)]
+    ):
+        scene, out = Scene(np.ones((runs, columns)), np.zeros((runs, width))), np.zeros(runs)
+        loop(runs, scene, out)
+        assert out.tolist() == [1000.0 * columns + width + 1.0] * runs
+        assert len(made) == min(count + 1, 4)
+    assert len(list(kernels.iterdir())) == 4
+
+
+# --- what is kept ------------------------------------------------------------------------------------
+
+ELSEWHERE = """
+import numpy as np
+from replay.engine.kernels import native
+native._made = lambda *_: 1 / 0
+from tests.replay.engine.kernels.test_native import doubled, kernel_of
+from replay.engine.compile import compile_over_runs
+out = np.zeros(1)
+compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), out)
+print(out[0])
+"""
+
+
+def test_another_process_loads_what_is_kept_and_it_holds_no_address(kernels: Path):
+    assert result_of(doubled) == 3.0
+    (path,) = kernels.iterdir()
+    kept = path.read_bytes()
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE],
+        env={**os.environ, "PYTHONPATH": str(Path.cwd()), "PYTHONHASHSEED": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "3.0\n", done.stderr
+    path.unlink()
+    compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), np.zeros(1))
+    assert path.read_bytes() == kept  # whatever lies where
+    text = native.program_of(kernel_of(doubled), (native.Kept("d", (None,), True),) * 2).text()
+    addresses = [int(number) for number in re.findall(r"(?<![\w%.])\d{9,}", text)]
+    assert addresses == []
+
+
+def test_another_processor_or_version_of_this_room_is_another_kernel(
+    kernels: Path, made: list[Any], monkeypatch: pytest.MonkeyPatch
+):
+    assert result_of(doubled) == 3.0
+    native._surroundings.cache_clear()
+    monkeypatch.setattr(native, "_machine", lambda: ("x86-64", "another's features"))
+    monkeypatch.setattr(native, "_loaded", lambda _: lambda *_: 0)
+    monkeypatch.setattr(native, "object_code", lambda _: b"machine code")
+    result_of(doubled)
+    native._surroundings.cache_clear()
+    assert len(made) == 2
+    assert len(list(kernels.iterdir())) == 2
+
+
+# --- other processes ---------------------------------------------------------------------------------
+
+
+def in_a_worker(number: float) -> float:
+    out = np.zeros(1)
+    compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([number]), out)
+    return out[0]
+
+
+@pytest.mark.usefixtures("kernels")
+def test_workers_run_kernels_and_get_them_by_name():
+    """Spawned, as `--workers` has them: a function is sent, and compiled or found there."""
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        assert list(pool.map(result_of, [doubled, tripled])) == [3.0, 4.5]
+        assert list(pool.map(in_a_worker, [1.0, 2.0, 3.0])) == [2.0, 4.0, 6.0]
+    assert pickle.loads(pickle.dumps(in_a_worker))(2.0) == 4.0
