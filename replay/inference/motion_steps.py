@@ -7,16 +7,11 @@ from replay.inference.gaussian import (
     add_through,
     moved_covariance,
 )
-from replay.inference.generate import (
-    Input,
-    adding_noise,
-    derivative,
-    filling,
-    tuple_of,
-)
+from replay.inference.linearization import Input, derivative
 from replay.inference.model import Model, Motion
 from replay.inference.stage import Stage
 from replay.inference.steps import Workspace
+from replay.inference.tuples import adding_noise, filling, tuple_of
 
 
 def linear_motion(stage: Stage) -> Function:
