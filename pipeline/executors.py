@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput
+from replay.engine.compile import use_cores
 
 # With fewer runs, processes take longer to begin than they save.
 PAYING_RUNS = 1000
@@ -127,10 +128,8 @@ def processes(count: int) -> Crew:
 
 def _begin_worker() -> None:
     """One core for each worker; an interrupt is the parent's to deal with, and its end theirs too."""
-    import numba
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    numba.config.NUMBA_NUM_THREADS = 1  # type: ignore[attr-defined]
+    use_cores(1)
     threadpool_limits(1)
     parent = parent_process()
     assert parent is not None
@@ -245,7 +244,7 @@ def version_of_code() -> str:
             _add_sources(digest, Path(place))
         if spec.origin and not spec.submodule_search_locations:
             digest.update(Path(spec.origin).read_bytes())
-    digest.update(" ".join(version(name) for name in ("numpy", "scipy", "numba")).encode())
+    digest.update(" ".join(version(name) for name in ("numpy", "scipy", "llvmlite", "numba")).encode())
     return digest.hexdigest()
 
 

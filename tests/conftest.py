@@ -3,7 +3,6 @@
 import os
 import sys
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,41 +20,9 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture
-def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Loops in plain Python, of which none is left to the next test.
-
-    A log of some hundred messages is replayed in less than a second, and a kernel takes ten to compile.
-    """
-    from replay.engine import blocks, supervision
-    from replay.inference import (
-        filtering,
-        fixed_lag,
-        gauss_newton,
-        imm,
-        observability,
-        rewinding,
-        smoothing,
-        tracking,
-    )
-
-    loops = (
-        blocks._merge,
-        supervision._over_runs,
-        filtering._compiled,
-        rewinding._compiled,
-        gauss_newton.searching,
-        smoothing.going_back,
-        fixed_lag.sliding_over_runs,
-        imm._smoothing,
-        observability._summing,
-        tracking._compiled,
-    )
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops in plain Python: the reference, which a debugger can follow."""
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    for each in loops:
-        each.cache_clear()
-    yield
-    for each in loops:
-        each.cache_clear()
 
 
 @pytest.fixture(scope="session")

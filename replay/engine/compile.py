@@ -40,14 +40,15 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     @cache
     def kernel() -> Callable[Parameters, Result]:
-        if _is_uncompiled():
-            return np.errstate(all="ignore")(function)
         from replay.engine.through_numba import function_of
 
         return function_of(function)
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        if is_uncompiled():
+            with np.errstate(all="ignore"):
+                return function(*arguments, **named)
         return kernel()(*arguments, **named)
 
     return call
@@ -72,15 +73,25 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
     array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
-    if _is_uncompiled():
-        return uncompiled_over_runs(run_once)
-    if allocates:
-        from replay.engine.through_numba import loop_of
 
-        return _shared(loop_of(run_once))
-    from replay.engine.kernels.native import Kernel
+    @cache
+    def loop() -> Loop:
+        if allocates:
+            from replay.engine.through_numba import loop_of
 
-    return _shared(Kernel(cast(FunctionType, run_once)))
+            return loop_of(run_once)
+        from replay.engine.kernels.native import Kernel
+
+        return Kernel(cast(FunctionType, run_once))
+
+    def over_runs(runs: int, *arguments: Any, **memory: Any) -> None:
+        if is_uncompiled():
+            plain(runs, *arguments, **memory)
+        else:
+            _share(loop(), runs, *arguments, **memory)
+
+    plain = uncompiled_over_runs(run_once)
+    return over_runs
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
@@ -103,52 +114,54 @@ def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
     return loop
 
 
-def _shared(loop: Loop) -> Callable[..., None]:
+def _share(
+    loop: Loop,
+    runs: int,
+    *arguments: Any,
+    scratch: Callable[[], Any] | None = None,
+    own: Sequence[Any] | None = None,
+) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
-    def over_runs(
-        runs: int,
-        *arguments: Any,
-        scratch: Callable[[], Any] | None = None,
-        own: Sequence[Any] | None = None,
-    ) -> None:
-        def prepared() -> Callable[[int, int], None]:
-            if own is None:
-                return loop.of(arguments, [scratch()] if scratch else [])
-            of_own = {
-                run: loop.of((*arguments, each)) for run, each in enumerate(own) if each is not None
-            }
+    def prepared() -> Callable[[int, int], None]:
+        if own is None:
+            return loop.of(arguments, [scratch()] if scratch else [])
+        of_own = {run: loop.of((*arguments, each)) for run, each in enumerate(own) if each is not None}
 
-            def through(first: int, end: int) -> None:
-                for run in range(first, end):
-                    if run in of_own:
-                        of_own[run](run, run + 1)
+        def through(first: int, end: int) -> None:
+            for run in range(first, end):
+                if run in of_own:
+                    of_own[run](run, run + 1)
 
-            return through
+        return through
 
-        def work(through: Callable[[int, int], None] | None) -> None:
-            through = through or prepared()
-            for first, end in waiting:
-                through(first, end)
+    def work(through: Callable[[int, int], None] | None) -> None:
+        through = through or prepared()
+        for first, end in waiting:
+            through(first, end)
 
-        cores = min(runs, core_count())
-        cuts = (
-            [runs * piece // (4 * cores) for piece in range(4 * cores + 1)] if cores > 1 else [0, runs]
-        )
-        waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
-        first = prepared()
-        if cores > 1:  # compiles here: a thread would wait for ever for a module that is being imported
-            first(0, 0)
-        helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
-        try:
-            work(first)
-        finally:  # none works on when this returns
-            begun = [helper for helper in helpers if not helper.cancel()]
-            wait(begun)
-        for helper in begun:
-            helper.result()
+    cores, first = min(runs, core_count()), prepared()
+    if cores <= 1:
+        first(0, runs)
+        return
+    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+    waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
+    first(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+    helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
+    try:
+        work(first)
+    finally:  # none works on when this returns
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
 
-    return over_runs
+
+def use_cores(count: int) -> None:
+    """Have kernels of this process use so many cores."""
+    os.environ["NUMBA_NUM_THREADS"] = str(count)
+    core_count.cache_clear()
+    _helpers.cache_clear()
 
 
 @cache
@@ -167,5 +180,6 @@ def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
     return ThreadPoolExecutor(max(1, core_count() - 1))
 
 
-def _is_uncompiled() -> bool:
+def is_uncompiled() -> bool:
+    """Whether kernels are plain Python now."""
     return os.environ.get("FUSELOG_UNCOMPILED") == "1"

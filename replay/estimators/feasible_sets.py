@@ -172,7 +172,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
 
     A circle is run through from its point nearest the arena's centre. With tau = tan(h s) / h, h half
     its curvature and s the distance run, another constraint along it is a quadratic in tau, whatever
-    is disc or line.
+    is disc or line. Its own is zero all along, whose roots would be rounding.
     """
     centre = 0.5 * (arena.low + arena.high)
     reach = 4.0 * float(np.linalg.norm(arena.high - arena.low))
@@ -191,6 +191,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
     inward = -np.einsum("kmi,ki->km", gradient, normal)
     h = half_curvature[:, None]
     tau = _roots(half_curvature + h * inward + h**2 * value, along, value)
+    tau[np.diag_indices(len(tau))] = np.nan
     with np.errstate(invalid="ignore", divide="ignore"):
         turned = np.arctan(h[..., None] * tau) / h[..., None]
         end = np.minimum(0.5 * np.pi / np.abs(half_curvature), reach)

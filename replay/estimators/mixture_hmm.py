@@ -12,6 +12,8 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats
 
+UNEVEN = 1e-9  # far more than rounding, and far less than scores say
+
 
 class MixtureHmm(NamedTuple):
     """A model of s states with g components of m dimensions.
@@ -88,11 +90,21 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     responsibility = np.zeros((len(sequences), states, how.components))
     for state in range(states):
         clusters = KMeans(how.components, n_init=1, random_state=int(rng.integers(2**31)))
-        labels = clusters.fit_predict(sequences[:, state])
+        labels = clusters.fit_predict(_uneven(sequences[:, state]))
         responsibility[np.arange(len(labels)), state, labels] = 1.0
     empty = np.zeros((states, how.components))
     model = MixtureHmm(initial, transition, empty, empty, empty)
     return _mixtures(model, sequences.transpose(1, 0, 2), responsibility.transpose(1, 0, 2), how.floor)
+
+
+def _uneven(vectors: Floats) -> Floats:
+    """Vectors (count, m) on scales that are bent a little, each otherwise.
+
+    Scores that are whole numbers are often as far from one mean as from another; here the lower one is
+    the nearer, where rounding would decide.
+    """
+    bend = UNEVEN * np.arange(1, vectors.shape[1] + 1)
+    return vectors + bend * (vectors - vectors.min(axis=0)) ** 2
 
 
 def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[MixtureHmm, float]:

@@ -19,6 +19,7 @@ from replay.estimators.feasible_sets import Arena
 from replay.estimators.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
 
 ROUNDING_M = 1e-7
+ON_A_LINE_M = 1e-10  # a vertex so near to the line between its neighbours is none
 # Segments of an offset in a quarter of a circle. GEOS rounds their number, so that one may span 1.5
 # times as much, and simplifies what it offsets by up to 1 % of the distance; so offsets are wider.
 QUARTER_SEGMENTS = 8
@@ -169,10 +170,15 @@ def from_rings(rings: Sequence[Floats]) -> BaseGeometry:
     return places
 
 
+def corners_of(places: BaseGeometry) -> BaseGeometry:
+    """A set without the vertices on its edges, which are there or not as rounding has it."""
+    return shapely.simplify(places, ON_A_LINE_M)
+
+
 def to_rings(places: BaseGeometry) -> list[Floats]:
     """The borders (n, 2) of a set: on their left is the set."""
     found = []
-    for part in shapely.get_parts(places):
+    for part in shapely.get_parts(corners_of(places)):
         if isinstance(part, Polygon) and not part.is_empty:
             upright = shapely.orient_polygons(part)
             found += [

@@ -35,6 +35,7 @@ from replay.estimators.moving_sets import (
     Odometry,
     all_headings_of,
     common_headings,
+    corners_of,
     directions,
     from_rings,
     moved,
@@ -261,7 +262,7 @@ def _contradicting(frame: Frame, places: BaseGeometry) -> int | None:
 
 
 def _simpler(part: BaseGeometry, most_edges: int) -> BaseGeometry:
-    return within_l8(part) if shapely.get_num_coordinates(part) > most_edges else part
+    return within_l8(part) if shapely.get_num_coordinates(corners_of(part)) > most_edges else part
 
 
 def _area(parts: Sequence[BaseGeometry]) -> float:

@@ -14,7 +14,7 @@ from pydantic import PositiveFloat
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from recorders.models.planar import Components
-from replay.engine.arrays import Floats
+from replay.engine.arrays import Floats, Function
 from replay.engine.measurements import SPACE
 from replay.estimators.ranging import distance
 from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
@@ -23,14 +23,17 @@ from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor, 
 # the best of its points on.
 SOUGHT = np.linspace(-1.5, 1.5, 21)
 BEST = 3
+ALIKE = 6  # decimals of a cost, in units of one standard deviation squared, that tell two places apart
+NEAR_M = 1e-9  # from a microphone, where no direction leads to it
+WIDER = 100.0  # of the standard deviations of what is found: a start that is worth a ten-thousandth
 
 
 class SoundSourceParameters(ModelParameters):
     """The air and the start.
 
-    The start is found by least squares; its standard deviation is `start_sigma_m`, so large that it
-    counts little beside the differences. If all microphones have one height, `height_sigma_m` is the
-    standard deviation of the source's height from it.
+    The start is found by least squares; its standard deviation is a hundred times what these say, so
+    that it counts little beside the differences, and at most `start_sigma_m`. If all microphones have
+    one height, `height_sigma_m` is the standard deviation of the source's height from it.
     """
 
     speed_of_sound_mps: PositiveFloat | None = None
@@ -88,6 +91,11 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
         state = (*place, *middle[free:], 0.0)
         return (hear(state, about.T, parameters)[0] - measured) / sigma
 
+    def slopes(place: Floats) -> Floats:
+        away = np.append(place, middle[free:]) - about.reshape(-1, 2, 3)
+        toward = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), NEAR_M)
+        return (toward[:, 0] - toward[:, 1])[:, :free] / (parameters.speed_of_sound_mps * sigma)[:, None]
+
     grid = np.stack(np.meshgrid(*[SOUGHT] * free), axis=-1).reshape(-1, free, 1)
     starts = middle[:free, None] + size * grid
     costs = np.sum(residuals(np.swapaxes(starts, 0, 1)) ** 2, axis=1)
@@ -95,14 +103,41 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     scale = np.full(free, size)
     fits = [
-        least_squares(residuals, start[:, 0], x_scale=scale, loss="soft_l1")
-        for start in starts[np.argsort(costs, kind="stable")[:BEST]]
+        least_squares(residuals, start[:, 0], x_scale=scale, loss="soft_l1")  # see `_settled`
+        for start in starts[np.argsort(costs.round(ALIKE), kind="stable")[:BEST]]
     ]
-    place = min(fits, key=lambda fit: float(fit.cost)).x
-    spread = np.array([parameters.start_sigma_m**2] * free + [parameters.height_sigma_m**2] * (3 - free))
-    covariance = np.diag(np.append(spread, shared_s2))
+    best = min(fits, key=lambda fit: round(float(fit.cost), ALIKE))
+    place, told = _settled(residuals, slopes, best.x, float(size))
+    told = told / WIDER**2 + np.eye(free) / parameters.start_sigma_m**2
+    covariance = np.diag([0.0] * free + [parameters.height_sigma_m**2] * (3 - free) + [shared_s2])
+    covariance[:free, :free] = np.linalg.inv(told)
     time_ns = int(first.publish_time_ns[0])
     return Started(time_ns, np.array([*place, *middle[free:], 0.0]), covariance, HOW)
+
+
+def _settled(
+    residuals: Function, slopes: Function, place: Floats, near_m: float
+) -> tuple[Floats, Floats]:
+    """Where the gradient of a soft_l1 cost is zero, near a place (n,), and the information (n, n) there.
+
+    A search by the cost itself ends where rounding hides what is lower, at another place on another CPU.
+    Of a source that nothing tells the distance of, the gradient is zero at infinity: it stays in place.
+    """
+
+    def cost(there: Floats) -> float:
+        return float(np.sum(np.sqrt(1.0 + residuals(there) ** 2) - 1.0))
+
+    def gradient(there: Floats) -> Floats:
+        off = residuals(there)
+        return slopes(there).T @ (off / np.sqrt(1.0 + off**2))
+
+    from scipy.optimize import root  # which takes long to import
+
+    found = root(gradient, place, tol=1e-14).x
+    if np.linalg.norm(found - place) < near_m and cost(found) <= cost(place) + 10.0**-ALIKE:
+        place = found
+    weight = (1.0 + residuals(place) ** 2) ** -1.5
+    return place, (slopes(place).T * weight) @ slopes(place)
 
 
 HOW = "where its differences fit best"

@@ -14,7 +14,7 @@ from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.blocks import Ragged
@@ -39,6 +39,7 @@ from replay.inference.stage import Stage
 from replay.inference.steps import Gaussian, Note, Steps
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
+ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says
 AGREED = 0.1  # members become one where their means are on average so near, as a squared distance
 
 
@@ -47,10 +48,19 @@ class BankParameters(UnscentedParameters, RegressionParameters):
 
     Members lie side by side, and the standard deviation of each is half their distance, so that their
     sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not cut.
+    The number is odd: of an even one, each member has another opposite, and whether that is half a turn
+    to the left or to the right, and so the mean of all, rounding would say.
     """
 
     filter: str = "ekf"
-    members: Annotated[int, Field(ge=8, le=720)] = 36
+    members: Annotated[int, Field(ge=9, le=721)] = 45
+
+    @field_validator("members")
+    @classmethod
+    def _odd(cls, members: int) -> int:
+        if members % 2 == 0:
+            raise ValueError(f"members must be odd, so that no two are opposite; give {members + 1}")
+        return members
 
 
 class Belief(NamedTuple):
@@ -204,16 +214,21 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
-    """The direction (t,) in which a covariance (t, t) is widest of all turns, and its variance there."""
+    """The direction (t,) in which a covariance (t, t) is widest of all turns, and its variance there.
+
+    Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
+    """
     direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
     for kind, _ in things(kinds):
         end = begin + TANGENT_WIDTHS[kind]
         if kind != "linear":
             variances, axes = np.linalg.eigh(covariance[begin:end, begin:end])
-            if variances[-1] > variance:
+            if variances[-1] > (1.0 + ALIKE) * variance:
                 direction[:], variance = 0.0, float(variances[-1])
-                axis = axes[:, -1]
-                direction[begin:end] = axis * np.sign(axis[np.argmax(np.abs(axis))])
+                alike = axes[:, variances >= (1.0 - ALIKE) * variance]
+                within = alike @ alike.T  # of every axis what is in the directions that are widest
+                axis = within[:, np.argmax(np.round(np.diagonal(within), 9))]
+                direction[begin:end] = axis / np.linalg.norm(axis)
         begin = end
     return direction, variance
 

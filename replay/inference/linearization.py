@@ -102,7 +102,21 @@ def derivative(
         for index, into, row, column in written:
             getattr(work, into)[row, column] = found[index]
 
+    linearise.__dict__["known"] = {
+        place: node.value if node.is_constant else None for place, node in linearised.entries.items()
+    }
     return linearise
+
+
+def known_entries(linearise: Function, into: str) -> dict[tuple[int, int], float | None] | None:
+    """The entries of a Jacobian that may differ from zero, by row and column, and what is known of them.
+
+    None where nothing is known, as of one written by hand.
+    """
+    known = linearise.__dict__.get("known")
+    if known is None:
+        return None
+    return {(row, column): value for (name, row, column), value in known.items() if name == into}
 
 
 def _seeded(

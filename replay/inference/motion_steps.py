@@ -3,12 +3,10 @@
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.gaussian import (
-    add_through,
-    moved_covariance,
-)
-from replay.inference.linearization import Input, derivative
+from replay.inference.gaussian import add_through
+from replay.inference.linearization import Input, derivative, known_entries
 from replay.inference.model import Model, Motion
+from replay.inference.sparse import adding_through, moving_covariance, pattern_of
 from replay.inference.stage import Stage
 from replay.inference.steps import Workspace
 from replay.inference.tuples import adding_noise, filling, tuple_of
@@ -20,6 +18,8 @@ def linear_motion(stage: Stage) -> Function:
     n, read_control = model.size, tuple_of(model.controls)
     read_state, fill = tuple_of(n), filling(n)
     linearise = motion_derivative(model, motion, by_state=True)
+    known = known_entries(linearise, "transition")
+    move_covariance = moving_covariance(pattern_of(known, model.tangent))
     add_noise = motion_noise(model, motion)
 
     def predict(
@@ -34,7 +34,7 @@ def linear_motion(stage: Stage) -> Function:
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
         fill(mean, work.state)
-        moved_covariance(covariance, work.transition, work.product)
+        move_covariance(covariance, work.transition, work.product)
         add_noise(state, covariance, duration_s, parameters, work)
         return True
 
@@ -71,7 +71,7 @@ def motion_noise(model: Model, motion: Motion) -> Function:
     """
     pieces: list[Function] = []
     if motion.control_noise is not None:
-        pieces.append(_control_noise(motion.control_noise, model.controls))
+        pieces.append(_control_noise(model, motion))
     if motion.noise is not None and motion.noises:
         pieces.append(_entering_noise(motion.noise, motion.noises))
     elif motion.noise is not None:
@@ -94,8 +94,11 @@ def _both(first: Function, second: Function) -> Function:
     return add
 
 
-def _control_noise(variances: Function, controls: int) -> Function:
-    fill = filling(controls)
+def _control_noise(model: Model, motion: Motion) -> Function:
+    fill, variances = filling(model.controls), motion.control_noise
+    assert variances is not None
+    known = known_entries(motion_derivative(model, motion, by_state=False), "gain")
+    add_through = adding_through(pattern_of(known, model.tangent))
 
     def add(state: Any, covariance: Floats, duration_s: float, parameters: Any, work: Any) -> None:
         fill(work.control_variance, variances(duration_s, parameters))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.kernels.identity import identity
+from replay.engine.kernels.identity import digest_of, identity
 from replay.engine.kernels.numbers import REAL, Emitter, Number, constant
 from replay.engine.kernels.program import Instance, Program, called
 from replay.engine.kernels.values import Array, Record, entries, load, part_of, store
@@ -335,7 +335,8 @@ def _where(function: Callable[..., Any], error: Exception) -> str:
 
 
 def _digest(words: Sequence[str]) -> str:
-    return sha256("\n".join(words).encode()).hexdigest()
+    """The digest of a graph and of how its instructions are written."""
+    return sha256("\n".join([digest_of("replay.tracing"), *words]).encode()).hexdigest()
 
 
 _KNOWN: dict[Any, tuple[str, TracedFunction, Any]] = {}

@@ -1,7 +1,8 @@
 """Expression graphs: numbers that are made of others, each once, with what is known folded.
 
-A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. Zero times anything is
-zero here, so that what does not depend on something costs nothing.
+A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. What is simplified has
+the same bits, but for one thing: zero times anything is zero here, so that what does not depend on
+something costs nothing.
 """
 
 import math
@@ -27,6 +28,8 @@ _TRUTHS = (
     operator.xor,
     operator.not_,
 )
+
+_COMMUTATIVE = (operator.add, operator.mul)
 
 
 class Node:
@@ -108,8 +111,10 @@ class Graph:
         simpler = self._simpler(operation, arguments)
         if simpler is not None:
             return simpler
-        key = operation, *(each.number for each in arguments)
-        return self._node(operation, arguments, None, key)
+        numbers = [each.number for each in arguments]
+        if operation in _COMMUTATIVE:
+            numbers.sort()
+        return self._node(operation, arguments, None, (operation, *numbers))
 
     def _simpler(self, operation: Any, arguments: tuple[Node, ...]) -> Node | None:
         if operation is operator.neg:
@@ -118,12 +123,19 @@ class Graph:
         if len(arguments) != 2 or any(each.is_truth for each in arguments):
             return None
         x, y = arguments
+        opposite = operator.neg
         if operation is operator.add:
-            return y if x.is_number(0.0) else x if y.is_number(0.0) else None
+            if x.is_number(0.0) or y.is_number(0.0):
+                return y if x.is_number(0.0) else x
+            if y.operation is opposite:
+                return self.apply(operator.sub, x, y.arguments[0])
+            return self.apply(operator.sub, y, x.arguments[0]) if x.operation is opposite else None
         if operation is operator.sub:
             if y.is_number(0.0):
                 return x
-            return self.apply(operator.neg, y) if x.is_number(0.0) else None
+            if y.operation is opposite:
+                return self.apply(operator.add, x, y.arguments[0])
+            return self.apply(opposite, y) if x.is_number(0.0) else None
         if operation is operator.mul:
             if x.is_number(0.0) or y.is_number(0.0):
                 return self.constant(0.0)
@@ -131,7 +143,9 @@ class Graph:
                 if one.is_number(1.0):
                     return other
                 if one.is_number(-1.0):
-                    return self.apply(operator.neg, other)
+                    return self.apply(opposite, other)
+                if one.operation is opposite:
+                    return self.apply(opposite, self.apply(operator.mul, one.arguments[0], other))
         if operation is operator.truediv and y.is_number(1.0):
             return x
         return None

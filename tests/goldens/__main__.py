@@ -29,7 +29,7 @@ def main(names: tuple[str, ...], data: Path) -> None:
             if path.exists():
                 for each in discrepancies(read(path), done):
                     click.echo(each.sentence)
-            write(path, done.golden)
+            write(path, store.kept(done.golden))
             click.echo(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
     (store.FOLDER.parent / "README.md").write_text(index(), encoding="utf-8")
 

@@ -65,8 +65,12 @@ def test_ci_runs_the_two_commands_everywhere() -> None:
     assert matrix["python"] == ["3.11", "3.12", "3.13", "3.14"]
     assert f">={matrix['python'][0]}" == PYPROJECT["project"]["requires-python"]
     assert job["defaults"]["run"]["shell"] == "bash"
-    commands = [step["run"] for step in job["steps"] if "run" in step]
-    assert commands[-2:] == ["make demo PYTHON=python", "make test PYTHON=python"]
+    demo, older, test = [step for step in job["steps"] if "run" in step][-3:]
+    assert [demo["run"], test["run"]] == ["make demo PYTHON=python", "make test PYTHON=python"]
+    [own], [one] = matrix["cpu"], matrix["include"]
+    assert one["cpu"] != own
+    assert older["if"] == f"matrix.cpu == '{one['cpu']}'"
+    assert "python -m tests.older_cpu" in older["run"]
 
 
 def test_no_file_cites_what_is_outside_the_repository() -> None:

@@ -7,17 +7,18 @@ is made of (`identity`), this room itself, LLVM, and the processor.
 
 import ctypes
 import gc
+import operator
 import os
 import platform
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
-from importlib.resources import files
+from itertools import count
+from struct import Struct
 from threading import Lock
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -25,12 +26,12 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.cache import cache_folder, in_turn, is_private, read_checked, say_once, write_checked
-from replay.engine.kernels.identity import identity
+from replay.engine.kernels.identity import digest_of, identity
 from replay.engine.kernels.lowering import lower
 from replay.engine.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
 from replay.engine.kernels.program import Program
 from replay.engine.kernels.telling import compiling
-from replay.engine.kernels.values import STORED, Array, Record, leaves, rebuilt
+from replay.engine.kernels.values import STORED, Array, Record, combined
 
 KNOWN = 64  # sizes up to this are part of a kernel
 _MADE_BY = "a kernel that fuselog compiled"
@@ -41,85 +42,161 @@ class Kernel:
 
     def __init__(self, run_once: FunctionType) -> None:
         self._function = run_once
-        self._entries: dict[Any, Callable[..., None]] = {}
+        self._entries: dict[Any, tuple[Struct, Callable[..., None]]] = {}
+        self._loaded: dict[Any, Callable[..., None]] = {}
         self._lock = Lock()
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
         """The loop over the runs from `first` up to `end` for these arguments, which it holds."""
-        words: list[int] = []
-        kinds = (
-            *(_described(each, words, 1) for each in arguments),
-            *(_described(each, words, 0) for each in scratch),
-        )
-        entry = self._entries.get(kinds)
-        if entry is None:
+        kinds: list[Any] = []
+        numbers: list[Any] = []
+        for each in arguments:
+            _describe(each, 1, kinds, numbers)
+        for each in scratch:
+            _describe(each, 0, kinds, numbers)
+        key = tuple(kinds)
+        known = self._entries.get(key)
+        if known is None:
             with self._lock:
-                entry = self._entries.get(kinds) or self._entries.setdefault(
-                    kinds, _entry(self._function, kinds)
+                known = self._entries.get(key) or self._entries.setdefault(
+                    key, self._entry((*arguments, *scratch), iter(key))
                 )
-        found, given = entry, (ctypes.c_int64 * len(words))(*words)
+        layout, entry = known
+        given = layout.pack(*numbers)
 
         def loop(first: int, end: int, kept: Any = (arguments, scratch)) -> None:  # noqa: ARG001
-            found(first, end, given)
+            entry(first, end, given)
 
         return loop
+
+    def _entry(
+        self, arguments: Sequence[Any], kinds: Iterator[Any]
+    ) -> tuple[Struct, Callable[..., None]]:
+        described = tuple(_with_types(each, kinds) for each in arguments)
+        if described not in self._loaded:
+            self._loaded[described] = _entry(self._function, described)
+        return Struct(f"={''.join(map(_letters, described))}"), self._loaded[described]
 
 
 # --- arguments --------------------------------------------------------------------------------------
 
 
-def _described(value: Any, words: list[int], varies: int) -> Any:
-    """What an argument is, for the kernel's key; what of it is known at run time only goes to `words`.
+class Kept(NamedTuple):
+    """How an array lies in memory: NumPy's letter of its numbers, its sizes (None where they vary)."""
+
+    letter: str
+    shape: tuple[int | None, ...]
+    is_packed: bool
+
+
+_LETTERS: dict[str, str] = {np.dtype(stored).char: stored for stored in STORED}
+_LETTERS["q"] = _LETTERS["l"] = "<i8"
+_LETTERS["Q"] = _LETTERS["L"] = "<u8"
+# where NumPy's own structure of an array has what (PyArrayObject_fields), behind the head of an object
+_DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
+
+
+def _describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> None:
+    """Add what an argument is, for the kernel's key, and what it is at run time.
 
     So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
     """
     if isinstance(value, np.ndarray):
-        size, item = value.itemsize, value.dtype.str
-        if item not in STORED:
-            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}")
-        shape = tuple(n if axis >= varies and n <= KNOWN else None for axis, n in enumerate(value.shape))
-        strides: list[int | None] = []
-        usual: int | None = 1
-        for n, known, step in zip(value.shape[::-1], shape[::-1], value.strides[::-1], strict=True):
-            if step % size:
-                raise BadInput("a kernel takes arrays whose numbers lie in whole steps")
-            strides.append(step // size if step // size == usual else None)
-            usual = None if usual is None or known is None else usual * n
-        strides.reverse()
-        words.append(value.__array_interface__["data"][0])
-        for known, numbers in (
-            (shape, value.shape),
-            (strides, [each // size for each in value.strides]),
-        ):
-            words += [n for n, each in zip(numbers, known, strict=True) if each is None]
-        return item, shape, tuple(strides)
+        kinds.append((value.dtype.char, value.ndim, value.shape[varies:], value.flags.c_contiguous))
+        numbers.append(id(value))
+    elif isinstance(value, tuple):
+        kinds.append((type(value), len(value)))
+        own = getattr(value, "varies", None)
+        if own is None:
+            for each in value:
+                _describe(each, varies, kinds, numbers)
+        else:
+            for each, axes in zip(value, own, strict=True):
+                _describe(each, axes, kinds, numbers)
+    else:
+        kinds.append(type(value))
+        numbers.append(value)
+
+
+def _with_types(value: Any, kinds: Iterator[Any]) -> Any:
+    """An argument in full, as `_value_of` takes it: from what it is and its part of the key."""
+    kind = next(kinds)
     if isinstance(value, tuple):
-        own = getattr(type(value), "varies", (varies,) * len(value))
-        return type(value), tuple(
-            _described(*each) for each in zip(value, [words] * len(value), own, strict=True)
-        )
-    if isinstance(value, bool | np.bool_):
-        words.append(int(value))
-        return TRUTH
-    if isinstance(value, int | np.integer):
-        words.append(int(value))
-        return WORD if isinstance(value, np.unsignedinteger) else WHOLE
-    if isinstance(value, float | np.floating):
-        words.append(struct.unpack("<q", struct.pack("<d", value))[0])
-        return REAL
-    raise BadInput(f"a kernel takes numbers, arrays and tuples of them, not a {type(value).__name__}")
+        return type(value), tuple(_with_types(each, kinds) for each in value)
+    if isinstance(value, np.ndarray):
+        letter, axes, known, is_packed = kind
+        if letter not in _LETTERS or value.dtype.byteorder == ">":
+            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}")
+        shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
+        return Kept(letter, shape, is_packed)
+    for types, name in _SCALARS:
+        if issubclass(kind, types):
+            return name
+    raise BadInput(f"a kernel takes numbers, arrays and tuples of them, not a {kind.__name__}")
 
 
-def _value_of(kind: Any, emitter: Emitter) -> Any:
-    """The value that a described argument is in the kernel, its leaves without names."""
-    if isinstance(kind, str):
-        return Number(kind, "")
-    if isinstance(kind[0], str):
-        item, shape, strides = kind
-        unknown = [tuple("" if each is None else each for each in part) for part in (shape, strides)]
-        return Array(item, "", unknown[0], unknown[1])
-    parts = tuple(_value_of(each, emitter) for each in kind[1])
-    return parts if kind[0] is tuple else Record(kind[0], parts)
+_SCALARS: tuple[tuple[Any, str], ...] = (
+    ((bool, np.bool_), TRUTH),
+    (np.unsignedinteger, WORD),
+    ((int, np.integer), WHOLE),
+    ((float, np.floating), REAL),
+)
+
+
+def _letters(kind: Any) -> str:
+    """How the numbers of an argument are packed into words."""
+    if isinstance(kind, Kept):
+        return "q"
+    if isinstance(kind, tuple):
+        return "".join(map(_letters, kind[1]))
+    return {REAL: "d", WORD: "Q"}.get(kind, "q")
+
+
+def _value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
+    """The value that a described argument is in the kernel: loaded from its words."""
+    if isinstance(kind, Kept):
+        return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
+    if isinstance(kind, tuple):
+        parts = tuple(_value_of(each, emitter, words) for each in kind[1])
+        return parts if kind[0] is tuple else Record(kind[0], parts)
+    if kind == TRUTH:
+        return emitter.number(TRUTH, f"icmp ne i64 {_word('i64', emitter, next(words))}, 0")
+    return Number(kind, _word(Number(kind, "").type, emitter, next(words)))
+
+
+def _word(kind: str, emitter: Emitter, place: int) -> str:
+    return _loaded_from(kind, emitter, "%words", 8 * place)
+
+
+def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
+    place, name = emitter.fresh(), emitter.fresh()
+    emitter.add(f"{place} = getelementptr inbounds i8, ptr {address}, i64 {offset}")
+    emitter.add(f"{name} = load {kind}, ptr {place}")
+    return name
+
+
+def _array_of(kind: Kept, emitter: Emitter, structure: str) -> Array:
+    """An array of NumPy's: where its numbers are, and the sizes that are not known."""
+    dtype = _LETTERS[kind.letter]
+    sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
+    shape: list[Any] = [
+        _loaded_from("i64", emitter, sizes, 8 * axis) if size is None else size
+        for axis, size in enumerate(kind.shape)
+    ]
+    strides: list[Any] = []
+    if kind.is_packed:
+        stride: Any = 1
+        for size in reversed(shape):
+            strides.insert(0, stride)
+            stride = combined(emitter, operator.mul, size, stride)
+    else:
+        steps = _loaded_from("ptr", emitter, structure, _STRIDES)
+        for axis in range(len(shape)):
+            step = _loaded_from("i64", emitter, steps, 8 * axis)
+            text = f"sdiv exact i64 {step}, {np.dtype(dtype).itemsize}"
+            strides.append(emitter.number(WHOLE, text).code)
+    data = _loaded_from("ptr", emitter, structure, _DATA)
+    return Array(dtype, data, tuple(shape), tuple(strides))
 
 
 # --- making -----------------------------------------------------------------------------------------
@@ -127,20 +204,8 @@ def _value_of(kind: Any, emitter: Emitter) -> Any:
 
 def text_of(function: FunctionType, kinds: Sequence[Any]) -> str:
     """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run."""
-    program, emitter = Program(lower), Emitter()
-    place = 0
-    arguments = []
-    for kind in kinds:
-        value, names = _value_of(kind, emitter), []
-        for leaf, _ in leaves(value):
-            address = emitter.fresh()
-            emitter.add(f"{address} = getelementptr inbounds i64, ptr %words, i64 {place}")
-            stored = "i64" if leaf == "i1" else leaf
-            name = emitter.fresh()
-            emitter.add(f"{name} = load {stored}, ptr {address}")
-            names.append(name if leaf != "i1" else emitter.number(TRUTH, f"icmp ne i64 {name}, 0").code)
-            place += 1
-        arguments.append(rebuilt(value, iter(names)))
+    program, emitter, words = Program(lower), Emitter(), count()
+    arguments = [_value_of(kind, emitter, words) for kind in kinds]
     body = Emitter()
     body.fresh = emitter.fresh  # type: ignore[method-assign]
     program.call(body, function, [Number(WHOLE, "%run"), *arguments])
@@ -205,13 +270,10 @@ def _named(kinds: Any) -> Any:
 @cache
 def _surroundings() -> str:
     """What beside a kernel's own sources its code depends on."""
-    room = files("replay.engine.kernels")
-    sources = sorted(each.name for each in room.iterdir() if each.name.endswith(".py"))
-    digest = sha256(b"".join(room.joinpath(name).read_bytes() for name in sources)).hexdigest()
     machine = _machine()
     return "\n".join(
         [
-            digest,
+            digest_of("replay.engine.kernels"),
             platform.python_version(),
             f"llvmlite {llvmlite.__version__}",
             str(llvm.get_process_triple()),
@@ -229,8 +291,8 @@ def _machine() -> tuple[str, str]:
     return name or llvm.get_host_cpu_name(), features
 
 
-@cache
-def _target() -> Any:
+def _new_target() -> Any:
+    """LLVM's description of the machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = _machine()
@@ -251,7 +313,7 @@ def object_code(text: str) -> bytes:
 
     Without the SLP vectoriser, which costs as much as all else and gains these kernels nothing.
     """
-    target = _target()
+    target = _new_target()
     module = llvm.parse_assembly(text)
     module.triple, module.data_layout = target.triple, str(target.target_data)
     options = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -265,22 +327,13 @@ _ENGINES: list[Any] = []  # what is loaded stays
 
 
 def _loaded(code: bytes) -> Callable[..., None]:
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _fresh_target())
+    """The entry of a kernel's object code; the engine owns its target."""
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
-    entry = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p)
+    entry = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p)
     return entry(engine.get_function_address("kernel"))
-
-
-def _fresh_target() -> Any:
-    """An engine owns its target."""
-    _target()
-    name, features = _machine()
-    target = llvm.Target.from_triple(llvm.get_process_triple())
-    return target.create_target_machine(
-        cpu=name, features=features, opt=3, reloc="pic", codemodel="jitdefault"
-    )
 
 
 @contextmanager

@@ -163,6 +163,17 @@ def test_a_vector_of_which_all_is_missing_says_nothing():
     np.testing.assert_allclose(found, [0.0, -0.5 - 0.5 * np.log(2.0 * np.pi)])
 
 
+def test_whole_numbers_halfway_between_two_means_do_not_hang_on_rounding():
+    """Of scores that are few whole numbers many are as near to one mean of the start as to another."""
+    how, scores = Fit(3, True, 0.01, 3, 0.0), np.random.default_rng(1).integers(0, 7, (200, 1, 1))
+    for seed in range(20):
+        fitted = [
+            fit(scores * scale, how, np.random.default_rng(seed)).means
+            for scale in (1.0 / 3.0, (1.0 + 1e-15) / 3.0, (1.0 - 1e-15) / 3.0)
+        ]
+        np.testing.assert_allclose(fitted[1:], fitted[:1] * 2, rtol=1e-9)
+
+
 def test_ergodic_likelihood_never_falls():
     """More steps of Baum-Welch without a floor cannot be worse."""
     rng = np.random.default_rng(8)

@@ -16,6 +16,7 @@ from replay.estimators.feasible_sets import (
     exact_set,
     excess_rad,
     half_planes,
+    intersection,
     make_pairs,
     rings,
     signed_area,
@@ -72,6 +73,15 @@ def scene(seed, landmarks, bound_rad, error):
 
 def test_the_sheets_angles():
     np.testing.assert_allclose(np.degrees(section_v().angle_rad), [90, 45, -135], atol=1e-9)
+
+
+def test_a_circle_is_not_cut_by_itself():
+    """Alone it is in two halves, whatever rounding leaves of its own equation along it."""
+    rng, planes = np.random.default_rng(1), half_planes(ARENA)
+    for radius, *centre in rng.uniform([0.5, -2.0, -2.0], [2.0, 2.0, 2.0], (50, 3)):
+        disc = np.array([1.0, *np.multiply(-2.0, centre), np.dot(centre, centre) - radius**2])
+        border = intersection(np.array([disc / (2.0 * radius), *planes]), ARENA)
+        np.testing.assert_allclose(border.length, [np.pi * radius] * 2)
 
 
 def test_exact_sets_of_section_v():

@@ -6,7 +6,6 @@ from scipy.stats import chi2
 
 from pipeline.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
-from replay.estimators import networks
 from replay.estimators.covariance_intersection import Estimate
 from replay.estimators.networks import agrees, divergence
 
@@ -21,9 +20,6 @@ def room():
 @pytest.fixture(autouse=True)
 def plain(monkeypatch):
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
-    networks._compiled.cache_clear()
-    yield
-    networks._compiled.cache_clear()
 
 
 def replayed(room, **estimators):

@@ -82,6 +82,13 @@ def test_intervals_of_headings():
     assert directions(shapely.box(-1.0, -1.0, 2.0, 1.0), np.zeros(2)).half_rad == np.pi
 
 
+def test_a_vertex_on_an_edge_is_no_corner():
+    """It is there or not as rounding has it; one that is off the edge is kept."""
+    for off, corners in ((1e-15, 4), (1e-8, 5)):
+        square = shapely.Polygon([(0, 0), (0.7, -off), (1, 0), (1, 1), (0, 1)])
+        assert [len(ring) for ring in to_rings(square)] == [corners]
+
+
 def test_l8_is_around_a_set_in_two_pieces_and_rings_keep_holes():
     pieces = SHAPE.union(shapely.Point(4, 3).buffer(0.3))
     around = within_l8(pieces)

@@ -13,7 +13,7 @@ from recorders.recording import Recording
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import difference
 from replay.inference.all_methods import modelled
-from replay.inference.bank import cut
+from replay.inference.bank import cut, widest
 from replay.inference.model import Control, Model, ModelParameters, Motion
 from tests.replay.inference.replays import outputs
 
@@ -105,12 +105,37 @@ def test_a_cut_prior_is_the_prior_in_parts():
     """Weights, means and covariances of the members give the moments of the whole."""
     root = np.array([[1.0, 0.0, 0.0], [0.3, 0.8, 0.0], [0.2, -0.1, 0.4]])
     mean, covariance = np.array([1.0, -2.0, 0.5]), root @ root.T
-    weights, means, narrow = cut(KINDS, mean, covariance, 36)
+    weights, means, narrow = cut(KINDS, mean, covariance, 45)
     away = means - mean
     assert weights.sum() == pytest.approx(1.0)
-    assert narrow[2, 2] == pytest.approx((np.pi / 36) ** 2)
+    assert narrow[2, 2] == pytest.approx((np.pi / 45) ** 2)
     assert_allclose(weights @ away, 0.0, atol=1e-12)
     assert_allclose(narrow + (away.T * weights) @ away, covariance, rtol=1e-3)
+
+
+def test_no_two_members_are_opposite_so_that_their_mean_does_not_hang_on_rounding():
+    logs = [rolling(seed, np.pi)[0] for seed in range(3)]
+    found = outputs(ROLLER, "bank", logs)["state"]["mean"]
+    for log in logs:
+        log.streams["/a/prior"]["covariance"][:] *= 1.0 + 1e-14
+    again = outputs(ROLLER, "bank", logs)["state"]["mean"]
+    assert_allclose(again, found, atol=1e-9)
+    with pytest.raises(BadInput, match="members must be odd, so that no two are opposite; give 37"):
+        outputs(ROLLER, "bank", logs, members=36)
+
+
+def test_of_directions_as_wide_the_first_is_cut():
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    about = np.diag([4.0, 4.0, 1.0])
+    for covariance, expected in (
+        (4.0 * turn @ turn.T, [1.0, 0.0, 0.0]),
+        (about[::-1, ::-1], [0.0, 1.0, 0.0]),
+        (turn @ np.diag([1.0, 2.0, 3.0]) @ turn.T, turn[:, 2] * np.sign(turn[:, 2][0])),
+    ):
+        direction, _ = widest(["quaternion"] * 4, covariance)
+        assert_allclose(np.abs(direction), np.abs(expected), atol=1e-9)
+    direction, _ = widest(["angle", "angle"], np.diag([1.0, 1.0 + 1e-12]))
+    assert_allclose(direction, [1.0, 0.0])
 
 
 def test_a_narrow_prior_leaves_one_filter_and_what_it_estimates():
@@ -124,7 +149,7 @@ def test_a_bank_finds_an_unknown_heading_and_knows_how_well():
     logs, truths = zip(*(rolling(seed, np.pi) for seed in range(12)), strict=True)
     found = outputs(ROLLER, "bank", list(logs))
     weights = found["modes"]["probability"]
-    assert weights.shape == (12 * STEPS, 36)
+    assert weights.shape == (12 * STEPS, 45)
     assert_allclose(weights.sum(axis=1), 1.0)
     left = (weights > 0.0).sum(axis=1).reshape(12, STEPS)
     assert (left[:, 0] > 10).all()
