@@ -61,7 +61,8 @@ class _Column(_Part):
     def _is_of_one_shape(self) -> Self:
         shapes = [np.shape(each) for each in (self.missing, self.sum, self.sum_of_squares)]
         kept = np.shape(self.kept)
-        if not kept or any(shape != kept[1:] for shape in shapes):
+        is_empty = kept == (0,)  # of a stream without messages, whatever shape these would have
+        if not kept or any(shape != (shapes[0] if is_empty else kept[1:]) for shape in shapes):
             raise ValueError("its rows and its sums are of different shapes")
         return self
 

@@ -32,8 +32,8 @@ from replay.engine.results import ALL_WELL, failures_by_run, failures_of, states
 from replay.estimators.covariance_intersection import Criterion, Stake, blend, sighting_weight
 from replay.estimators.landmarks import LANDMARKS, POSE, sight
 from replay.inference.gaussian import add_through, copy_gaussian, wrap
-from replay.inference.generate import Input, derivative
 from replay.inference.happenings import Points, points_of
+from replay.inference.linearization import Input, derivative
 from replay.inference.small_matrices import UpdateMemory, update, update_memory
 from replay.inference.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
 from replay.tracing.functions import traced

@@ -25,7 +25,6 @@ from recorders.models.optical import (
 from recorders.models.planar import Component, Components
 from replay.engine.measurements import SPACE
 from replay.engine.tangent import Kind
-from replay.inference.generate import function_of
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 
 
@@ -115,12 +114,12 @@ def sight_noise(parameters: Any) -> Components:
 
 
 def _sensor(number: int) -> Sensor:
-    bias = ", ".join(f"parameters.{name}" for name in bias_components(number))
-    see = function_of(
-        "def see(state, about, parameters):\n"
-        f"    return sight(state, about, ({bias}), parameters.{clock_component(number)})\n",
-        sight=sight,
-    )
+    biases, clock = tuple(bias_components(number)), clock_component(number)
+
+    def see(state: Components, about: Components, parameters: Any) -> Components:
+        bias = tuple(getattr(parameters, name) for name in biases)
+        return sight(state, about, bias, getattr(parameters, clock))
+
     return Sensor(
         f"sensor{number}/moving_line_of_sight",
         schemas.MOVING_LINE_OF_SIGHT,

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.arrays import Floats, Function
+from replay.engine.arrays import Floats
 from replay.engine.components import Components
 from replay.estimators.targets import Targets
-from replay.inference.generate import function_of, is_flat, tuple_of
+from replay.inference.manifold import is_flat
 from replay.inference.model import Model, Motion, trial_state
 from replay.inference.scanning import ScanSensor
 from replay.inference.stage import Stage
@@ -103,30 +103,23 @@ def _longer(stage: Stage, names: tuple[str, ...], lengths: tuple[int, ...]) -> S
 
 def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:
     """A motion beside which the errors fade and are renewed; `noises` is how many its noise has."""
-    n, found = model.size, [f"found[{row}]" for row in range(model.size)]
-    kept = [
-        f"state[{n + row}] * np.exp(-duration_s / parameters.{name}_s)" for row, name in enumerate(names)
-    ]
-    renewed = [
-        f"-parameters.{name}_sigma ** 2 * np.expm1(-2.0 * duration_s / parameters.{name}_s)"
-        for name in names
-    ]
-    entries = [f"found[{entry}]" for entry in range(noises)]
-    for row, each in enumerate(renewed):
-        entries += [*(["0.0"] * (n + row if noises > n else 0)), each]
-    own = tuple_of(n)
-    move: Function = function_of(
-        "def move(state, control, duration_s, parameters):\n"
-        "    found = inner(own(state), control, duration_s, parameters)\n"
-        f"    return {', '.join(found + kept)}\n",
-        inner=motion.move,
-        own=own,
-    )
-    noise: Function = function_of(
-        "def noise(state, duration_s, parameters):\n"
-        "    found = inner(own(state), duration_s, parameters)\n"
-        f"    return {', '.join(entries)}\n",
-        inner=motion.noise,
-        own=own,
-    )
+    n, is_triangle = model.size, noises > model.size
+    move_own, noise_own = motion.move, motion.noise
+    assert noise_own is not None
+
+    def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+        moved = list(move_own(state[:n], control, duration_s, parameters))
+        for row, name in enumerate(names):
+            share = np.exp(-duration_s / getattr(parameters, f"{name}_s"))
+            moved.append(state[n + row] * share)
+        return tuple(moved)
+
+    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        found = list(noise_own(state[:n], duration_s, parameters))
+        for row, name in enumerate(names):
+            found += [0.0] * (n + row) if is_triangle else []
+            variance = getattr(parameters, f"{name}_sigma") ** 2
+            found.append(-variance * np.expm1(-2.0 * duration_s / getattr(parameters, f"{name}_s")))
+        return tuple(found)
+
     return Motion(move, noise, linear=motion.linear)

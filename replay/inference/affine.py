@@ -22,7 +22,7 @@ from replay.inference.gaussian import (
     moved_covariance,
     scalar_update,
 )
-from replay.inference.generate import differencing, is_flat, resetting, retraction, tuple_of
+from replay.inference.manifold import differencing, is_flat, resetting, retraction
 from replay.inference.motion_steps import motion_derivative, motion_noise
 from replay.inference.sensor_steps import reading, sensor_derivative, whitening
 from replay.inference.smoothing import (
@@ -40,6 +40,7 @@ from replay.inference.steps import (
     gaussian_filter,
     workspace,
 )
+from replay.inference.tuples import tuple_of
 
 LOSSES = ("square", "huber", "cauchy")
 NOTHING_LEFT = 1e-12  # of a variance, beside what other components say of it

@@ -20,7 +20,6 @@ from replay.engine.blocks import Ragged
 from replay.engine.priors import gaussians
 from replay.engine.results import gaussian_stream
 from replay.inference.corrections import correcting_more
-from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.parameters import number_fields, settings_type
 from replay.inference.point_errors import (
@@ -202,134 +201,87 @@ def _augmented(model: Model, names: Names) -> Model:
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     """The motion, in which the parameters walk about or come back to what they were given as."""
-    n, t = model.size, model.tangent
-    stay = [_stay(model, name, f"state[{n + index}]") for index, name in enumerate(names)]
-    drifts = [spread(name) for name in names]
+    n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)
-    variances = _entries(len(given(state, 1.0, parameters)))
-    if not motion.noises and len(variances) != t:  # rows of a lower triangle
-        for index, drift in enumerate(drifts):
-            variances += ["0.0"] * (t + index) + [drift]
-    else:
-        variances += drifts
-    arguments, passed = "state, control", "first(state), control"
-    if motion.noises:
-        stay = [f"{place} + noise[{motion.noises + index}]" for index, place in enumerate(stay)]
-        arguments, passed = f"{arguments}, noise", f"{passed}, first_noises(noise)"
-    entering = ((0.0,) * motion.noises,) if motion.noises else ()
+    is_triangle = not noises and len(given(state, 1.0, parameters)) != t
+    entering = ((0.0,) * noises,) if noises else ()
     parameters = _traced(model)
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
     reads_none = not parameters.read & set(names)
-    lost = motion.lost and _reading(
-        model,
-        names,
-        motion.lost,
-        "state, duration_s",
-        "first(state), duration_s",
-        [*_entries(t), *drifts],
-    )
+    move_own = _reading(model, names, motion.move)
+    angular = tuple(model.estimable[name] == "angle" for name in names)
+
+    def move(state: Any, control: Any, *others: Any) -> Any:
+        *entering, duration_s, parameters = others
+        own = (each[:noises] for each in entering)
+        moved = list(move_own(state, control, *own, duration_s, parameters))
+        for index, name in enumerate(names):
+            stay = state[n + index]
+            if not angular[index]:  # an angle has no mean to come back to
+                share = kept(name, duration_s, parameters)
+                stay = share * stay + (1.0 - share) * getattr(parameters, name)
+            moved.append(stay + entering[0][noises + index] if noises else stay)
+        return tuple(moved)
+
+    def with_spreads(function: Function, *, is_triangle: bool = False) -> Function:
+        own = _reading(model, names, function)
+
+        def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+            found = list(own(state, duration_s, parameters))
+            for index, name in enumerate(names):
+                found += [0.0] * (t + index) if is_triangle else []
+                found.append(spread(name, duration_s, parameters))
+            return tuple(found)
+
+        return noise
+
     return replace(
         motion,
-        lost=lost,
-        move=_reading(
-            model,
-            names,
-            motion.move,
-            f"{arguments}, duration_s",
-            f"{passed}, duration_s",
-            _entries(n) + stay,
-            first_noises=tuple_of(motion.noises),
-        ),
-        noise=_reading(model, names, given, "state, duration_s", "first(state), duration_s", variances),
-        noises=motion.noises + len(names) if motion.noises else 0,
+        move=move,
+        noise=with_spreads(given, is_triangle=is_triangle),
+        lost=motion.lost and with_spreads(motion.lost),
+        noises=noises + len(names) if noises else 0,
         linear=motion.linear and reads_none,
         jacobians=None,
         moments=None,
     )
 
 
-def _kept(model: Model, name: str) -> str:
-    """The share that a component of this name keeps in a step; an angle has no mean to come back to."""
-    return "1.0" if model.estimable[name] == "angle" else kept(name)
-
-
-def _stay(model: Model, name: str, state: str) -> str:
-    """A component of this name after a step."""
-    if model.estimable[name] == "angle":
-        return state
-    return f"{kept(name)} * {state} + (1.0 - {kept(name)}) * parameters.{name}"
-
-
 @lru_cache(maxsize=256)
 def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
-    arguments, passed = "state", "first(state)"
-    if sensor.noises:
-        arguments, passed = "state, noise", "first(state), noise"
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     parameters, about = _traced(model), (1.0,) * sensor.about_size
     sensor.measure(trial_state(model.kinds), *entering, about, parameters)
-    measured = _entries(len(sensor.measured))
-    measure = _reading(model, names, sensor.measure, f"{arguments}, about", f"{passed}, about", measured)
-    log_likelihood = sensor.log_likelihood and _reading(
-        model,
-        names,
-        sensor.log_likelihood,
-        "state, measured, about",
-        "first(state), measured, about",
-        None,
-    )
     return replace(
         sensor,
-        measure=measure,
-        log_likelihood=log_likelihood,
+        measure=_reading(model, names, sensor.measure),
+        log_likelihood=sensor.log_likelihood and _reading(model, names, sensor.log_likelihood),
         linear=sensor.linear and not parameters.read & set(names),
         jacobian=None,
         moments=None,
     )
 
 
-def _reading(
-    model: Model,
-    names: Names,
-    function: Function,
-    arguments: str,
-    passed: str,
-    entries: list[str] | None,
-    **others: Any,
-) -> Function:
-    """A model's function of the augmented state, which reads the estimated parameters from there.
+def _reading(model: Model, names: Names, function: Function) -> Function:
+    """A model's function of the augmented state, which reads the estimated parameters from there."""
+    n, fields = model.size, number_fields(model.parameters)
+    settings = settings_type(fields)
+    places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)
 
-    `entries` is what it returns, of what the function itself `found`; just that for None.
-    """
-    returned = "found" if entries is None else f"({', '.join(entries)},)"
-    return function_of(
-        f"def augmented({arguments}, parameters):\n"
-        f"    found = inner({passed}, own(state, parameters))\n"
-        f"    return {returned}\n",
-        inner=function,
-        own=_own_parameters(number_fields(model.parameters), names, model.size),
-        first=tuple_of(model.size),
-        **others,
-    )
+    def read(state: Any, *others: Any) -> Any:
+        *given, parameters = others
+        own = (getattr(parameters, name) if at < 0 else state[at] for name, at in places)
+        return function(state[:n], *given, settings(*own))
 
-
-@lru_cache(maxsize=64)
-def _own_parameters(fields: Names, names: Names, size: int) -> Function:
-    """`own(state, parameters)`: a model's parameters, the estimated ones from the augmented state."""
-    places = {name: f"state[{size + index}]" for index, name in enumerate(names)}
-    values = ", ".join(places.get(field, f"parameters.{field}") for field in fields)
-    text = f"def own(state, parameters):\n    return Settings({values})\n"
-    return function_of(text, Settings=settings_type(fields))
+    return read
 
 
 def _no_noise(size: int) -> Function:
-    zeros = ", ".join(["0.0"] * size)
-    return function_of(f"def no_noise(state, duration_s, parameters):\n    return ({zeros},)\n")
+    def no_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        return (0.0,) * size
 
-
-def _entries(count: int) -> list[str]:
-    return [f"found[{index}]" for index in range(count)]
+    return no_noise
 
 
 def _traced(model: Model) -> TracedParameters:

@@ -22,8 +22,8 @@ from replay.engine.results import ALL_WELL
 from replay.engine.tangent import TANGENT_WIDTHS, things
 from replay.inference.filtering import State
 from replay.inference.gaussian import cholesky, copy_gaussian
-from replay.inference.generate import retraction
 from replay.inference.imm import Mixing, Mixtures, likeliest_of, mixing, weighed_update
+from replay.inference.manifold import retraction
 from replay.inference.methods import (
     FILTERS,
     Method,

@@ -34,7 +34,6 @@ from replay.inference.gaussian import (
     reduce_covariance,
     whiten,
 )
-from replay.inference.generate import tuple_of
 from replay.inference.methods import FILTERS, Method, MethodParameters
 from replay.inference.motion_steps import motion_derivative, motion_noise
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations
@@ -50,6 +49,7 @@ from replay.inference.steps import (
     Workspace,
     workspace,
 )
+from replay.inference.tuples import tuple_of
 
 
 class BoundParameters(MethodParameters):

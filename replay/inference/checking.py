@@ -17,15 +17,8 @@ from recorders.parameters import build
 from replay.engine.arrays import Floats, Function
 from replay.engine.tangent import WIDTHS, tangent_components
 from replay.inference.augmentation import check_estimable
-from replay.inference.generate import (
-    Input,
-    adding_noise,
-    derivative,
-    differencing,
-    retraction,
-    tangent_size,
-    things,
-)
+from replay.inference.linearization import Input, derivative
+from replay.inference.manifold import differencing, retraction, tangent_size, things
 from replay.inference.model import (
     Correction,
     Model,
@@ -39,6 +32,7 @@ from replay.inference.model import (
     switching_of,
 )
 from replay.inference.parameters import number_fields, settings_type
+from replay.inference.tuples import adding_noise
 from replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200

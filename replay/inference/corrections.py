@@ -1,6 +1,6 @@
 """How an update moves a state by a step of its tangent space, and what becomes of the covariance.
 
-Components move by themselves (`generate.retraction`), unless a model says how they bend together
+Components move by themselves (`manifold.retraction`), unless a model says how they bend together
 (`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
 of the new one by the derivative of the moved state by the step, and the other way by that of the step by
 the state to which it leads.
@@ -10,19 +10,10 @@ from typing import Any
 
 from replay.engine.arrays import Floats, Function
 from replay.inference.gaussian import moved_covariance
-from replay.inference.generate import (
-    Input,
-    derivative,
-    differencing,
-    filling,
-    function_of,
-    is_flat,
-    resetting,
-    retraction,
-    tangent_size,
-    tuple_of,
-)
+from replay.inference.linearization import Input, derivative
+from replay.inference.manifold import differencing, is_flat, resetting, retraction, tangent_size
 from replay.inference.model import Correction, Model
+from replay.inference.tuples import filling, tuple_of
 from replay.tracing.functions import traced
 
 Kinds = tuple[str, ...]
@@ -182,26 +173,22 @@ def correcting_more(model: Model, more: int) -> Correction | None:
     """How a model is corrected whose state gets so many more components, which move by themselves."""
     if model.correct is None:
         return None
-    n, t = model.size, model.tangent
-    first, first_step = tuple_of(n), tuple_of(t)
+    n, t, correct = model.size, model.tangent, model.correct
 
-    def longer(text: str, entries: list[str], inner: Function) -> Function:
-        body = f"    return ({', '.join(entries)})\n"
-        return function_of(text + body, inner=inner, first=first, first_step=first_step)
+    def longer(move: Function) -> Function:
+        def move_all(state: Any, step: Any, slope: Any) -> Any:
+            moved = move(state[:n], step[:t], slope[:t])
+            return (*moved, *(state[n + each] + step[t + each] for each in range(more)))
 
-    moved = [f"moved[{each}]" for each in range(n)]
-    moved += [f"state[{n + each}] + step[{t + each}]" for each in range(more)]
-    move = "def move(state, step, slope):\n"
-    move += "    moved = inner(first(state), first_step(step), first_step(slope))\n"
-    found = [f"step[{each}]" for each in range(t)]
-    found += [f"target[{n + each}] - state[{n + each}]" for each in range(more)]
-    find = "def step_to(state, target, slope):\n"
-    find += "    step = inner(first(state), first(target), first_step(slope))\n"
-    ahead = [f"found[{each}]" for each in range(t)] + ["0.0"] * more
-    correct = model.correct
-    return Correction(
-        longer("def along(state):\n    found = inner(first(state))\n", ahead, correct.along),
-        longer(move, moved, correct.move),
-        longer(find, found, correct.step),
-        longer(move, moved, correct.back),
-    )
+        return move_all
+
+    along_own, step_own = correct.along, correct.step
+
+    def along(state: Any) -> Any:
+        return (*along_own(state[:n]), *(0.0,) * more)
+
+    def step_to(state: Any, target: Any, slope: Any) -> Any:
+        step = step_own(state[:n], target[:n], slope[:t])
+        return (*step, *(target[n + each] - state[n + each] for each in range(more)))
+
+    return Correction(along, longer(correct.move), step_to, longer(correct.back))

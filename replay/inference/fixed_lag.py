@@ -11,7 +11,7 @@ from typing import NamedTuple
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.inference.gaussian import copy_gaussian, moved_covariance
-from replay.inference.generate import differencing, retraction
+from replay.inference.manifold import differencing, retraction
 from replay.inference.recursion import Estimates
 from replay.inference.smoothing import BackMemory, Nodes, lengthen
 

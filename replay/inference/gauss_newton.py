@@ -20,7 +20,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL
 from replay.inference.affine import Trajectory, affine_steps, damped, reaching
-from replay.inference.generate import is_flat, resetting, retraction
+from replay.inference.manifold import is_flat, resetting, retraction
 from replay.inference.parameters import number_fields
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.settings import reading_settings

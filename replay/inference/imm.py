@@ -29,15 +29,7 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL, named
 from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import keep_measured, whiten, wrap
-from replay.inference.generate import (
-    differencing,
-    filling,
-    function_of,
-    is_flat,
-    resetting,
-    retraction,
-    tangent_size,
-)
+from replay.inference.manifold import differencing, is_flat, resetting, retraction, tangent_size
 from replay.inference.methods import (
     FILTERS,
     Method,
@@ -54,9 +46,12 @@ from replay.inference.sensor_steps import noting, slots_of
 from replay.inference.settings import reading_settings
 from replay.inference.stage import Stage
 from replay.inference.steps import Gaussian, Note, Steps
+from replay.inference.tuples import filling, range_of, total
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
+
+Matrix = tuple[tuple[float, ...], ...]  # its rows
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
@@ -215,13 +210,18 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
 
 def predicting(filters: Sequence[Steps]) -> Function:
     """`predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
-    arguments = "belief, control, duration_s, parameters, use, memories"
-    lines = [f"def predict({arguments}):", "    well = True"]
-    for mode in range(len(filters)):
-        given = arguments.replace("memories", f"memories[{mode}]")
-        lines.append(f"    well = predict_{mode}({mode}, {given}) and well")
-    text = "\n".join([*lines, "    return well", ""])
-    return function_of(text, **{f"predict_{mode}": each.predict for mode, each in enumerate(filters)})
+    predictions = tuple(each.predict for each in filters)
+
+    def predict(
+        belief: Any, control: Floats, duration_s: float, parameters: Any, use: int, memories: Any
+    ) -> bool:
+        well = True
+        for mode in range_of(len(predictions)):
+            predict_mode, memory = predictions[mode], memories[mode]
+            well = predict_mode(mode, belief, control, duration_s, parameters, use, memory) and well
+        return well
+
+    return predict
 
 
 def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function:
@@ -322,40 +322,51 @@ def changing(modes: int) -> Function:
     negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
     series is short, and the result squared as often; what that leaves of the rows' sums is one.
     """
-    places = [(begin, end) for begin in range(modes) for end in range(modes)]
-    changes = [(begin, end) for begin, end in places if begin != end]
-    leaving = [
-        " + ".join(f"r{start}_{end}" for start, end in changes if start == begin)
+    changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
+    rate_of = tuple(
+        tuple(changes.index((begin, end)) if begin != end else -1 for end in range(modes))
         for begin in range(modes)
-    ]
-    identity = ", ".join("1.0" if begin == end else "0.0" for begin, end in places)
-    entries = ", ".join(f"p{begin}_{end}" for begin, end in places)
+    )
+    identity = tuple(tuple(float(i == j) for j in range(modes)) for i in range(modes))
 
-    def times(left: str, begin: int, end: int) -> str:
-        return " + ".join(f"{left}{begin}_{k} * p{k}_{end}" for k in range(modes))
+    def change(rates: Floats, duration_s: float, transition: Floats) -> None:
+        leaving = tuple(total(tuple(rates[each] for each in row if each >= 0)) for row in rate_of)
+        fastest = max(*leaving)
+        span_s, doublings = duration_s, 0
+        while fastest * span_s > LONGEST:
+            span_s, doublings = 0.5 * span_s, doublings + 1
+        a = tuple(
+            tuple(
+                span_s * (rates[rate_of[i][j]] if i != j else fastest - leaving[i]) for j in range(modes)
+            )
+            for i in range(modes)
+        )
+        p = identity
+        for power in range(TERMS, 0, -1):  # I + A (I + A / 2 (I + A / 3 ...))
+            scale, times = 1.0 / power, matrix_product(a, p)
+            p = tuple(
+                tuple(identity[i][j] + scale * times[i][j] for j in range(modes)) for i in range(modes)
+            )
+        factor = np.exp(-fastest * span_s)
+        p = tuple(tuple(factor * each for each in row) for row in p)
+        for _ in range(doublings):
+            p = matrix_product(p, p)
+        for i, row in enumerate(p):
+            whole = total(row)
+            for j, entry in enumerate(row):
+                transition[i, j] = entry / whole
 
-    series = (f"{float(i == j)} + scale * ({times('a', i, j)})" for i, j in places)
-    lines = [
-        "def change(rates, duration_s, transition):",
-        *(f"    r{i}_{j} = rates[{index}]" for index, (i, j) in enumerate(changes)),
-        f"    fastest = max({', '.join(leaving)})",
-        "    span_s, doublings = duration_s, 0",
-        f"    while fastest * span_s > {LONGEST}:",
-        "        span_s, doublings = 0.5 * span_s, doublings + 1",
-        *(f"    a{i}_{j} = span_s * r{i}_{j}" for i, j in changes),
-        *(f"    a{i}_{i} = span_s * (fastest - ({each}))" for i, each in enumerate(leaving)),
-        f"    {entries} = {identity}",
-        f"    for power in range({TERMS}, 0, -1):",  # I + A (I + A / 2 (I + A / 3 ...))
-        "        scale = 1.0 / power",
-        f"        {entries} = {', '.join(series)}",
-        "    factor = np.exp(-fastest * span_s)",
-        f"    {entries} = {', '.join(f'factor * p{i}_{j}' for i, j in places)}",
-        "    for _ in range(doublings):",
-        f"        {entries} = {', '.join(times('p', i, j) for i, j in places)}",
-        *(f"    sum{i} = {' + '.join(f'p{i}_{j}' for j in range(modes))}" for i in range(modes)),
-        *(f"    transition[{i}, {j}] = p{i}_{j} / sum{i}" for i, j in places),
-    ]
-    return function_of("\n".join([*lines, ""]))
+    return change
+
+
+def matrix_product(left: Matrix, right: Matrix) -> Matrix:
+    """The product of two matrices."""
+    return tuple(
+        tuple(
+            total(tuple(row[k] * right[k][j] for k in range(len(right)))) for j in range(len(right[0]))
+        )
+        for row in left
+    )
 
 
 def weighing(modes: int) -> Function:

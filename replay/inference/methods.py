@@ -27,7 +27,6 @@ from replay.inference.gaussian import (
     widening,
     wrap,
 )
-from replay.inference.generate import tuple_of
 from replay.inference.model import Model, trial_state
 from replay.inference.motion_steps import linear_motion, motion_noise
 from replay.inference.parameters import number_fields
@@ -52,6 +51,7 @@ from replay.inference.steps import (
     gaussian_filter,
     workspace,
 )
+from replay.inference.tuples import tuple_of
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 

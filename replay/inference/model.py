@@ -19,7 +19,7 @@ from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
 from replay.engine.components import Components
 from replay.engine.tangent import are_kinds
-from replay.inference.generate import function_of, tangent_size
+from replay.inference.manifold import tangent_size
 from replay.tracing.functions import place_of
 
 FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
@@ -234,14 +234,19 @@ class Sensor:
 @lru_cache(maxsize=64)
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
     """The sensor of position fixes, of a state that has x, y and perhaps z in these places."""
-    entries = ", ".join(f"state[{place}]" for place in places)
-    variances = ", ".join(["parameters.sigma_fix_m ** 2"] * len(places))
+
+    def position(state: Any, about: Any, parameters: Any) -> Any:
+        return tuple(state[place] for place in places)
+
+    def fix_noise(parameters: Any) -> Any:
+        return (parameters.sigma_fix_m**2,) * len(places)
+
     return Sensor(
         FIX,
         schemas.POSITION_FIX,
         dict.fromkeys(POSITION[: len(places)], "linear"),
-        function_of(f"def position(state, about, parameters):\n    return ({entries},)\n"),
-        function_of(f"def fix_noise(parameters):\n    return ({variances},)\n"),
+        position,
+        fix_noise,
         vector="position_m",
         covariance="covariance_m2",
         linear=True,

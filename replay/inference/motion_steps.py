@@ -4,18 +4,12 @@ from typing import Any
 
 from replay.engine.arrays import Floats, Function
 from replay.inference.gaussian import add_through
-from replay.inference.generate import (
-    Input,
-    adding_noise,
-    derivative,
-    filling,
-    known_entries,
-    tuple_of,
-)
+from replay.inference.linearization import Input, derivative, known_entries
 from replay.inference.model import Model, Motion
 from replay.inference.sparse import adding_through, moving_covariance, pattern_of
 from replay.inference.stage import Stage
 from replay.inference.steps import Workspace
+from replay.inference.tuples import adding_noise, filling, tuple_of
 
 
 def linear_motion(stage: Stage) -> Function:

@@ -27,8 +27,8 @@ from replay.inference.affine import carrying
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.filtering import State
 from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
-from replay.inference.generate import differencing, is_flat, tuple_of
 from replay.inference.iterated import ITERATED, IteratedSmoother, Way
+from replay.inference.manifold import differencing, is_flat
 from replay.inference.methods import Method, MethodParameters
 from replay.inference.model import Model
 from replay.inference.motion_steps import motion_derivative
@@ -38,6 +38,7 @@ from replay.inference.sensor_steps import reading, sensor_derivative, sensor_noi
 from replay.inference.settings import reading_settings
 from replay.inference.stage import Stage
 from replay.inference.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
+from replay.inference.tuples import tuple_of
 
 RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors

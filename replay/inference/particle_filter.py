@@ -18,10 +18,8 @@ from replay.inference.filtering import Filter, State
 from replay.inference.gaussian import (
     no_innovation,
 )
-from replay.inference.generate import (
-    retraction,
-)
 from replay.inference.happenings import joined, of_rows
+from replay.inference.manifold import retraction
 from replay.inference.methods import Method, MethodParameters, no_steps
 from replay.inference.model import Model, Sensor, trial_state
 from replay.inference.particle_update import weighing

@@ -14,12 +14,7 @@ from replay.inference.gaussian import (
     widening,
     wrap,
 )
-from replay.inference.generate import (
-    Input,
-    derivative,
-    filling,
-    tuple_of,
-)
+from replay.inference.linearization import Input, derivative
 from replay.inference.particles import Cloud, ParticleMemory, SensorMemory
 from replay.inference.sensor_steps import note_numbers, noting, reading, sensor_noise
 from replay.inference.stage import Stage
@@ -29,6 +24,7 @@ from replay.inference.steps import (
     NOTHING_MEASURED,
     Note,
 )
+from replay.inference.tuples import filling, tuple_of
 
 
 def weighing(stage: Stage, number: int) -> Function:

@@ -17,18 +17,9 @@ from replay.inference.gaussian import (
     Innovation,
     semidefinite_cholesky,
 )
-from replay.inference.generate import (
-    adding_noise,
-    differencing,
-    filling,
-    lower_of,
-    moments_of,
-    offset_of,
-    retraction,
-    tuple_of,
-    weighted_mean_of,
-)
+from replay.inference.manifold import differencing, retraction
 from replay.inference.model import Model
+from replay.inference.moments import lower_of, moments_of, offset_of, weighted_mean_of
 from replay.inference.motion_steps import nothing
 from replay.inference.regression import settling
 from replay.inference.stage import Stage
@@ -36,6 +27,7 @@ from replay.inference.steps import (
     Gaussian,
     Workspace,
 )
+from replay.inference.tuples import adding_noise, filling, tuple_of
 from replay.sampling.resampling import choose_systematically
 
 

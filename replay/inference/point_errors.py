@@ -4,8 +4,7 @@ Measurement noise that is not white: ranges to one anchor, or between an anchor 
 seconds. A transformation of models: the state gets a component for each point or pair of points, which
 is added to what is measured about it, and moves by itself: a random walk, or a first-order Gauss-Markov
 process of mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, section 8.2. Derivatives by these components are written here, for jets of many slopes
-take minutes to compile.
+Navigation, 2001, section 8.2.
 """
 
 import re
@@ -13,11 +12,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from recorders.errors import BadInput
 from replay.inference.corrections import correcting_more
-from replay.inference.generate import function_of, tuple_of
 from replay.inference.model import Model, Motion, Sensor, trial_state
 from replay.inference.settings import trial_parameters
 from replay.inference.walks import kept, spread, with_walk_parameters
@@ -82,34 +80,29 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
 def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
     """The motion, beside which each error goes its own way."""
     n, t = model.size, model.tangent
-    noises = motion.noises
-    arguments = "state, control, noise, duration_s" if noises else "state, control, duration_s"
-    stay = [f"{kept(each)} * state[{n + index}]" for index, each in enumerate(_names(errors))]
-    if noises:
-        stay = [f"{each} + noise[{noises + index}]" for index, each in enumerate(stay)]
-    move = function_of(
-        f"def move({arguments}, parameters):\n"
-        f"    moved = inner({arguments.replace('state', 'first(state)', 1)}, parameters)\n"
-        f"    return ({_listed([f'moved[{index}]' for index in range(n)] + stay)})\n",
-        inner=motion.move,
-        first=tuple_of(n),
-    )
-    spreads = [spread(each) for each in _names(errors)]
-    given = motion.noise and motion.noise(trial_state(model.kinds), 1.0, trial_parameters(model))
-    entries = [f"noise[{index}]" for index in range(len(given))] if given else ["0.0"] * t
-    noise = function_of(
-        "def noises(state, duration_s, parameters):\n"
-        + ("    noise = inner(first(state), duration_s, parameters)\n" if given else "")
-        + f"    return ({_listed(entries + spreads)})\n",
-        inner=motion.noise,
-        first=tuple_of(n),
-    )
+    noises, names, inner, noise_of = motion.noises, _names(errors), motion.move, motion.noise
+    given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()
+    entries = len(given) or t
+
+    def move(state: Any, control: Any, *others: Any) -> Any:
+        *entering, duration_s, parameters = others
+        own = (each[:noises] for each in entering)
+        moved = list(inner(state[:n], control, *own, duration_s, parameters))
+        for index, name in enumerate(names):
+            stay = kept(name, duration_s, parameters) * state[n + index]
+            moved.append(stay + entering[0][noises + index] if noises else stay)
+        return tuple(moved)
+
+    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        found = noise_of(state[:n], duration_s, parameters) if noise_of else (0.0,) * t
+        return (*found, *(spread(name, duration_s, parameters) for name in names))
+
     return replace(
         motion,
         move=move,
         noise=noise,
         noises=noises + len(errors) if noises else 0,
-        noise_block=t if not noises and len(entries) != t else 0,
+        noise_block=t if not noises and entries != t else 0,
         jacobians=None,
         moments=None,
     )
@@ -123,18 +116,15 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
         for index, each in enumerate(errors)
         if each.measured in sensor.measured
     ]
-    arguments = "state, noise" if sensor.noises else "state"
-    passed = arguments.replace("state", "first(state)")
-    entries = [f"seen[{index}]" for index in range(len(sensor.measured))]
-    for column, row, numbers in own:
-        entries[row] += f" + {_same(sensor, numbers)} * state[{column}]"
-    names = {"inner": sensor.measure, "first": tuple_of(model.size), "own": tuple_of(sensor.about_size)}
-    measure = function_of(
-        f"def measure({arguments}, about, parameters):\n"
-        f"    seen = inner({passed}, own(about), parameters)\n"
-        f"    return ({_listed(entries)})\n",
-        **names,
-    )
+    n, size, inner = model.size, sensor.about_size, sensor.measure
+
+    def measure(state: Any, *others: Any) -> Any:
+        *entering, about, parameters = others
+        seen = list(inner(state[:n], *entering, about[:size], parameters))
+        for place, row, numbers in own:
+            seen[row] = seen[row] + _same(about[size:], numbers) * state[place]
+        return tuple(seen)
+
     return replace(
         sensor,
         measure=measure,
@@ -145,17 +135,13 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
     )
 
 
-def _same(sensor: Sensor, numbers: Sequence[int]) -> str:
+def _same(about: Any, numbers: Sequence[int]) -> Any:
     """1 where a message is about these points, 0 where not."""
-    first = sensor.about_size
-    return "1.0 * " + " * ".join(
-        f"(about[{first + index}] == {number})" for index, number in enumerate(numbers)
-    )
+    found: Any = 1.0
+    for index, number in enumerate(numbers):
+        found = found * (about[index] == number)
+    return found
 
 
 def _names(errors: Errors) -> Names:
     return tuple(each.name for each in errors)
-
-
-def _listed(entries: Sequence[str]) -> str:
-    return ", ".join(entries) + ","

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from replay.engine.blocks import filled_rows
 from replay.engine.results import ALL_WELL
-from replay.inference.generate import function_of
 from replay.inference.model import Model
 from replay.inference.stage import Stage
 from replay.inference.steps import (
@@ -27,6 +26,7 @@ from replay.inference.steps import (
     Note,
     Steps,
 )
+from replay.inference.tuples import range_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -276,12 +276,11 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
 
 def choosing(updates: tuple[Function, ...]) -> Function:
     """`update(source, ...)`: the update of the sensor with this number."""
-    arguments = "run, belief, data, parameters, gate, use, memory, note"
-    lines = [f"def update(source, {arguments}):"]
-    lines += [
-        f"    if source == {number}:\n        return update_{number}({arguments})"
-        for number in range(len(updates))
-    ]
-    lines.append(f"    return {NOTHING_MEASURED}")
-    text = "\n".join([*lines, ""])
-    return function_of(text, **{f"update_{number}": each for number, each in enumerate(updates)})
+
+    def update(source: int, *arguments: Any) -> int:
+        for number in range_of(len(updates)):
+            if source == number:
+                return updates[number](*arguments)
+        return NOTHING_MEASURED
+
+    return update

@@ -13,25 +13,14 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, varying
 from replay.inference.gaussian import cholesky, wrap
-from replay.inference.generate import (
-    differencing,
-    filling,
-    is_flat,
-    lower_of,
-    moments_of,
-    offset_of,
-    recentring,
-    retraction,
-    sum_of,
-    tangent_size,
-    tuple_of,
-    weighted_mean_of,
-)
+from replay.inference.manifold import differencing, is_flat, recentring, retraction, tangent_size
 from replay.inference.model import Motion, Sensor
+from replay.inference.moments import lower_of, moments_of, offset_of, weighted_mean_of
 from replay.inference.motion_steps import motion_derivative, motion_noise, nothing
 from replay.inference.sensor_steps import reading, sensor_noise
 from replay.inference.stage import Stage
 from replay.inference.steps import Workspace
+from replay.inference.tuples import filling, tuple_of
 from replay.sampling.sets import SampleSets
 
 MEANS = 30  # at most so many steps to an intrinsic mean
@@ -95,7 +84,7 @@ def regression(
     t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
-    add, add_flat, subtract = retraction(kinds), sum_of(components), differencing(outputs)
+    add, subtract = retraction(kinds), differencing(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
@@ -109,7 +98,7 @@ def regression(
             away = offset(triangle, points, index)
             fill_offset(offsets[index], away)
             if flat_states:
-                point = add_flat(state, away)
+                point = tuple(state[row] + away[row] for row in range(components))
             else:
                 for row in range(components):
                     memory.point[row] = mean[row]

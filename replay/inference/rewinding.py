@@ -18,7 +18,6 @@ from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.compile import compile_over_runs
 from replay.engine.results import ALL_WELL, failures_of
-from replay.inference.generate import function_of
 from replay.inference.happenings import data_columns, happenings_of
 from replay.inference.methods import Method
 from replay.inference.model import Model
@@ -304,22 +303,16 @@ def structure_of(rows: Any) -> Structure:
 @lru_cache(maxsize=64)
 def copying_rows(structure: Structure) -> Function:
     """`copy(source, i, target, j)`: row i of a NamedTuple of arrays into row j of another."""
-    lines = ["def copy(source, i, target, j):"]
+    columns = tuple(name for name, of in structure if not isinstance(of, tuple))
+    groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
 
-    def add(within: str, fields: Structure) -> None:
-        for name, of in fields:
-            column = f"{within}.{name}"
-            if isinstance(of, tuple):
-                add(column, of)
-                continue
-            inner = [f"k{axis}" for axis in range(1, of)]
-            for axis, index in enumerate(inner, start=1):
-                lines.append(f"{'    ' * axis}for {index} in range(source{column}.shape[{axis}]):")
-            there, here = (", ".join([row, *inner]) for row in "ji")
-            lines.append(f"{'    ' * of}target{column}[{there}] = source{column}[{here}]")
+    def copy(source: Any, i: int, target: Any, j: int) -> None:
+        for name in columns:
+            getattr(target, name)[j] = getattr(source, name)[i]
+        for name, copy_group in groups:
+            copy_group(getattr(source, name), i, getattr(target, name), j)
 
-    add("", structure)
-    return function_of("\n".join([*lines, ""]))
+    return copy
 
 
 # As an estimator

@@ -29,13 +29,13 @@ from replay.inference.association import Memory as AssociationMemory
 from replay.inference.association import Weights, memory_for
 from replay.inference.corrections import correcting, sloping
 from replay.inference.gaussian import Innovation, kalman_step, whiten, wrap
-from replay.inference.generate import adding_noise, function_of, tuple_of
 from replay.inference.model import Model, Sensor
 from replay.inference.sensor_steps import sensor_derivative
 from replay.inference.shared_bias import Pool, pool_of
 from replay.inference.stage import Stage, traced_sensor
 from replay.inference.steps import Workspace, workspace
 from replay.inference.tracks import Tracks
+from replay.inference.tuples import adding_noise, tuple_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +198,12 @@ def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: i
 def target_of(model: Model) -> Function:
     """`target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
     names = list(model.state)
-    entries = [f"state[{names.index(name)}]" if name in names else "0.0" for name in PLANE_MOTION]
-    return function_of(f"def target(state):\n    return {', '.join(entries)}\n")
+    places = tuple(names.index(name) if name in names else -1 for name in PLANE_MOTION)
+
+    def target(state: Any) -> Any:
+        return tuple(state[place] if place >= 0 else 0.0 for place in places)
+
+    return target
 
 
 @lru_cache(maxsize=64)
@@ -214,20 +218,23 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
     return traced_sensor(model, own, names)
 
 
-@lru_cache(maxsize=4)
 def errors_at(component: int) -> Function:
     """`errors(parameters)`: where in the state errors of a measured component stand; -1 for nowhere."""
-    places = f"parameters.registration_at_{component}, parameters.correlated_at_{component}"
-    return function_of(f"def errors(parameters):\n    return {places}\n")
+    names = (f"registration_at_{component}", f"correlated_at_{component}")
+
+    def errors(parameters: Any) -> tuple[float, ...]:
+        return tuple(getattr(parameters, name) for name in names)
+
+    return errors
 
 
 def adding_errors(components: int) -> Function:
     """`add(rows, predicted, mean, parameters)`: the errors that the state has of what is measured."""
-    of_first, of_second = errors_at(0), errors_at(1)
+    errors = tuple(errors_at(component) for component in range(components))
 
     def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
-        for i in range(components):
-            for place in of_first(parameters) if i == 0 else of_second(parameters):
+        for i, errors_of in enumerate(errors):
+            for place in errors_of(parameters):
                 if place >= 0.0:
                     rows[i, int(place)] += 1.0
                     predicted[i] += mean[int(place)]

@@ -20,16 +20,11 @@ from replay.inference.gaussian import (
     widening,
     wrap,
 )
-from replay.inference.generate import (
-    Input,
-    adding_noise,
-    derivative,
-    filling,
-    tuple_of,
-)
+from replay.inference.linearization import Input, derivative
 from replay.inference.model import Model, Sensor
 from replay.inference.stage import Stage
 from replay.inference.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Workspace
+from replay.inference.tuples import adding_noise, filling, tuple_of
 
 
 class Reading(NamedTuple):

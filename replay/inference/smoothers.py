@@ -20,7 +20,7 @@ from replay.engine.arrays import Integers
 from replay.engine.blocks import Ragged, copied
 from replay.inference.filtering import Filter, State
 from replay.inference.fixed_lag import Window, sliding_over_runs
-from replay.inference.generate import is_flat
+from replay.inference.manifold import is_flat
 from replay.inference.methods import (
     FILTERS,
     Method,

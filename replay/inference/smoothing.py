@@ -22,7 +22,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compile import compile_over_runs
 from replay.inference.corrections import Kinds, comparing, correcting, sloping
 from replay.inference.gaussian import copy_gaussian, moved_covariance, multiply, semidefinite_cholesky
-from replay.inference.generate import tangent_size
+from replay.inference.manifold import tangent_size
 from replay.inference.model import Correction
 from replay.inference.recursion import Estimates
 from replay.inference.stage import Stage

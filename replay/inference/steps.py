@@ -16,12 +16,9 @@ from replay.inference.gaussian import (
     copy_gaussian,
     no_innovation,
 )
-from replay.inference.generate import (
-    adding_noise,
-    tuple_of,
-)
 from replay.inference.model import Model
 from replay.inference.stage import Stage
+from replay.inference.tuples import adding_noise, tuple_of
 
 FAILURES = (
     "the covariance is no longer positive definite",

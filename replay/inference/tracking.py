@@ -17,7 +17,6 @@ from replay.engine.compile import compile_over_runs
 from replay.engine.tangent import tangent_components
 from replay.inference.association import ASSOCIATIONS
 from replay.inference.gaussian import copy_gaussian
-from replay.inference.generate import function_of, tuple_of
 from replay.inference.imm import Belief, interacting_steps
 from replay.inference.model import Model
 from replay.inference.motion_steps import linear_motion, nothing
@@ -42,6 +41,7 @@ from replay.inference.stage import Stage
 from replay.inference.steps import Gaussian, Steps, gaussian_filter
 from replay.inference.track_management import MANAGEMENTS, Evidence
 from replay.inference.tracks import NEVER, Tracks, are_near, drop, expected
+from replay.inference.tuples import range_of, tuple_of
 
 
 class Tracker(NamedTuple):
@@ -141,15 +141,16 @@ def believing(stage: Stage) -> Function:
     return of_modes if stage.modes else of_one
 
 
-def choosing(functions: list[Function], arguments: str) -> Function:
+def choosing(functions: list[Function]) -> Function:
     """`call(kind, ...)`: the function of this number."""
-    lines = [f"def call(kind, {arguments}):"]
-    lines += [
-        f"    if kind == {k}:\n        return function_{k}({arguments})"
-        for k in range(1, len(functions))
-    ]
-    lines.append(f"    return function_0({arguments})\n")
-    return function_of("\n".join(lines), **{f"function_{k}": each for k, each in enumerate(functions)})
+
+    def call(kind: int, *arguments: Any) -> Any:
+        for number in range_of(1, len(functions)):
+            if kind == number:
+                return functions[number](*arguments)
+        return functions[0](*arguments)
+
+    return call
 
 
 class Births(NamedTuple):
@@ -171,7 +172,7 @@ def births_of(kinds: Sequence[ScanSensor]) -> Births:
     begins = tuple(kind.birth is not None for kind in kinds)
     births = [kind.birth for kind in kinds if kind.birth is not None]
     number = tuple(sum(begins[:k]) for k in range(len(kinds)))
-    return Births(begins, number, choosing(births, "detection, origin, parameters"))
+    return Births(begins, number, choosing(births))
 
 
 def place_of(model: Model) -> tuple[int, int]:
@@ -251,13 +252,10 @@ def advancing(tracker: Tracker) -> Function:
 def weighing(tracker: Tracker) -> Function:
     """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
-    observe = choosing(
-        [observing(model, kind, tracker.names) for kind in kinds],
-        "track, mode, mean, covariance, origin, parameters, memory",
-    )
-    compare = choosing([comparing(kind) for kind in kinds], "track, mode, detection, memory")
-    detection_of = choosing([kind.detection for kind in kinds], "target, origin, parameters")
-    clutter_of = choosing([kind.clutter for kind in kinds], "detection, parameters")
+    observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
+    compare = choosing([comparing(kind) for kind in kinds])
+    detection_of = choosing([kind.detection for kind in kinds])
+    clutter_of = choosing([kind.clutter for kind in kinds])
     begins, birth_number, birth = births_of(kinds)
     read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
 
@@ -315,9 +313,7 @@ def weighing(tracker: Tracker) -> Function:
 def taking_in(tracker: Tracker) -> Function:
     """`take_in(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
-    update = choosing(
-        [updating(model, kind) for kind in kinds], "track, mode, detections, mean, covariance, memory"
-    )
+    update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
     begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
 
@@ -401,7 +397,7 @@ def beginning(tracker: Tracker) -> Function:
         correlations = [
             correlating(model, kind, corner, tracker.names) for kind in kinds if kind.birth is not None
         ]
-        correlate = choosing(correlations, "mean, covariance, origin, parameters, work")
+        correlate = choosing(correlations)
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
         """Whether a confirmed track is too near for another one to begin."""

@@ -6,6 +6,7 @@ The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimati
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import NonNegativeFloat, create_model
 
 from replay.inference.model import ModelParameters
@@ -35,12 +36,13 @@ def with_walk_parameters(
     return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **walks)
 
 
-def kept(name: str) -> str:
-    """The share of a component's distance from its mean that is left after a step, as text."""
-    return f"np.exp(-duration_s / parameters.time_s_{name})"
+def kept(name: str, duration_s: Any, parameters: Any) -> Any:
+    """The share of a component's distance from its mean that is left after a step."""
+    return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
 
 
-def spread(name: str) -> str:
-    """The variance that a step adds to it, as text."""
-    lost = f"1.0 - np.exp(-2.0 * duration_s / parameters.time_s_{name})"
-    return f"parameters.drift_{name} ** 2 * duration_s + ({lost}) * parameters.sigma_{name} ** 2"
+def spread(name: str, duration_s: Any, parameters: Any) -> Any:
+    """The variance that a step adds to it."""
+    walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
+    lost = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
+    return walked + lost * getattr(parameters, f"sigma_{name}") ** 2

@@ -55,7 +55,7 @@ class Program:
         self.tables: dict[Any, tuple[str, Array]] = {}
         self.instances: dict[Any, Instance] = {}
         self._names = count()
-        self._open: list[str] = []
+        self._open: list[int] = []
         self._kept: list[Any] = []  # whose ids are keys
 
     def text(self) -> str:
@@ -79,9 +79,9 @@ class Program:
         """What a function returns for these arguments; it is lowered where that was not done yet."""
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
-            if function.__qualname__ in self._open:
+            if id(function) in self._open:
                 raise DoesNotCompile(f"{function.__qualname__} calls itself, which a kernel cannot")
-            self._open.append(function.__qualname__)
+            self._open.append(id(function))
             self._kept.append((function, arguments))
             parameters = [self._parameter(index, each) for index, each in enumerate(arguments)]
             own, returned = self._lower(self, function, [value for value, _ in parameters])

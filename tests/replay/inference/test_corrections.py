@@ -11,7 +11,7 @@ from replay.estimators.navigation import INERTIAL
 from replay.estimators.turning import heading, move, move_back
 from replay.inference.augmentation import augmented
 from replay.inference.corrections import comparing, correcting, relinearising, sloping
-from replay.inference.generate import differencing
+from replay.inference.manifold import differencing
 
 MODEL = augmented(INERTIAL, ("lever_x_m",))
 N, T = MODEL.size, MODEL.tangent

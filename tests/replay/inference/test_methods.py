@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from recorders.models.orientation import compose, conjugate
 from replay.engine.tangent import rotation_vector
-from replay.inference.generate import resetting
+from replay.inference.manifold import resetting
 from replay.inference.regression import regression, sample_memory
 from replay.sampling.sets import SampleSets
 from tests.replay.inference import attitude, vehicle_a

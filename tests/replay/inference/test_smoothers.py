@@ -20,7 +20,7 @@ from recorders.recording import Recording, import_run
 from replay.engine.sources import MemorySource, memory_source
 from replay.engine.tangent import rotation_vector
 from replay.inference import smoothers
-from replay.inference.generate import resetting
+from replay.inference.manifold import resetting
 from replay.inference.model import Model, ModelParameters, Motion, Sensor
 from replay.inference.smoothing import solve_semidefinite
 from tests.replay.inference import attitude, vehicle_a, wheel

@@ -1,0 +1,69 @@
+"""Between the tuples that a model's functions take and return, and the arrays that kernels work in.
+
+A kernel has no index into a tuple that it does not know while it is compiled: what goes through one is a
+loop over something known, which is written out (`range_of`).
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+from replay.engine.arrays import Floats, Function
+
+
+def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
+    """The numbers of `range`, for a loop that is written out."""
+    return tuple(range(start) if end is None else range(start, end))
+
+
+@lru_cache(maxsize=256)
+def tuple_of(size: int, start: int = 0) -> Function:
+    """`read(array)`: `size` entries of an array from `start` on, as a tuple."""
+
+    def read(array: Floats) -> tuple[Any, ...]:
+        return tuple(array[start + index] for index in range(size))
+
+    return read
+
+
+@lru_cache(maxsize=256)
+def filling(size: int) -> Function:
+    """`fill(array, values)`: the first entries of a tuple into an array."""
+
+    def fill(array: Floats, values: Sequence[float]) -> None:
+        for index in range_of(size):
+            array[index] = values[index]
+
+    return fill
+
+
+def total(numbers: Sequence[float]) -> float:
+    """The sum of a tuple of numbers, from the first on; how `sum` rounds depends on Python's version."""
+    found = numbers[0]
+    for number in numbers[1:]:
+        found = found + number
+    return found
+
+
+@lru_cache(maxsize=64)
+def adding_noise(size: int, block: int = 0) -> Function:
+    """`add(covariance, noise)`: adds variances, or the rows of a lower triangle, given as a tuple.
+
+    The triangle is that of the first `block` components, behind which are variances of the others; of
+    all components unless it is given.
+    """
+    corner = block or size
+    triangle = tuple((row, column) for row in range(corner) for column in range(row + 1))
+    triangle += tuple((row, row) for row in range(corner, size))
+
+    def add(covariance: Floats, noise: tuple[float, ...]) -> None:
+        if len(noise) == size:
+            for row in range_of(size):
+                covariance[row, row] += noise[row]
+        else:
+            for entry, (row, column) in enumerate(triangle):
+                covariance[row, column] += noise[entry]
+                if column < row:
+                    covariance[column, row] += noise[entry]
+
+    return add
