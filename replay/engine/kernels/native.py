@@ -17,7 +17,7 @@ from hashlib import sha256
 from importlib.resources import files
 from threading import Lock
 from types import FunctionType
-from typing import Any
+from typing import Any, cast
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -33,6 +33,7 @@ from replay.engine.kernels.telling import compiling
 from replay.engine.kernels.values import STORED, Array, Record, leaves, rebuilt
 
 KNOWN = 64  # sizes up to this are part of a kernel
+_ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
 
 
@@ -44,11 +45,16 @@ class Kernel:
         self._entries: dict[Any, Callable[..., None]] = {}
         self._lock = Lock()
 
-    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
-        """The loop over the runs from `first` up to `end` for these arguments, which it holds."""
+    def of(
+        self, arguments: Sequence[Any], scratch: Sequence[Any] = (), varies: int = 1
+    ) -> Callable[[int, int], None]:
+        """The loop over the runs from `first` up to `end` for these arguments, which it holds.
+
+        So many first axes of arrays vary, none of those in `scratch`; see `_described`.
+        """
         words: list[int] = []
         kinds = (
-            *(_described(each, words, 1) for each in arguments),
+            *(_described(each, words, varies) for each in arguments),
             *(_described(each, words, 0) for each in scratch),
         )
         entry = self._entries.get(kinds)
@@ -63,6 +69,39 @@ class Kernel:
             found(first, end, given)
 
         return loop
+
+
+def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that makes no arrays, for Python; no size of the arrays that it is given is known.
+
+    It returns nothing, or a number of the kind that its annotation says.
+    """
+    said = function.__annotations__.get("return", "")
+    returned = said if isinstance(said, str) else getattr(said, "__name__", str(said))
+    if returned not in ("float", "int", "bool", "None"):
+        raise BadInput(
+            f"{function.__qualname__} does not say what it returns; annotate it with '-> float', "
+            "'-> int', '-> bool' or '-> None'"
+        )
+
+    def call(run: int, arguments: tuple[Any, ...]) -> None:  # noqa: ARG001
+        function(*arguments)
+
+    def evaluate(run: int, arguments: tuple[Any, ...], found: np.ndarray) -> None:
+        found[run] = function(*arguments)
+
+    once = call if returned == "None" else evaluate
+    once.__module__, once.__name__ = function.__module__, function.__name__
+    kernel = Kernel(cast(FunctionType, once))
+
+    def called(*arguments: Any) -> Any:
+        if returned == "None":
+            return kernel.of((arguments,), varies=_ALL)(0, 1)
+        found = np.empty(1, returned)
+        kernel.of((arguments, found), varies=_ALL)(0, 1)
+        return found[0].item()
+
+    return called
 
 
 # --- arguments --------------------------------------------------------------------------------------
@@ -83,7 +122,8 @@ def _described(value: Any, words: list[int], varies: int) -> Any:
         for n, known, step in zip(value.shape[::-1], shape[::-1], value.strides[::-1], strict=True):
             if step % size:
                 raise BadInput("a kernel takes arrays whose numbers lie in whole steps")
-            strides.append(step // size if step // size == usual else None)
+            # NumPy's strides of an array without numbers are 0: it is taken for a packed one
+            strides.append(usual if step // size == usual or not value.size else None)
             usual = None if usual is None or known is None else usual * n
         strides.reverse()
         words.append(value.__array_interface__["data"][0])
