@@ -10,15 +10,16 @@ Weideman, Schmelzer (BIT 46, 2006), the trapezoidal rule converges geometrically
 (-inf, 0]: 14 nodes give some 1e-14, without Bessel functions, tables or cancellation.
 """
 
-import cmath
 import math
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.models.orientation import SIGNS
 from replay.distributions.gaussian_kernels import solve_in_place
-from replay.engine.compile import compiled
+from replay.engine.compile import compile_over_runs
 
 Vector = NDArray | tuple[float, ...]
 
@@ -32,8 +33,10 @@ WEIGHTS = (
     * np.exp(CONTOUR)
     * (0.5017 * _cotangent - 0.5017 * 0.6407 * _theta * (1.0 + _cotangent**2) + 0.2645j)
 )
-CONTOUR.setflags(write=False)
-WEIGHTS.setflags(write=False)
+# real and imaginary parts of both, (nodes / 2, 4)
+_PARTS = np.stack([CONTOUR.real, CONTOUR.imag, WEIGHTS.real, WEIGHTS.imag], axis=1)
+for _table in (CONTOUR, WEIGHTS, _PARTS):
+    _table.setflags(write=False)
 
 # Newton's error squares in every step: from here the last step ends below the rounding.
 _LAST_STEP = 1e-8
@@ -41,7 +44,35 @@ _MOST_STEPS = 30
 _MOST_SWEEPS = 30
 
 
-@compiled
+Complex = tuple[float, float]
+
+
+def times(x: Complex, y: Complex) -> Complex:
+    """The product of two complex numbers."""
+    return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
+
+
+def reciprocal(x: Complex) -> Complex:
+    """1 / x, scaled by its larger part, as C divides."""
+    if abs(x[0]) >= abs(x[1]):
+        ratio = x[1] / x[0]
+        size = x[0] + x[1] * ratio
+        return 1.0 / size, -ratio / size
+    ratio = x[0] / x[1]
+    size = x[0] * ratio + x[1]
+    return ratio / size, -1.0 / size
+
+
+def root(x: Complex) -> Complex:
+    """The square root of a complex number whose real part is the larger one, as C takes it."""
+    size = math.sqrt((abs(x[0]) + math.hypot(x[0], x[1])) * 0.5)
+    if size == 0.0:
+        return 0.0, x[1]
+    if x[0] >= 0.0:
+        return size, x[1] / (2.0 * size)
+    return abs(x[1]) / (2.0 * size), math.copysign(size, x[1])
+
+
 def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     """The moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
 
@@ -56,19 +87,20 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     d = len(z)
     mean[:] = 0.0
     covariance[:] = 0.0
-    factors = np.empty(d, np.complex128)
+    factors = np.empty((d, 2))  # 1 / (s - z_k)
     total = 0.0
-    for node in range(len(CONTOUR)):
-        integrand = WEIGHTS[node]
+    for node in range(len(_PARTS)):
+        integrand = _PARTS[node, 2], _PARTS[node, 3]
         for i in range(d):
-            factors[i] = 1.0 / (CONTOUR[node] - z[i])
-            integrand *= cmath.sqrt(factors[i])
-        total += integrand.real
+            factor = reciprocal((_PARTS[node, 0] - z[i], _PARTS[node, 1]))
+            factors[i, 0], factors[i, 1] = factor
+            integrand = times(integrand, root(factor))
+        total += integrand[0]
         for i in range(d):
-            first = integrand * factors[i]
-            mean[i] += first.real
+            first = times(integrand, (factors[i, 0], factors[i, 1]))
+            mean[i] += first[0]
             for j in range(i + 1):
-                covariance[i, j] += (first * factors[j]).real
+                covariance[i, j] += times(first, (factors[j, 0], factors[j, 1]))[0]
     for i in range(d):
         mean[i] *= 0.5 / total
         covariance[i, i] *= 3.0
@@ -78,7 +110,6 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
     return total
 
 
-@compiled
 def fit_concentrations(target: NDArray, z: NDArray) -> bool:
     """Concentrations (d,) under which E(x_i^2) is `target`, ascending, sum 1: Newton's method on (14).
 
@@ -149,7 +180,10 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
     for i in range(d):
         values[i] = matrix[i, i]
     for i in range(d - 1):
-        least = i + np.argmin(values[i:])
+        least = i
+        for k in range(i + 1, d):
+            if values[k] < values[least]:
+                least = k
         if least != i:
             values[i], values[least] = values[least], values[i]
             for k in range(d):
@@ -164,7 +198,7 @@ def compose(left: Vector, right: Vector, out: NDArray) -> None:
             out[i] += SIGNS[j, i ^ j] * left[j] * right[i ^ j]
 
 
-def compose_columns(left: NDArray, columns: NDArray, out: NDArray) -> None:
+def compose_columns(left: Vector, columns: NDArray, out: NDArray) -> None:
     """Write left (+) columns[:, k] to out[:, k]."""
     for k in range(out.shape[1]):
         compose(left, columns[:, k], out[:, k])
@@ -177,12 +211,11 @@ def turn_columns(columns: NDArray, increment: NDArray) -> None:
         compose(before[:, k], increment, columns[:, k])
 
 
-def framed(matrix: NDArray, frame: NDArray) -> NDArray:
-    """L matrix L^T with L y = frame (+) y: a second moment or parameter matrix in another frame (d,)."""
-    half, whole = np.empty(matrix.shape), np.empty(matrix.shape)
+def framed(matrix: NDArray, frame: Vector, out: NDArray) -> None:
+    """Fill L matrix L^T, L y = frame (+) y: a moment or parameter matrix in another frame (d,)."""
+    half = np.empty(out.shape)
     compose_columns(frame, matrix, half)
-    compose_columns(frame, half.T, whole)
-    return whole
+    compose_columns(frame, half.T, out)
 
 
 def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
@@ -228,23 +261,33 @@ def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
     d = len(z)
     mode = axes[:, d - 1].copy()
     moments, local, work = np.empty(d), np.empty((d, d)), np.empty((d, d))
-    integrate(z, moments, work)
-    compose_columns(inverse(mode), axes, local)
-    weighted_outer(local, moments, work)
+    local_moments(axes, z, moments, work)
     compose_covariances(work, noise_covariance, local)
     eigen_ascending(local, moments, work)
     compose_columns(mode, work, axes)
     return fit_concentrations(moments, z)
 
 
-def inverse(x: NDArray) -> NDArray:
-    """The inverse of a unit complex number or quaternion (d,)."""
-    out = -x
-    out[0] = x[0]
-    return out
+def inverse(x: NDArray, out: NDArray) -> None:
+    """Fill the inverse of a unit complex number or quaternion (d,)."""
+    for i in range(len(x)):
+        out[i] = x[i] if i == 0 else -x[i]
 
 
-def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: NDArray) -> None:
+def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> None:
+    """Fill E(x_i^2) along the axes (d,), and the second moment (d, d) in the frame of the mode.
+
+    There small moments keep their digits next to large ones.
+    """
+    d = len(z)
+    local, back = np.empty((d, d)), np.empty(d)
+    integrate(z, moments, out)
+    inverse(axes[:, d - 1], back)
+    compose_columns(back, axes, local)
+    weighted_outer(local, moments, out)
+
+
+def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vector) -> None:
     """One measurement update in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
 
     Args:
@@ -253,28 +296,45 @@ def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: NDArr
         inverse_noise: D M^v Z^v M^v^T D, the parameter matrix of the inverse of the noise, (d, d).
         measurement: a unit vector (d,).
     """
-    total = np.empty(axes.shape)
+    d = len(z)
+    total, seen = np.empty((d, d)), np.empty((d, d))
     weighted_outer(axes, z, total)
-    total += framed(inverse_noise, measurement)
+    framed(inverse_noise, measurement, seen)
+    for i in range(d):
+        for j in range(d):
+            total[i, j] += seen[i, j]
     eigen_ascending(total, z, axes)
-    z -= z[len(z) - 1]
+    greatest = z[d - 1]
+    for i in range(d):
+        z[i] -= greatest
 
 
-@compiled
+@cache
+def _over_all(function: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(function, allocates=False)
+
+
+def _predict_one(
+    n: int, axes: NDArray, z: NDArray, noise_covariance: NDArray, converged: NDArray
+) -> None:
+    converged[n] = predict(axes[n], z[n], noise_covariance[n])
+
+
 def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArray:
     """`predict` for every distribution (n, ...) and its noise; returns which converged."""
     converged = np.empty(len(z), np.bool_)
-    for n in range(len(z)):
-        converged[n] = predict(axes[n], z[n], noise_covariance[n])
+    _over_all(_predict_one)(len(z), axes, z, noise_covariance, converged)
     return converged
 
 
-@compiled
+def _fit_one(n: int, covariance: NDArray, axes: NDArray, z: NDArray, converged: NDArray) -> None:
+    moments = np.empty(z.shape[1])
+    eigen_ascending(covariance[n], moments, axes[n])
+    converged[n] = fit_concentrations(moments, z[n])
+
+
 def fit_each(covariance: NDArray, axes: NDArray, z: NDArray) -> NDArray:
     """Fit every covariance (n, d, d), destroying it, into axes and z; returns which converged."""
     converged = np.empty(len(z), np.bool_)
-    moments = np.empty(z.shape[1])
-    for n in range(len(z)):
-        eigen_ascending(covariance[n], moments, axes[n])
-        converged[n] = fit_concentrations(moments, z[n])
+    _over_all(_fit_one)(len(z), covariance, axes, z, converged)
     return converged

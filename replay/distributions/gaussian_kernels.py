@@ -39,8 +39,10 @@ def condition(mean: NDArray, covariance: NDArray, innovation: NDArray, noise: ND
         noise: the covariance of v, (d, d).
     """
     d = len(mean)
-    innovation_covariance = covariance + noise
-    gain = covariance.copy()
+    innovation_covariance, gain = covariance.copy(), covariance.copy()
+    for i in range(d):
+        for j in range(d):
+            innovation_covariance[i, j] += noise[i, j]
     solve_in_place(innovation_covariance, gain)
     for i in range(d):
         for j in range(d):

@@ -15,6 +15,10 @@ from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal_kernels as kernels
 from replay.distributions.batches import flatten
+from replay.distributions.wrapped_normal_kernels import Mixture
+from replay.engine.compile import compiled
+
+_product_mixture = compiled(kernels.product_mixture, allocates=False)
 
 
 class WrappedNormal(NamedTuple):
@@ -43,14 +47,6 @@ class Samples(NamedTuple):
 
     positions: NDArray[np.float64]
     weights: NDArray[np.float64]
-
-
-class Mixture(NamedTuple):
-    """A wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
-
-    mean: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    covariance: NDArray[np.float64]
 
 
 def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal:
@@ -151,8 +147,9 @@ def fit_mixed_mle(samples: Samples) -> WrappedNormal:
 
 def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
     """The normalised product of two densities, exactly; single distributions without batch axes."""
-    mean, weights, covariance = kernels.product_mixture(*first, *second)
-    return Mixture(mean, weights, covariance)
+    made = kernels.blank_mixture(np.diagonal(first.covariance + second.covariance))
+    count = _product_mixture(*first, *second, made)
+    return Mixture(made.mean[:count], made.weights[:count], made.covariance)
 
 
 def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:

@@ -4,12 +4,15 @@ Component-first functions run on arrays as well. A covariance is handed on as c1
 """
 
 import math
+from collections.abc import Callable
+from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.models.planar import Component, Components, wrap_angle
-from replay.engine.compile import compiled
+from replay.engine.compile import compile_over_runs
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.
@@ -22,6 +25,14 @@ _MLE_REFINEMENTS = 34
 # the five samples are the mean plus these multiples of (a, b)
 DIRAC_SIGNS = ((-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (0.0, 0.0))
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+class Mixture(NamedTuple):
+    """A wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
+
+    mean: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    covariance: NDArray[np.float64]
 
 
 def circular_correlation(c11: Component, c12: Component, c22: Component) -> Component:
@@ -50,14 +61,16 @@ def diracs(c11: Component, c22: Component, correlation: Component, w5: Component
     return a, b, 0.5 * w * (1.0 + correlation), 0.5 * w * (1.0 - correlation)
 
 
-def five_samples(mean: NDArray, covariance: NDArray, central_weight: float) -> Components:
-    """Positions (5, 2) and weights (5,) of algorithm 1 for a wrapped normal."""
+def five_samples(
+    mean: NDArray, covariance: NDArray, central_weight: float, x: NDArray, weights: NDArray
+) -> None:
+    """Fill positions (5, 2) and weights (5,) of algorithm 1 for a wrapped normal."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     a, b, w1, w3 = diracs(c11, c22, circular_correlation(c11, c12, c22), central_weight)
-    x = np.empty((5, 2))
     for n, (sign1, sign2) in enumerate(DIRAC_SIGNS):
         x[n, 0], x[n, 1] = mean[0] + sign1 * a, mean[1] + sign2 * b
-    return x, np.array([w1, w1, w3, w3, central_weight])
+    for n, weight in enumerate((w1, w1, w3, w3, central_weight)):
+        weights[n] = weight
 
 
 def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Components:
@@ -94,13 +107,20 @@ def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Component
     return means[0], means[1], variances[0], variances[1], correlation
 
 
-def mixed_mle(x: NDArray, weights: NDArray, m1: float, m2: float, c11: float, c22: float) -> float:
+def mixed_mle(
+    x: NDArray,
+    weights: NDArray,
+    m1: float,
+    m2: float,
+    c11: float,
+    c22: float,
+    deviations: NDArray,
+) -> float:
     """The c12 that maximises the weighted likelihood of samples (n, 2), the rest given by moments.
 
     Kurz and Hanebeck, CDC 2015. The likelihood has several maxima, so that a grid over the whole range
-    comes first. Its wraps are cut at three, as in the source.
+    comes first. Its wraps are cut at three, as in the source. `deviations` (n, 2) is memory.
     """
-    deviations = np.empty(x.shape)
     for n in range(len(x)):
         deviations[n, 0] = wrap_angle(x[n, 0] - m1) / math.sqrt(c11)
         deviations[n, 1] = wrap_angle(x[n, 1] - m2) / math.sqrt(c22)
@@ -155,49 +175,76 @@ def fit_samples(x: NDArray, weights: NDArray) -> Components:
     m1, m2, c11, c22, correlation = circular_moments(x, weights, np.zeros((2, 2)))
     c12 = covariance_of(correlation, c11, c22)
     if not c12 * c12 < c11 * c22:
-        c12 = mixed_mle(x, weights, m1, m2, c11, c22)
+        c12 = mixed_mle(x, weights, m1, m2, c11, c22, np.empty(x.shape))
     return m1, m2, c11, c12, c22
 
 
-@compiled
+def blank_mixture(variance: NDArray) -> Mixture:
+    """Memory for the product of densities whose variances (2,) add up to these at most."""
+    most = (2 * _turns(variance[0]) + 1) * (2 * _turns(variance[1]) + 1)
+    return Mixture(np.empty((most, 2)), np.empty(most), np.empty((2, 2)))
+
+
 def product_mixture(
-    mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray
-) -> Components:
-    """The product of two wrapped normal densities: exactly a wrapped Gaussian mixture.
+    mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
+) -> int:
+    """Fill the product of two wrapped normal densities: exactly a wrapped Gaussian mixture.
 
-    It has a component for every number of turns between the two means, with Kalman's update each.
-
-    Returns:
-        The components' means (n, 2), their weights (n,), and the covariance (2, 2) that they share.
+    It has a component for every number of turns between the two means, with Kalman's update each;
+    returns how many.
     """
-    first, second = _limited(covariance), _limited(other)
-    total = first + second
+    first, second, inverse = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
+    _limit(covariance, first)
+    _limit(other, second)
+    total, gain = np.empty((2, 2)), np.empty((2, 2))
+    for i in range(2):
+        for j in range(2):
+            total[i, j] = first[i, j] + second[i, j]
     determinant = total[0, 0] * total[1, 1] - total[0, 1] * total[1, 0]
-    inverse = np.array([[total[1, 1], -total[0, 1]], [-total[1, 0], total[0, 0]]]) / determinant
-    gain = first @ inverse
+    for i in range(2):
+        inverse[i, i] = total[1 - i, 1 - i] / determinant
+        inverse[i, 1 - i] = -total[i, 1 - i] / determinant
+    _multiply(first, inverse, gain)
+    _multiply(gain, second, mixture.covariance)
     turns0, turns1 = _turns(total[0, 0]), _turns(total[1, 1])
     wide = 2 * turns1 + 1
-    means = np.empty(((2 * turns0 + 1) * wide, 2))
-    exponents = np.empty(len(means))
-    for n in range(len(means)):
+    count = (2 * turns0 + 1) * wide
+    greatest = -np.inf
+    for n in range(count):
         innovation0 = wrap_angle(other_mean[0] - mean[0]) + (n // wide - turns0) * TURN
         innovation1 = wrap_angle(other_mean[1] - mean[1]) + (n % wide - turns1) * TURN
-        exponents[n] = -0.5 * (
+        exponent = -0.5 * (
             inverse[0, 0] * innovation0**2
             + 2.0 * inverse[0, 1] * innovation0 * innovation1
             + inverse[1, 1] * innovation1**2
         )
+        greatest = max(greatest, exponent)
+        mixture.weights[n] = exponent
         for k in range(2):
-            means[n, k] = mean[k] + gain[k, 0] * innovation0 + gain[k, 1] * innovation1
-    weights = np.exp(exponents - exponents.max())
-    return means, weights / weights.sum(), gain @ second
+            mixture.mean[n, k] = mean[k] + gain[k, 0] * innovation0 + gain[k, 1] * innovation1
+    sum_of_weights = 0.0
+    for n in range(count):
+        mixture.weights[n] = np.exp(mixture.weights[n] - greatest)
+        sum_of_weights += mixture.weights[n]
+    for n in range(count):
+        mixture.weights[n] /= sum_of_weights
+    return count
 
 
-def _limited(covariance: NDArray) -> NDArray:
-    """The covariance, or where it stands for a uniform distribution, the least one that does."""
+def _multiply(left: NDArray, right: NDArray, product: NDArray) -> None:
+    for i in range(2):
+        for j in range(2):
+            product[i, j] = left[i, 0] * right[0, j] + left[i, 1] * right[1, j]
+
+
+def _limit(covariance: NDArray, limited: NDArray) -> None:
+    """Fill the covariance, or where it stands for a uniform distribution, the least one that does."""
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     least = 0.5 * (c11 + c22) - math.hypot(0.5 * (c11 - c22), c12)
-    return UNIFORM * np.eye(2) if least > UNIFORM else covariance
+    for i in range(2):
+        for j in range(2):
+            uniform = UNIFORM if i == j else 0.0
+            limited[i, j] = uniform if least > UNIFORM else covariance[i, j]
 
 
 def _turns(variance: float) -> int:
@@ -205,12 +252,16 @@ def _turns(variance: float) -> int:
     return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
 
 
-def fit_product(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> Components:
+def fit_product(
+    mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
+) -> Components:
     """The wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
     Where no positive definite covariance has them (modes far apart), the components' correlation stays.
+    `mixture` is memory, see `blank_mixture`.
     """
-    means, weights, spread = product_mixture(mean, covariance, other_mean, other)
+    count = product_mixture(mean, covariance, other_mean, other, mixture)
+    means, weights, spread = mixture.mean[:count], mixture.weights[:count], mixture.covariance
     m1, m2, c11, c22, correlation = circular_moments(means, weights, spread)
     c12 = covariance_of(correlation, c11, c22)
     if not c12 * c12 < c11 * c22:
@@ -242,38 +293,63 @@ def density(x1: float, x2: float, covariance: NDArray) -> float:
     return total / (TURN * math.sqrt(determinant))
 
 
-@compiled
+@cache
+def _over_all(function: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(function, allocates=False)
+
+
+def _density_one(n: int, deviation: NDArray, covariance: NDArray, out: NDArray) -> None:
+    out[n] = density(deviation[n, 0], deviation[n, 1], covariance[n])
+
+
 def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
     """`density` (n,) at every deviation (n, 2) under its covariance (n, 2, 2)."""
     out = np.empty(len(deviation))
-    for n in range(len(out)):
-        out[n] = density(deviation[n, 0], deviation[n, 1], covariance[n])
+    _over_all(_density_one)(len(out), deviation, covariance, out)
     return out
 
 
-@compiled
+def _circular_moments_one(n: int, x: NDArray, weights: NDArray, out: NDArray) -> None:
+    moments = circular_moments(x[n], weights[n], np.zeros((2, 2)))
+    out[n, 0], out[n, 1], out[n, 2], out[n, 3], out[n, 4] = moments
+
+
 def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
     """`circular_moments` (n, 5) of sample sets (n, samples, 2) with weights (n, samples)."""
     out = np.empty((len(x), 5))
-    for n in range(len(out)):
-        out[n] = circular_moments(x[n], weights[n], np.zeros((2, 2)))
+    _over_all(_circular_moments_one)(len(out), x, weights, out)
     return out
 
 
-@compiled
+def _mixed_mle_one(n: int, x: NDArray, weights: NDArray, out: NDArray, deviations: NDArray) -> None:
+    m1, m2, c11, c22, _ = circular_moments(x[n], weights[n], np.zeros((2, 2)))
+    c12 = mixed_mle(x[n], weights[n], m1, m2, c11, c22, deviations)
+    out[n, 0], out[n, 1], out[n, 2], out[n, 3], out[n, 4] = m1, m2, c11, c12, c22
+
+
 def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
     """Moments and `mixed_mle` (n, 5) as m1, m2, c11, c12, c22 of sample sets (n, samples, 2)."""
-    out = np.empty((len(x), 5))
-    for n in range(len(out)):
-        m1, m2, c11, c22, _ = circular_moments(x[n], weights[n], np.zeros((2, 2)))
-        out[n] = m1, m2, c11, mixed_mle(x[n], weights[n], m1, m2, c11, c22), c22
+    out, memory = np.empty((len(x), 5)), partial(np.empty, x.shape[1:])
+    _over_all(_mixed_mle_one)(len(out), x, weights, out, scratch=memory)
     return out
 
 
-@compiled
+def _product_one(
+    n: int,
+    mean: NDArray,
+    covariance: NDArray,
+    other_mean: NDArray,
+    other: NDArray,
+    out: NDArray,
+    mixture: Mixture,
+) -> None:
+    fitted = fit_product(mean[n], covariance[n], other_mean[n], other[n], mixture)
+    out[n, 0], out[n, 1], out[n, 2], out[n, 3], out[n, 4] = fitted
+
+
 def fit_product_each(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> NDArray:
     """`fit_product` (n, 5) of pairs (n, ...)."""
-    out = np.empty((len(mean), 5))
-    for n in range(len(out)):
-        out[n] = fit_product(mean[n], covariance[n], other_mean[n], other[n])
+    out, variance = np.empty((len(mean), 5)), np.einsum("nkk->nk", covariance + other)
+    memory = partial(blank_mixture, variance.max(axis=0, initial=0.0))
+    _over_all(_product_one)(len(out), mean, covariance, other_mean, other, out, scratch=memory)
     return out

@@ -47,6 +47,7 @@ def recursive(
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
     compiled: bool = True,
+    allocates: bool = True,
 ) -> Estimator[ParametersType]:
     """An estimator that follows its messages in time.
 
@@ -72,7 +73,8 @@ def recursive(
             messages: it changes that run's rows of `state`, and fills `results`, in place.
         follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
             at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
-        compiled: whether numba compiles `follow`; plain Python is a hundred times slower.
+        compiled: whether `follow` is compiled; plain Python is a hundred times slower.
+        allocates: whether `follow` makes arrays, see `replay.engine.compile.compile_over_runs`.
 
     The shortest range so far, of everything that was seen:
 
@@ -115,7 +117,9 @@ def recursive(
     @cache
     def loop() -> Callable[..., None]:
         assert follow is not None
-        return compile_over_runs(follow) if compiled else uncompiled_over_runs(follow)
+        if not compiled:
+            return uncompiled_over_runs(follow)
+        return compile_over_runs(follow, allocates=allocates)
 
     def advance_all(arguments: tuple[Any, ...], generators: Generators) -> None:
         if follow_all is not None:

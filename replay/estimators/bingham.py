@@ -19,14 +19,12 @@ from replay.distributions import bingham
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import (
     compose,
-    compose_columns,
     framed,
-    integrate,
     inverse,
+    local_moments,
     predict,
     turn_columns,
     update,
-    weighted_outer,
 )
 from replay.distributions.gaussian_kernels import condition
 from replay.engine.arrays import Floats, Integers
@@ -89,7 +87,7 @@ class GaussianNoise(NamedTuple):
 
 @cache
 def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(run_once)
+    return compile_over_runs(run_once, allocates=False)
 
 
 def run_bingham_filter(
@@ -140,7 +138,7 @@ def _bingham_run(
 ) -> None:
     axes, z = state.axes[run], state.concentrations[run]
     d = len(z)
-    moments, local, work = np.empty(d), np.empty((d, d)), np.empty((d, d))
+    moments, local = np.empty(d), np.empty((d, d))
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):
             turn_columns(axes, steps.increment[row])
@@ -153,11 +151,8 @@ def _bingham_run(
             axes[:] = np.nan
         estimates.axes[row] = axes
         estimates.concentrations[row] = z
-        # in the frame of the mode small moments keep their digits next to large ones
-        integrate(z, moments, work)
-        compose_columns(inverse(axes[:, d - 1]), axes, local)
-        weighted_outer(local, moments, work)
-        _store_rotations(work, rotations[row])
+        local_moments(axes, z, moments, local)
+        _store_rotations(local, rotations[row])
 
 
 def run_kalman_filter(
@@ -200,21 +195,37 @@ def _kalman_run(
     rotations: NDArray,
 ) -> None:
     x, p = state.mean[run], state.covariance[run]
+    d = len(x)
+    added, frame, innovation = np.empty((d, d)), np.empty(d), np.empty(d)
     for row in range(steps.offsets[run], steps.offsets[run + 1]):
         if not math.isnan(steps.increment[row, 0]):
             compose(x.copy(), steps.increment[row], x)
             turn_columns(p, steps.increment[row])
             turn_columns(p.T, steps.increment[row])
-            p += framed(noise.system, _frame(x, rotated))
+            _frame(x, rotated, frame)
+            framed(noise.system, frame, added)
+            for i in range(d):
+                for j in range(d):
+                    p[i, j] += added[i, j]
         if not math.isnan(steps.measurement[row, 0]):
+            along = 0.0
+            for i in range(d):
+                along += x[i] * steps.measurement[row, i]
             # z and -z are one axis: take the one on the side of the state
-            side = math.copysign(1.0, (x * steps.measurement[row]).sum())
-            innovation = side * steps.measurement[row] - x
-            condition(x, p, innovation, framed(noise.measurement, _frame(x, rotated)))
-            x /= math.sqrt((x * x).sum())
+            side = math.copysign(1.0, along)
+            for i in range(d):
+                innovation[i] = side * steps.measurement[row, i] - x[i]
+            _frame(x, rotated, frame)
+            framed(noise.measurement, frame, added)
+            condition(x, p, innovation, added)
+            length = _length(x)
+            for i in range(d):
+                x[i] /= length
         estimates.mean[row] = x
         estimates.covariance[row] = p
-        _store_rotations(framed(p, inverse(x)), rotations[row])
+        inverse(x, frame)
+        framed(p, frame, added)
+        _store_rotations(added, rotations[row])
 
 
 def _store_rotations(local: NDArray, covariance: NDArray) -> None:
@@ -228,8 +239,16 @@ def _store_rotations(local: NDArray, covariance: NDArray) -> None:
             covariance[i, j] = local[i + 1, j + 1] * (1.0 if t == 1 else 4.0)
 
 
-def _frame(state: NDArray, rotated: bool) -> NDArray:
-    """The state scaled to unit length where `rotated`, else the identity."""
-    frame = np.zeros(len(state))
-    frame[0] = 1.0
-    return state / math.sqrt((state * state).sum()) if rotated else frame
+def _length(x: NDArray) -> float:
+    squared = 0.0
+    for i in range(len(x)):
+        squared += x[i] * x[i]
+    return math.sqrt(squared)
+
+
+def _frame(state: NDArray, rotated: bool, frame: NDArray) -> None:
+    """Fill the state scaled to unit length where `rotated`, else the identity."""
+    length = _length(state)
+    for i in range(len(state)):
+        identity = 1.0 if i == 0 else 0.0
+        frame[i] = state[i] / length if rotated else identity

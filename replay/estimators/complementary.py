@@ -20,7 +20,7 @@ from replay.engine.arrays import Floats, Integers
 from replay.engine.given import Given, Messages, OneRun
 from replay.engine.outputs import Estimates, Results
 from replay.engine.plain import batch, each_run
-from replay.estimators.inertial import triad
+from replay.estimators.inertial import triad, unit
 from replay.estimators.orientation import FIELDS, ORIENTATION, of_inertial_samples
 
 HALF = np.sqrt(0.5)
@@ -151,19 +151,14 @@ def follow_mahony(
 
 def unit_vectors(value: Floats) -> Any:
     """The directions of force and field, and the turn rate between them."""
-    force, field = np.sqrt((value[:3] ** 2).sum()), np.sqrt((value[6:] ** 2).sum())
-    return (
-        (value[0] / force, value[1] / force, value[2] / force),
-        (value[3], value[4], value[5]),
-        (value[6] / field, value[7] / field, value[8] / field),
-    )
+    return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
 
 
 def began(run: int, messages: Messages, row: int, state: State) -> Any:
     """The orientation so far; of the first sample that of its force and field."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
-        q[:] = triad(messages.value[row, :3], messages.value[row, 6:])
+        q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
         state.time_ns[run] = messages.time_ns[row]
     return q[0], q[1], q[2], q[3]
 

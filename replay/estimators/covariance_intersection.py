@@ -4,10 +4,10 @@ Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion 
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
 Reinhardt, Hanebeck, Inverse Covariance Intersection (2017); Li, Nashashibi, Split CI (2013). A rule
 fuses K estimates of one state: scalar loops, so that networks compile it, called `fuse(count, parts,
-weights, mean, covariance) -> gap`, the last three filled, infinity where a covariance is singular.
+weights, mean, covariance, memory) -> gap`, infinity where a covariance is singular.
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -52,6 +52,18 @@ class Estimate(NamedTuple):
     mean: Floats
     covariance: Floats
     independent: Floats
+
+
+class Memory(NamedTuple):
+    """What K estimates are fused in: their informations (K, n, n), and weights (K,) to come."""
+
+    information: Floats
+    better: Floats
+
+
+def memory_for(count: int, states: int) -> Memory:
+    """Memory for the fusion of so many estimates at most."""
+    return Memory(np.empty((count, states, states)), np.empty(count))
 
 
 def inverted(matrix: Floats, inverse: Floats) -> bool:
@@ -161,7 +173,7 @@ def weigh_optimally(
     by_trace: bool,
     count: int,
     covariances: Floats,
-    information: Floats,
+    memory: Memory,
     weights: Floats,
     tolerance: float,
 ) -> float:
@@ -172,7 +184,8 @@ def weigh_optimally(
     """
     gap = np.inf
     size = covariances.shape[1]
-    covariance, slope, better = np.empty((size, size)), np.empty((size, size)), np.empty(count)
+    covariance, slope = np.empty((size, size)), np.empty((size, size))
+    information, better = memory
     for i in range(count):
         weights[i] = 1.0 / count
     for _ in range(ITERATIONS):
@@ -250,18 +263,18 @@ def weigh(
     rule: int,
     count: int,
     covariances: Floats,
-    information: Floats,
+    memory: Memory,
     weights: Floats,
     tolerance: float,
 ) -> float:
     """Fill the weights of a rule that adds up weighted informations; returns their certificate."""
     if rule in (CI_TRACE, CI_DETERMINANT):
         by_trace = rule == CI_TRACE
-        return weigh_optimally(by_trace, count, covariances, information, weights, tolerance)
+        return weigh_optimally(by_trace, count, covariances, memory, weights, tolerance)
     if rule == NIEHSEN:
         weigh_by_traces(count, covariances, weights)
     elif rule == FRANKEN:
-        weigh_by_shares(count, information, weights)
+        weigh_by_shares(count, memory.information, weights)
     else:
         weigh_fully(count, weights)
     return 0.0
@@ -275,13 +288,14 @@ def fuse_together(
     mean: Floats,
     covariance: Floats,
     tolerance: float,
+    memory: Memory,
 ) -> float:
     """Add up weighted informations."""
-    information = np.empty_like(parts.covariance)
+    information = memory.information
     for i in range(count):
         if not inverted(parts.covariance[i], information[i]):
             return np.inf
-    gap = weigh(rule, count, parts.covariance, information, weights, tolerance)
+    gap = weigh(rule, count, parts.covariance, memory, weights, tolerance)
     if not gap < np.inf or not combined(count, weights, information, parts.mean, mean, covariance):
         return np.inf
     return gap
@@ -441,6 +455,7 @@ def fuse_by(
     mean: Floats,
     covariance: Floats,
     tolerance: float,
+    memory: Memory,
 ) -> float:
     """Fuse the first `count` estimates by the rule of a number; returns the certificate.
 
@@ -450,7 +465,7 @@ def fuse_by(
     if rule in (INVERSE_CI, SPLIT_CI):
         is_split = rule == SPLIT_CI
         return fuse_in_turn(is_split, count, parts, weights, mean, covariance, tolerance)
-    return fuse_together(rule, count, parts, weights, mean, covariance, tolerance)
+    return fuse_together(rule, count, parts, weights, mean, covariance, tolerance, memory)
 
 
 def fuse_run(
@@ -461,16 +476,17 @@ def fuse_run(
     covariances: Floats,
     independents: Floats,
     fused: Fused,
+    memory: Memory,
 ) -> None:
     """Fuse the estimates of one run."""
     parts = Estimate(means[run], covariances[run], independents[run])
     mean, covariance, weights = fused.mean[run], fused.covariance[run], fused.weights[run]
-    fused.gap[run] = fuse_by(rule, means.shape[1], parts, weights, mean, covariance, tolerance)
+    fused.gap[run] = fuse_by(rule, means.shape[1], parts, weights, mean, covariance, tolerance, memory)
 
 
 @cache
 def _fuse_runs() -> Function:
-    return compile_over_runs(fuse_run)
+    return compile_over_runs(fuse_run, allocates=False)
 
 
 def fuse(
@@ -529,6 +545,7 @@ def fuse(
         covariance.reshape(runs, count, size, size),
         known.reshape(runs, count, size, size),
         fused,
+        scratch=partial(memory_for, count, size),
     )
     if np.any(np.isinf(fused.gap)):
         raise BadInput(

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from recorders.models.inertial import cross
+from recorders.models.planar import Components
 from replay.distributions.bingham_kernels import (
     Vector,
     compose,
-    compose_columns,
     integrate,
-    inverse,
+    local_moments,
     predict,
     turn_columns,
     update,
-    weighted_outer,
 )
 from replay.engine.arrays import Floats, Integers
-from replay.engine.compile import compile_over_runs, compiled
+from replay.engine.compile import compile_over_runs
 
 _NS = 1e-9
 
@@ -147,7 +147,7 @@ def start_inertial_filter(runs: int) -> InertialState:
 
 @cache
 def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(run_once)
+    return compile_over_runs(run_once, allocates=False)
 
 
 def run_inertial_filter(
@@ -194,7 +194,8 @@ def attitudes(
     Args and errors as `run_inertial_filter`.
     """
     samples, estimates = _prepared(model, samples, estimates)
-    _attitudes(samples.force, samples.field, estimates.orientation)
+    rows = len(samples.force)
+    _over_runs(_attitude)(rows, samples.force, samples.field, estimates.orientation)
     estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
     return estimates
 
@@ -216,10 +217,10 @@ def _prepared(
     return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
 
 
-@compiled
-def _attitudes(force: NDArray, field: NDArray, orientation: NDArray) -> None:
-    for row in range(len(orientation)):
-        orientation[row] = triad(force[row], field[row])
+def _attitude(row: int, force: NDArray, field: NDArray, orientation: NDArray) -> None:
+    found = triad(force[row], field[row])
+    for part in range(4):
+        orientation[row, part] = found[part]
 
 
 def _reckoning_run(
@@ -246,7 +247,7 @@ def _reckon(
     """Take in one sample; one that is not finite is passed over."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
-    if not math.isfinite(rate.sum() + force.sum() + field.sum()):
+    if not _all_finite(rate, force, field):
         return
     orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
     if times[0] < 0:
@@ -256,19 +257,33 @@ def _reckon(
     if duration_s > model.gap_s:
         orientation[:] = np.nan
     if elapsed_s < model.rest_s:
-        sums[0] += rate
-        sums[1] += force
-        sums[2] += field
+        for i in range(3):
+            sums[0, i] += rate[i]
+            sums[1, i] += force[i]
+            sums[2, i] += field[i]
         state.rest_samples[run] += 1
         return
-    if (orientation == 0.0).all():
-        orientation[:] = triad(sums[1], sums[2])
-    bias = sums[0] / max(state.rest_samples[run], 1) if unbiased else np.zeros(3)
-    x, y, z = (rate - bias) * duration_s
-    compose(orientation.copy(), _increment(x, y, z), orientation)
+    is_blank = True
+    for i in range(4):
+        is_blank = is_blank and orientation[i] == 0.0
+    if is_blank:
+        orientation[0], orientation[1], orientation[2], orientation[3] = triad(sums[1], sums[2])
+    turn, count = np.empty(3), max(state.rest_samples[run], 1)
+    for i in range(3):
+        turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
+    compose(orientation.copy(), _increment(turn[0], turn[1], turn[2]), orientation)
     estimates.orientation[row] = orientation
     variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
-    estimates.covariance[row] = variance * np.eye(3)
+    for i in range(3):
+        for j in range(3):
+            estimates.covariance[row, i, j] = variance if i == j else 0.0
+
+
+def _all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
+    total = 0.0
+    for i in range(3):
+        total += rate[i] + force[i] + field[i]
+    return math.isfinite(total)
 
 
 def _inertial_run(
@@ -294,10 +309,9 @@ def _accumulate(
 
     Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
     """
-    # scalars and tuples: making an array takes longer than what is done with it
-    time_ns, force, field = samples.time_ns[row], samples.force[row], samples.field[row]
-    x, y, z = samples.rate[row]
-    if not math.isfinite(x + y + z + force.sum() + field.sum()):
+    time_ns, rate = samples.time_ns[row], samples.rate[row]
+    force, field = samples.force[row], samples.field[row]
+    if not _all_finite(rate, force, field):
         return math.nan
     times = state.time_ns[run]
     duration_s = (time_ns - times[1]) * _NS
@@ -309,19 +323,23 @@ def _accumulate(
         _start_block(state, run, time_ns)
     times[1] = time_ns
     if (time_ns - times[0]) * _NS < model.rest_s:
-        state.rate_sum[run] += samples.rate[row]
+        for i in range(3):
+            state.rate_sum[run, i] += rate[i]
         state.rest_samples[run] += 1
     else:
-        a, b, c = state.rate_sum[run]
-        count, increment = max(state.rest_samples[run], 1), state.increment[run]
+        bias, count = state.rate_sum[run], max(state.rest_samples[run], 1)
+        increment = state.increment[run]
         step = _increment(
-            (x - a / count) * duration_s, (y - b / count) * duration_s, (z - c / count) * duration_s
+            (rate[0] - bias[0] / count) * duration_s,
+            (rate[1] - bias[1] / count) * duration_s,
+            (rate[2] - bias[2] / count) * duration_s,
         )
         compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
         _carry(step, state.force[run])
         _carry(step, state.field[run])
-    state.force[run] += force
-    state.field[run] += field
+    for i in range(3):
+        state.force[run, i] += force[i]
+        state.field[run, i] += field[i]
     return (time_ns - times[2]) * _NS
 
 
@@ -336,20 +354,23 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
     """One prediction over the block and one update with its attitude, in place."""
     axes, z = state.axes[run], state.concentrations[run]
-    moments, work = np.empty(4), np.empty((4, 4))
+    moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
         turn_columns(axes, state.increment[run])
-        integrate(_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s)), moments, work)
-        predict(axes, z, _diagonal(moments))
+        _isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
+        integrate(noise, moments, work)
+        _diagonal(moments, work)
+        predict(axes, z, work)
     attitude = triad(state.force[run], state.field[run])
     if math.isfinite(attitude[0]):
-        update(axes, z, _diagonal(_isotropic(model.attitude_sigma_rad)), attitude)
-    integrate(z, moments, work)
-    local = np.empty((4, 4))
-    compose_columns(inverse(axes[:, 3]), axes, local)
-    weighted_outer(local, moments, work)
-    # a small rotation vector is twice the vector part of its quaternion
-    state.covariance[run] = 4.0 * work[1:, 1:]
+        _isotropic(model.attitude_sigma_rad, noise)
+        _diagonal(noise, work)
+        update(axes, z, work, attitude)
+    local_moments(axes, z, moments, work)
+    for i in range(3):
+        for j in range(3):
+            # a small rotation vector is twice the vector part of its quaternion
+            state.covariance[run, i, j] = 4.0 * work[i + 1, j + 1]
     _start_block(state, run, state.time_ns[run, 1])
 
 
@@ -374,11 +395,10 @@ def _dead_reckon(
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
 
 
-def _isotropic(sigma_rad: float) -> NDArray:
-    """Concentrations about the identity, in the order of a quaternion's components."""
-    z = np.full(4, -2.0 / sigma_rad**2)
+def _isotropic(sigma_rad: float, z: NDArray) -> None:
+    """Fill concentrations about the identity, in the order of a quaternion's components."""
+    z[:] = -2.0 / sigma_rad**2
     z[0] = 0.0
-    return z
 
 
 def _increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
@@ -392,42 +412,40 @@ def _increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, 
 def _carry(turned: Vector, vector: NDArray) -> None:
     """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
-    a, b, c = vector
+    a, b, c = vector[0], vector[1], vector[2]
     d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     vector[0] = a + w * d + y * f - z * e
     vector[1] = b + w * e + z * d - x * f
     vector[2] = c + w * f + x * e - y * d
 
 
-def triad(force: NDArray, field: NDArray) -> NDArray:
-    """The orientation (4,) under which force points up and field north; NaN where they are parallel."""
-    up = force / math.sqrt((force**2).sum())
-    east = _cross(field, up)
-    east /= math.sqrt((east**2).sum())
-    north = _cross(up, east)
+def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
+    """The orientation under which force points up and field north; NaN where they are parallel."""
+    up = unit(force)
+    east = unit(cross(field, up))
+    north = cross(up, east)
     # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
-    outer = np.array(
-        (
-            (1.0 + east[0] + north[1] + up[2], up[1] - north[2], east[2] - up[0], north[0] - east[1]),
-            (up[1] - north[2], 1.0 + east[0] - north[1] - up[2], east[1] + north[0], east[2] + up[0]),
-            (east[2] - up[0], east[1] + north[0], 1.0 - east[0] + north[1] - up[2], north[2] + up[1]),
-            (north[0] - east[1], east[2] + up[0], north[2] + up[1], 1.0 - east[0] - north[1] + up[2]),
-        )
-    )
-    best = 0
-    for i in range(1, 4):
-        if outer[i, i] > outer[best, best]:
-            best = i
-    column = outer[best]
-    return column / math.sqrt((column**2).sum())
+    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
+    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
+    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
+    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
+    column, most = (w, a, b, c), w
+    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
+        if size > most:
+            column, most = other, size
+    w, x, y, z = column
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length
 
 
-def _cross(a: NDArray, b: NDArray) -> NDArray:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+def unit(vector: Components) -> Components:
+    """The direction of a vector of three components; NaN where it has none."""
+    x, y, z = vector[0], vector[1], vector[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
 
 
-def _diagonal(values: NDArray) -> NDArray:
-    out = np.zeros((len(values), len(values)))
+def _diagonal(values: NDArray, out: NDArray) -> None:
+    out[:] = 0.0
     for i in range(len(values)):
         out[i, i] = values[i]
-    return out

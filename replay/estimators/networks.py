@@ -29,10 +29,12 @@ from replay.engine.priors import gaussians
 from replay.engine.results import ALL_WELL, failures_of, states_in
 from replay.estimators.covariance_intersection import (
     Estimate,
+    Memory,
     blend,
     determinant,
     fuse_by,
     inverted,
+    memory_for,
     one_of,
     rule_number,
 )
@@ -141,6 +143,33 @@ class Nodes(NamedTuple):
     said_ns: Integers
     said_mean: Floats
     said_covariance: Floats
+
+
+class Work(NamedTuple):
+    """What one core works in: the nodes of a run, and what one of them fuses, with weights (most,)."""
+
+    nodes: Nodes
+    parts: Estimate
+    weights: Floats
+    memory: Memory
+
+
+def work_for(nodes: int, most: int, states: int) -> Work:
+    """Memory for so many nodes, of which each fuses so many estimates at most."""
+    square, many = (nodes, states, states), (most, states, states)
+    return Work(
+        Nodes(
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+        ),
+        Estimate(np.empty((most, states)), np.empty(many), np.empty(many)),
+        np.empty(most),
+        memory_for(most, states),
+    )
 
 
 class Results(NamedTuple):
@@ -260,28 +289,17 @@ def follow(
     fusion: Fusion,
     results: Results,
     failed_ns: Integers,
+    work: Work,
 ) -> None:
     """Move the nodes of one run through their activities, until these end or a fusion fails.
 
     At every time all nodes send first, and then take in what they hear.
     """
-    count, size = len(sensing.density), prior_mean.shape[1]
-    nodes = Nodes(
-        np.full(count, prior_ns[run]),
-        np.empty((count, size)),
-        np.empty((count, size, size)),
-        np.full(count, -1),
-        np.empty((count, size)),
-        np.empty((count, size, size)),
-    )
-    for node in range(count):
+    nodes, parts, weights, memory = work
+    nodes.time_ns[:], nodes.said_ns[:] = prior_ns[run], -1
+    for node in range(len(nodes.mean)):
         copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
     begin, last = activities.offsets[run], activities.offsets[run + 1]
-    most = 1
-    for activity in range(begin, last):
-        most = max(most, 1 + activities.received[activity + 1] - activities.received[activity])
-    weights, square = np.empty(most), (most, size, size)
-    parts = Estimate(np.empty((most, size)), np.empty(square), np.empty(square))
     while begin < last:
         now = activities.time_ns[begin]
         end = begin
@@ -293,7 +311,8 @@ def follow(
             mean, covariance = nodes.mean[node], nodes.covariance[node]
             heard = hear(activity, activities, sensing, fusion, nodes, parts, results)
             if heard > 1:
-                gap = fuse_by(fusion.rule, heard, parts, weights, mean, covariance, fusion.tolerance)
+                rule, tolerance = fusion.rule, fusion.tolerance
+                gap = fuse_by(rule, heard, parts, weights, mean, covariance, tolerance, memory)
                 if not gap < np.inf:
                     failed_ns[run] = now
                     return
@@ -394,7 +413,7 @@ def hear(
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(follow)
+    return compile_over_runs(follow, allocates=False)
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> Fusion:
@@ -453,6 +472,7 @@ def solve(
         np.zeros(len(arrived), bool),
     )
     failed_ns = np.full(runs, -1)
+    most = 1 + int(np.diff(activities.received).max(initial=0))
     _compiled()(
         runs,
         activities,
@@ -463,6 +483,7 @@ def solve(
         _fusion(parameters, sensors, size),
         results,
         failed_ns,
+        scratch=partial(work_for, len(sensing.density), most, size),
     )
     well = np.full_like(failed_ns, ALL_WELL)
     outputs = [

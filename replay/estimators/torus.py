@@ -8,7 +8,7 @@ an update with its measurement (2,) unless that is NaN, or with its first angle 
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,8 @@ from replay.distributions.wrapped_normal import (
 from replay.distributions.wrapped_normal_kernels import (
     TURN,
     UNIFORM,
+    Mixture,
+    blank_mixture,
     fit_product,
     fit_samples,
     five_samples,
@@ -130,7 +132,12 @@ def _run(
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
     rows = np.ascontiguousarray(measurement)
-    _over_runs(step, motion)(len(offsets) - 1, model, option, offsets, rows, state, estimates)
+    # a fit to samples is no wider than a uniform distribution
+    most = UNIFORM + np.diagonal(model.system) + np.maximum(np.diagonal(model.measurement), UNIFORM)
+    memory = partial(blank_mixture, most)
+    _over_runs(step, motion)(
+        len(offsets) - 1, model, option, offsets, rows, state, estimates, scratch=memory
+    )
     return state, estimates
 
 
@@ -146,13 +153,14 @@ def _over_runs(step: Callable[..., None], motion: Motion) -> Callable[..., None]
         measurement: Floats,
         state: WrappedNormal,
         estimates: WrappedNormal,
+        mixture: Mixture,
     ) -> None:
         for row in range(offsets[run], offsets[run + 1]):
-            step(motion, model, option, measurement[row], state, run)
+            step(motion, model, option, measurement[row], state, run, mixture)
             estimates.mean[row] = state.mean[run]
             estimates.covariance[row] = state.covariance[run]
 
-    return compile_over_runs(run_once)
+    return compile_over_runs(run_once, allocates=False)
 
 
 def _toroidal_step(
@@ -162,25 +170,34 @@ def _toroidal_step(
     z: NDArray,
     state: WrappedNormal,
     run: int,
+    mixture: Mixture,
 ) -> None:
     mean, covariance = state.mean[run], state.covariance[run]
-    x, weights = five_samples(mean, covariance, central_weight)
+    x, weights = np.empty((5, 2)), np.empty(5)
+    five_samples(mean, covariance, central_weight, x, weights)
     _move(motion, model, x)
     _store(fit_samples(x, weights), mean, covariance)
-    covariance += model.system
+    for i in range(2):
+        for j in range(2):
+            covariance[i, j] += model.system[i, j]
     if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
         # no distribution: NaN stays, all later rows of the run are NaN as well
         mean[:], covariance[:] = np.nan, np.nan
     elif not math.isnan(z[0]):
-        measured, noise = _measured(z, model.measurement, UNIFORM)
-        _store(fit_product(mean, covariance, measured, noise), mean, covariance)
+        measured, noise = np.empty(2), np.empty((2, 2))
+        _take(z, model.measurement, UNIFORM, measured, noise)
+        _store(fit_product(mean, covariance, measured, noise, mixture), mean, covariance)
 
 
-def _measured(z: NDArray, noise: NDArray, vague: float) -> tuple[NDArray, NDArray]:
-    """A measurement and its covariance; that of a missing angle is so wide that it tells nothing."""
-    if not math.isnan(z[1]):
-        return z, noise
-    return np.array([z[0], 0.0]), np.array([[noise[0, 0], 0.0], [0.0, vague]])
+def _take(z: NDArray, noise: NDArray, vague: float, measured: NDArray, covariance: NDArray) -> None:
+    """Fill a measurement and its covariance, so wide for a missing angle that it tells nothing."""
+    is_whole = not math.isnan(z[1])
+    for i in range(2):
+        measured[i] = z[i] if is_whole or i == 0 else 0.0
+        for j in range(2):
+            covariance[i, j] = noise[i, j] if is_whole or i + j == 0 else 0.0
+    if not is_whole:
+        covariance[1, 1] = vague
 
 
 def _move(motion: Motion, model: HeadingModel, x: NDArray) -> None:
@@ -198,15 +215,21 @@ def _store(
 
 
 def _unscented_step(
-    motion: Motion, model: HeadingModel, wrapped: bool, z: NDArray, state: WrappedNormal, run: int
+    motion: Motion,
+    model: HeadingModel,
+    wrapped: bool,
+    z: NDArray,
+    state: WrappedNormal,
+    run: int,
+    mixture: Mixture,
 ) -> None:
-    mean, covariance = state.mean[run], state.covariance[run]
-    x = _sigma_points(mean, covariance)
+    mean, covariance, x = state.mean[run], state.covariance[run], np.empty((5, 2))
+    _fill_sigma_points(mean, covariance, x)
     _move(motion, model, x)
-    if not wrapped:
-        x %= TURN
-    for k in range(2):  # scalar loops: arrays would take longer than what is in them
+    for k in range(2):
         mean[k] = 0.0
+        for n in range(len(x)):
+            x[n, k] = x[n, k] if wrapped else x[n, k] % TURN
         for n in range(len(x)):
             mean[k] += x[n, k] / len(x)
     for i in range(2):
@@ -216,8 +239,8 @@ def _unscented_step(
                 spread += (x[n, i] - mean[i]) * (x[n, j] - mean[j])
             covariance[i, j] = covariance[j, i] = spread / len(x) + model.system[i, j]
     if not math.isnan(z[0]):
-        measured, noise = _measured(z, model.measurement, _VAGUE)
-        innovation = np.empty(2)
+        measured, noise, innovation = np.empty(2), np.empty((2, 2)), np.empty(2)
+        _take(z, model.measurement, _VAGUE, measured, noise)
         for k in range(2):
             innovation[k] = wrap_angle(measured[k] - mean[k]) if wrapped else measured[k] - mean[k]
         condition(mean, covariance, innovation, noise)
@@ -225,13 +248,11 @@ def _unscented_step(
         mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
 
 
-def _sigma_points(mean: NDArray, covariance: NDArray) -> NDArray:
-    """The mean, and the mean plus and minus sqrt(5 / 2) times the columns of the Cholesky factor."""
+def _fill_sigma_points(mean: NDArray, covariance: NDArray, x: NDArray) -> None:
+    """Fill the mean, and it plus and minus sqrt(5 / 2) times the columns of the Cholesky factor."""
     first = math.sqrt(2.5 * covariance[0, 0])
     below = 2.5 * covariance[0, 1] / first
     second = math.sqrt(2.5 * covariance[1, 1] - below * below)
-    x = np.empty((5, 2))
     for n, (along, across) in enumerate(((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))):
         x[n, 0] = mean[0] + along * first
         x[n, 1] = mean[1] + along * below + across * second
-    return x

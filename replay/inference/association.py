@@ -14,13 +14,14 @@ JPDA: Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Eng. 8(3), 1983. JIPDA: Mus
 IEEE TAES 50(4), 2014.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput, choices
-from replay.engine.arrays import Booleans, Floats, Integers, varying
+from replay.engine.arrays import Booleans, Floats, Function, Integers, varying
 from replay.engine.compile import compiled
 
 # Clusters in which both tracks and detections are more than this are left to belief propagation.
@@ -417,6 +418,11 @@ def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda")
     if association not in ASSOCIATIONS:
         raise BadInput(f"no association '{association}'; {choices(association, ASSOCIATIONS)}")
     probability = np.empty((tracks, 1 + detections))
-    call = compiled(ASSOCIATIONS[association])
-    call(weights, tracks, detections, probability, memory_for(tracks, detections))
+    memory = memory_for(tracks, detections)
+    _compiled(association)(weights, tracks, detections, probability, memory)
     return probability
+
+
+@cache
+def _compiled(association: str) -> Function:
+    return compiled(ASSOCIATIONS[association], allocates=False)

@@ -90,7 +90,7 @@ def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
     )
 
 
-_draw_normals = compiled(fill_normals)
+_draw_normals = compiled(fill_normals, allocates=False)
 
 
 class ParticleFilter(Filter):

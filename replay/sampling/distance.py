@@ -68,7 +68,9 @@ def lcd_distance_and_gradient(points: Array, weights: Array) -> tuple[float, Arr
     rates, factors, constant = _quadrature(points.shape[1])
     decays = np.expm1(-np.multiply.outer(np.sum(points**2, axis=1), rates))
     pulls = 4 * np.vecdot(decays + 1, factors * rates)
-    pairs, pair_gradient = _pair_sum(np.ascontiguousarray(points.T), weights)
+    coordinates = np.ascontiguousarray(points.T)
+    pair_gradient, work = np.zeros(coordinates.shape), np.zeros((3 + len(points), len(points)))
+    pairs = _pair_sum(coordinates, weights, pair_gradient, work)
     distance = constant - 2 * weights @ np.vecdot(decays, factors) + pairs
     return float(distance), (weights * pulls)[:, None] * points + pair_gradient.T
 
@@ -93,12 +95,13 @@ def _quadrature(dimension: int) -> _Quadrature:
 # instructions without reordering. With fastmath the bytes depended on whether numba's cache was warm.
 
 
-@compiled
-def _pair_sum(coordinates: Array, weights: Array) -> tuple[float, Array]:
-    """Sum B^2/2 w_i w_j (E2 - 1) over all i, j, and its gradient (N, L), for coordinates (N, L)."""
+def _sum_pairs(coordinates: Array, weights: Array, gradient: Array, work: Array) -> float:
+    """Sum B^2/2 w_i w_j (E2 - 1) over all i, j; adds its gradient (N, L), for coordinates (N, L).
+
+    `work` (3 + L, L) is 0.
+    """
     dimension, count = coordinates.shape
-    u, e1, e2 = np.empty(count), np.empty(count), np.empty(count)
-    pulls = np.zeros((count, count))
+    u, e1, e2, pulls = work[0], work[1], work[2], work[3:]
     total = 0.0
     for i in range(1, count):
         u[:i] = 0.0
@@ -111,12 +114,14 @@ def _pair_sum(coordinates: Array, weights: Array) -> tuple[float, Array]:
         for j in range(i):
             total += weights[i] * weights[j] * e2[j]
             pulls[i, j] = pulls[j, i] = weights[i] * weights[j] * e1[j] / 2
-    gradient = np.zeros((dimension, count))
     for axis in range(dimension):
         for j in range(count):
             for i in range(count):
                 gradient[axis, i] += pulls[j, i] * (coordinates[axis, j] - coordinates[axis, i])
-    return B_MAX**2 * total, gradient
+    return B_MAX**2 * total
+
+
+_pair_sum = compiled(_sum_pairs, allocates=False)
 
 
 def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:

@@ -20,12 +20,22 @@ from replay.engine.kernels.numbers import (
     binary,
     common_kind,
     compare,
+    constant,
     inverse,
     is_static,
     negative,
 )
 from replay.engine.kernels.program import Program, definition_of
 from replay.engine.kernels.values import Array, Record, entries, load, made, part_of, store
+
+
+def _is_in(x: Any, many: Any) -> bool:
+    return x in many
+
+
+def _is_not_in(x: Any, many: Any) -> bool:
+    return x not in many
+
 
 _OPERATORS: dict[type[ast.AST], Any] = {
     ast.Add: operator.add,
@@ -48,8 +58,8 @@ _OPERATORS: dict[type[ast.AST], Any] = {
     ast.NotEq: operator.ne,
     ast.Is: operator.is_,
     ast.IsNot: operator.is_not,
-    ast.In: lambda x, y: x in y,
-    ast.NotIn: lambda x, y: x not in y,
+    ast.In: _is_in,
+    ast.NotIn: _is_not_in,
 }
 
 # Functions that make arrays, and whether these are zero.
@@ -266,6 +276,12 @@ class Expressions:
         if operation in (operator.is_, operator.is_not):
             return operation is operator.is_not
         parts, others = entries(left), entries(right)
+        if operation in (_is_in, _is_not_in):
+            alike = constant(False)
+            for each in others or ():
+                same = self.emitter.truth(self.compared(operator.eq, left, each))
+                alike = binary(self.emitter, operator.or_, alike, same)
+            return alike if operation is _is_in else inverse(self.emitter, alike)
         if parts is None or others is None:
             return compare(self.emitter, operation, self.scalar(left), self.scalar(right))
         if operation not in (operator.eq, operator.ne) or len(parts) != len(others):
@@ -377,6 +393,8 @@ class Expressions:
             new = {each.arg: self.value(each.value) for each in node.keywords}
             names = owner.type._fields
             return Record(owner.type, tuple(new.get(name, owner.get(name)) for name in names))
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "copy":
+            return self.copied(self.value(node.func.value))
         function = self.value(node.func)
         arguments = list(self.listed(node.args))
         named = {each.arg: self.value(each.value) for each in node.keywords if each.arg}
@@ -425,6 +443,12 @@ class Expressions:
         if is_zero:
             self.fill(array, 0)
         return array
+
+    def copied(self, array: Array) -> Array:
+        """`array.copy()`, of known sizes: there until the function returns."""
+        copy = self.new_array(array, is_zero=False)
+        self.fill(copy, array)
+        return copy
 
     def fill(self, place: Array, value: Any) -> None:
         """Write a number to every place of an array."""

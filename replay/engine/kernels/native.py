@@ -19,7 +19,7 @@ from pathlib import Path
 from struct import Struct
 from threading import Lock
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -35,6 +35,7 @@ from replay.engine.kernels.telling import compiling
 from replay.engine.kernels.values import STORED, Array, Record, combined
 
 KNOWN = 64  # sizes up to this are part of a kernel
+_ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
 
 
@@ -47,12 +48,17 @@ class Kernel:
         self._loaded: dict[Any, Callable[..., Any]] = {}
         self._lock = Lock()
 
-    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
-        """The loop over the runs from `first` up to `end` for these arguments, which it holds."""
+    def of(
+        self, arguments: Sequence[Any], scratch: Sequence[Any] = (), varies: int = 1
+    ) -> Callable[[int, int], None]:
+        """The loop over the runs from `first` up to `end` for these arguments, which it holds.
+
+        So many first axes of arrays vary, none of those in `scratch`; see `_describe`.
+        """
         kinds: list[Any] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Any] = []
         for each in arguments:
-            _describe(each, 1, kinds, numbers)
+            _describe(each, varies, kinds, numbers)
         for each in scratch:
             _describe(each, 0, kinds, numbers)
         key = tuple(kinds)
@@ -79,6 +85,39 @@ class Kernel:
         if key not in self._loaded:
             self._loaded[key] = (_checked_entry if is_checked else _entry)(self._function, described)
         return Struct(f"={''.join(map(_letters, described))}"), self._loaded[key]
+
+
+def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that makes no arrays, for Python; no size of the arrays that it is given is known.
+
+    It returns nothing, or a number of the kind that its annotation says.
+    """
+    said = function.__annotations__.get("return", "")
+    returned = said if isinstance(said, str) else getattr(said, "__name__", str(said))
+    if returned not in ("float", "int", "bool", "None"):
+        raise BadInput(
+            f"{function.__qualname__} does not say what it returns; annotate it with '-> float', "
+            "'-> int', '-> bool' or '-> None'"
+        )
+
+    def call(run: int, arguments: tuple[Any, ...]) -> None:  # noqa: ARG001
+        function(*arguments)
+
+    def evaluate(run: int, arguments: tuple[Any, ...], found: np.ndarray) -> None:
+        found[run] = function(*arguments)
+
+    once = call if returned == "None" else evaluate
+    once.__module__, once.__name__ = function.__module__, function.__name__
+    kernel = Kernel(cast(FunctionType, once))
+
+    def called(*arguments: Any) -> Any:
+        if returned == "None":
+            return kernel.of((arguments,), varies=_ALL)(0, 1)
+        found = np.empty(1, returned)
+        kernel.of((arguments, found), varies=_ALL)(0, 1)
+        return found[0].item()
+
+    return called
 
 
 # --- arguments --------------------------------------------------------------------------------------

@@ -421,7 +421,6 @@ FUNCTIONS: dict[Any, Callable[..., Any]] = {
     **{getattr(np, name): partial(_of_reals, name) for name in _LIBM},
     **{function: partial(_of_reals, name) for function, name in _LIBM_RENAMED.items()},
     math.frexp: _frexp,
-    math.sqrt: partial(_of_reals, "llvm.sqrt.f64"),
     np.add: _operator(operator.add),
     np.subtract: _operator(operator.sub),
     np.multiply: _operator(operator.mul),
@@ -488,4 +487,13 @@ FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.int64: lambda emitter, x: emitter.as_kind(x, WHOLE),
     np.uint64: lambda emitter, x: emitter.as_kind(x, WORD),
     bool: lambda emitter, x: emitter.truth(x),
+}
+# Python's own functions of the same names.
+FUNCTIONS |= {
+    getattr(math, name): FUNCTIONS[getattr(np, name)]
+    for name in (
+        *("sqrt", "exp", "exp2", "sin", "cos", "log", "log2", "log10", *_LIBM),
+        *("asin", "acos", "atan", "atan2", "asinh", "acosh", "atanh", "hypot", "copysign", "fabs"),
+        *("isnan", "isfinite", "isinf"),
+    )
 }

@@ -14,7 +14,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.kernels.numbers import WHOLE, Emitter, Number
-from replay.engine.kernels.values import Array, leaves, rebuilt, signature, table
+from replay.engine.kernels.values import Array, is_local, leaves, placed, rebuilt, signature, table
 
 FEW = 30  # lines of a function that is always written where it is called
 
@@ -88,8 +88,8 @@ class Program:
             self._open.pop()
             types = [types for _, types in parameters]
             self.instances[key] = self.define(function.__name__, own, types, returned)
-        instance = self.instances[key]
-        return called(emitter, instance, arguments)
+        result = called(emitter, self.instances[key], arguments)
+        return placed(result, is_local=True) if any(map(is_local, arguments)) else result
 
     def define(
         self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Any
@@ -126,7 +126,8 @@ class Program:
     def _parameter(self, index: int, value: Any) -> tuple[Any, list[tuple[str, str]]]:
         """An argument as the function that it is given to knows it, and its leaves there."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
-        return rebuilt(_unsure(value), iter([code for _, code in found])), found
+        known = placed(_unsure(value), is_local=False)
+        return rebuilt(known, iter([code for _, code in found])), found
 
 
 def _unsure(value: Any) -> Any:

@@ -7,7 +7,7 @@ numbers and, of an array, where it is and the sizes that are not known before.
 
 import operator
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
@@ -277,3 +277,16 @@ def is_local(value: Any) -> bool:
     if isinstance(value, Array):
         return value.is_local
     return any(map(is_local, entries(value) or ()))
+
+
+def placed(value: Any, *, is_local: bool) -> Any:
+    """The value with arrays that are, or are not, gone when the function at hand returns.
+
+    What a function is given stays when it returns, and may be part of what that is.
+    """
+    if isinstance(value, Array):
+        return replace(value, is_local=is_local)
+    if isinstance(value, Record):
+        return Record(value.type, tuple(placed(each, is_local=is_local) for each in value.values))
+    parts = entries(value)
+    return value if parts is None else tuple(placed(each, is_local=is_local) for each in parts)

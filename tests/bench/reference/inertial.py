@@ -16,7 +16,6 @@ from replay.distributions.bingham_kernels import (
     compose,
     compose_columns,
     integrate,
-    inverse,
     predict,
     turn_columns,
     update,
@@ -206,7 +205,7 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
         update(axes, z, _diagonal(_isotropic(model.attitude_sigma_rad)), attitude)
     integrate(z, moments, work)
     local = np.empty((4, 4))
-    compose_columns(inverse(axes[:, 3]), axes, local)
+    compose_columns(_inverse(axes[:, 3]), axes, local)
     weighted_outer(local, moments, work)
     # a small rotation vector is twice the vector part of its quaternion
     state.covariance[run] = 4.0 * work[1:, 1:]
@@ -232,6 +231,12 @@ def _dead_reckon(
     for i in range(3):
         _carry(increment, covariance[:, i])
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
+
+
+def _inverse(x: NDArray) -> NDArray:
+    out = -x
+    out[0] = x[0]
+    return out
 
 
 def _isotropic(sigma_rad: float) -> NDArray:

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from replay.distributions.gaussian_kernels import condition
 from replay.distributions.wrapped_normal import WrappedNormal
-from replay.distributions.wrapped_normal_kernels import TURN, fit_product, fit_samples, five_samples
+from replay.distributions.wrapped_normal_kernels import (
+    TURN,
+    blank_mixture,
+    fit_product,
+    fit_samples,
+    five_samples,
+)
 from replay.engine.compile import compile_over_runs
 from tests.bench.reference.gaussian import wrap_angle
 
@@ -68,7 +74,8 @@ def toroidal_step(
     model: HeadingModel, central_weight: float, z: NDArray, state: WrappedNormal, run: int
 ) -> None:
     mean, covariance = state.mean[run], state.covariance[run]
-    x, weights = five_samples(mean, covariance, central_weight)
+    x, weights = np.empty((5, 2)), np.empty(5)
+    five_samples(mean, covariance, central_weight, x, weights)
     _move(model, x)
     _store(fit_samples(x, weights), mean, covariance)
     covariance += model.system
@@ -76,7 +83,8 @@ def toroidal_step(
         # no distribution: NaN stays, all later rows of the run are NaN as well
         mean[:], covariance[:] = np.nan, np.nan
     elif not math.isnan(z[0]):
-        _store(fit_product(mean, covariance, z, model.measurement), mean, covariance)
+        mixture = blank_mixture(np.diag(covariance + model.measurement))
+        _store(fit_product(mean, covariance, z, model.measurement, mixture), mean, covariance)
 
 
 def _move(model: HeadingModel, x: NDArray) -> None:

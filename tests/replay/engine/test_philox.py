@@ -7,7 +7,7 @@ from scipy import stats
 from replay.engine.compile import compiled
 from replay.engine.philox import fill_normals, philox, run_key
 
-normals = compiled(fill_normals)
+normals = compiled(fill_normals, allocates=False)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The parts of Gaussian filters, uncompiled and in sizes of no family, beside NumPy's algebra."""
 
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from replay.inference.gaussian import cholesky
 from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
 from replay.inference.recursion import fault_of
 from replay.inference.sensor_steps import kalman_update
-from replay.inference.stage import stage_of
+from replay.inference.stage import Stage, stage_of
 from replay.inference.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
@@ -77,7 +78,7 @@ def correct(
     """The Kalman update by an innovation v with covariance S and cross-covariance C."""
     sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, all_linear("z", len(v)), nothing)
     motion = Motion(nothing)
-    stage = stage_of(
+    stage = Stage(
         Model("", all_linear("x", len(mean)), ModelParameters, (sensor,), motion), motion, (sensor,)
     )
 
@@ -90,7 +91,7 @@ def correct(
 
     note = empty_note(len(v))
     update = kalman_update(stage, 0, innovate)
-    plain = Noise(np.empty(0), np.empty(0))  # no robust update
+    plain = noise_of(np.empty(0), np.empty(0))  # no robust update
     return update(mean, covariance, v, plain, gate, 0, workspace(stage), note), note
 
 
@@ -148,14 +149,13 @@ def test_every_entry_of_an_estimate_is_looked_at(bad: float):
 # Linear models: every filter is exact, whatever its samples.
 
 
-class Noise(NamedTuple):
-    """What the functions of `Linear` get as parameters."""
+ROBUST = ("inflate_nis", "student_freedom", "switch_nis")
 
-    density: Floats
-    variance: Floats
-    inflate_nis: float = np.nan
-    student_freedom: float = np.nan
-    switch_nis: float = np.nan
+
+def noise_of(density: Floats, variance: Floats) -> Any:
+    """What the functions of `Linear` get as parameters."""
+    fields = (*names("density", len(density)), *names("variance", len(variance)), *ROBUST)
+    return namedtuple("Noise", fields)(*density, *variance, *[np.nan] * len(ROBUST))
 
 
 def times(matrix: Floats, vector: Any) -> tuple[Any, ...]:
@@ -176,18 +176,18 @@ class Linear(NamedTuple):
         """As component-first functions."""
         states, controls, components = len(self.transition), self.control.shape[1], len(self.look)
 
-        def move(x: Any, u: Any, duration: float, _: Noise) -> tuple[Any, ...]:
+        def move(x: Any, u: Any, duration: float, _: Any) -> tuple[Any, ...]:
             driven = times(duration * self.control, u)
             return tuple(a + b for a, b in zip(times(self.transition, x), driven, strict=True))
 
-        def measure(x: Any, target: Any, _: Noise) -> tuple[Any, ...]:
+        def measure(x: Any, target: Any, _: Any) -> tuple[Any, ...]:
             return times(self.look, [a - b for a, b in zip(x, target, strict=True)])
 
-        def control_noise(duration: float, noise: Noise) -> tuple[float, ...]:
-            return tuple(noise.density**2 / duration)
+        def control_noise(duration: float, noise: Any) -> tuple[float, ...]:
+            return tuple(getattr(noise, each) ** 2 / duration for each in names("density", controls))
 
-        def variances(noise: Noise) -> tuple[float, ...]:
-            return tuple(noise.variance)
+        def variances(noise: Any) -> tuple[float, ...]:
+            return tuple(getattr(noise, each) for each in names("variance", components))
 
         measured = {**all_linear("z", components), f"z{components - 1}": "angle"}
         targets = Map("/targets", schemas.LANDMARK, "landmark_id", "position_m", all_linear("p", states))
@@ -197,7 +197,8 @@ class Linear(NamedTuple):
         control = Control("control", schema, names("u", controls))
         state = all_linear("x", states)
         model = Model("", state, ModelParameters, (sensor,), motion, control=control)
-        return stage_of(model, motion, (sensor,))
+        own = (*names("density", controls), *names("variance", components))
+        return stage_of(model, motion, (sensor,), names=own)
 
 
 def one_set(dimension: int, kappa: float) -> SampleSets:
@@ -224,7 +225,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
     x, p = generator.normal(size=states), positive_definite(generator, states)
     u, density = generator.normal(size=controls), generator.uniform(size=controls)
     variance = generator.uniform(0.01, 1.0, size=components)
-    noise = Noise(density, variance)
+    noise = noise_of(density, variance)
     belief = Gaussian(x[None].copy(), p[None].copy())
     assert steps.predict(0, belief, u, 0.5, noise, 0, work)
     gain = 0.5 * linear.control
@@ -250,7 +251,7 @@ def test_sampling_says_where_the_covariance_is_none():
     steps = METHODS["ukf"].steps(Linear(np.eye(2), np.eye(2), np.eye(2)).stage())
     work = steps.memory((one_set(2, 0.0),) * 2)
     one = np.ones(2)
-    noise, belief = Noise(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])
+    noise, belief = noise_of(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])
     assert not steps.predict(0, belief, one, 1.0, noise, 0, work)
     update = steps.updates[0]
     told = update(0, belief, np.ones(4), noise, np.full(3, np.inf), 0, work, empty_note(2))
