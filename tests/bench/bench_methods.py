@@ -1,57 +1,38 @@
-"""What exact derivatives cost beside Jacobians by hand, modes beside one motion, and a first use.
+"""What derivatives of the graph cost beside Jacobians by hand, and modes beside one motion.
 
 The loops of the filters alone, on columns that are ready; CPU time of all cores together, medians of
-turns. Compiling is measured in a process of its own with an empty cache, loading in a second one. Run it
-with `make bench`, or `python -m tests.bench methods`.
+turns. Run it with `make bench`, or `python -m tests.bench methods`.
 """
 
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from os import environ
 from typing import Any
 
 import numpy as np
 
 from pipeline.ensemble import record_ensemble
 from recorders.parameters import build
-from replay.engine.estimator import Bound, bind
+from replay.engine.estimator import Bound
 from replay.engine.sources import MemorySource
 from replay.estimators.landmarks import ROBOT
 from replay.estimators.vehicle_kalman import VEHICLE
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
 from replay.inference.model import Model, Switching
-from tests.bench.loops import Call, calls_of, first_use_s
+from tests.bench.loops import Call, calls_of
 from tests.bench.reference.landmarks import fill_motion_jacobians, fill_sensor_jacobian
 from tests.bench.timing import cpu_seconds
 
 Row = tuple[str, str, str, str]
-COMPILES_S, LOADS_S = 15.0, 1.0  # what a first and a second use may take
-# scenario, its parameters, estimator
-USED: tuple[tuple[str, Mapping[str, Any], str], ...] = (
-    *(
-        ("landmarks", {"duration_s": 2.0}, method)
-        for method in ("ekf", "iekf", "ukf", "smoother:iterated")
-    ),
-    ("batch-reactor", {}, "ekf"),
-    ("batch-reactor", {}, "lrkf:ukf"),
-    ("batch-reactor", {}, "analytic"),
-    ("extended-target", {}, "lrkf:ukf"),
-    ("vehicles", {"duration_s": 10.0}, "vehicle-kalman"),
-)
 
 
 def main() -> list[Row]:
-    """Microseconds per step with jets and by hand, and CPU seconds of first uses."""
+    """Microseconds per step with derivatives of the graph and by hand, with modes and without."""
     return [
         *derivatives({"duration_s": 300.0}, 1),
         *derivatives({"duration_s": 20.0}, 1000),
         *interacting(),
-        *uses(),
     ]
 
 
@@ -78,18 +59,20 @@ def bind_robot(model: Model, sources: list[MemorySource]) -> list[Bound]:
 
 
 def derivatives(parameters: Mapping[str, Any], runs: int) -> list[Row]:
-    """The extended Kalman filter of a robot, with jets and with Jacobians by hand."""
+    """The extended Kalman filter of a robot, with derivatives of the graph and by hand."""
     sources = record_ensemble("landmarks", parameters, 1, runs)
     ways: dict[str, Callable[[], Any]] = {}
-    for name, model in {"jets": ROBOT, "by hand": by_hand(ROBOT)}.items():
+    for name, model in {"graph": ROBOT, "by hand": by_hand(ROBOT)}.items():
         [ways[name]] = calls_of(bind_robot(model, sources), sources)
     means = {name: way() for name, way in ways.items()}
-    apart = np.max(np.abs(means["jets"] - means["by hand"]))
-    assert apart < 1e-9, f"jets and Jacobians by hand are {apart} apart"
+    apart = np.max(np.abs(means["graph"] - means["by hand"]))
+    assert apart < 1e-9, f"derivatives of the graph and by hand are {apart} apart"
     us = {name: 1e6 * s / len(means[name]) for name, s in cpu_seconds(ways).items()}
-    what = f"EKF, jets; Jacobians by hand, {'one log' if runs == 1 else f'{runs} runs'}"
+    what = (
+        f"EKF, derivatives of the graph; Jacobians by hand, {'one log' if runs == 1 else f'{runs} runs'}"
+    )
     return [
-        (what, *(f"{each:.3g} us" for each in us.values()), f"{us['jets'] / us['by hand']:.2f} times")
+        (what, *(f"{each:.3g} us" for each in us.values()), f"{us['graph'] / us['by hand']:.2f} times")
     ]
 
 
@@ -124,33 +107,3 @@ def interacting() -> list[Row]:
 
 def _repeated(calls: list[Call]) -> Any:
     return np.concatenate([call() for call in calls])
-
-
-def uses() -> list[Row]:
-    """First and second uses, each in a process of its own."""
-    rows = []
-    for number, (scenario, _, estimator) in enumerate(USED):
-        with tempfile.TemporaryDirectory() as cache:
-            taken = [_use_elsewhere(number, cache) for _ in range(2)]
-        for verb, s, wanted_s in zip(("compile", "load"), taken, (COMPILES_S, LOADS_S), strict=True):
-            what = f"{estimator} of {scenario}: CPU to {verb}; target"
-            rows.append((what, f"{s:.2g} s", f"{wanted_s:g} s", f"{s / wanted_s:.2f} times"))
-    return rows
-
-
-def _use_elsewhere(number: int, cache: str) -> float:
-    command = [sys.executable, "-m", "tests.bench.bench_methods", str(number)]
-    environment = {**environ, "FUSELOG_CACHE": cache}
-    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-    return float(done.stdout)
-
-
-def use(number: int) -> float:
-    """CPU seconds of this process's first use of a model with a method."""
-    scenario, parameters, estimator = USED[number]
-    sources = record_ensemble(scenario, parameters, 1, 1)
-    return first_use_s(bind(estimator, sources, {}), sources)
-
-
-if __name__ == "__main__":
-    print(use(int(sys.argv[1])))

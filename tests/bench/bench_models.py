@@ -2,9 +2,8 @@
 
 The kernels get columns that are ready, and fill arrays; the estimators start from columns in memory and
 end with output streams, plumbing included. Where they are made of a model, their loop is timed alone as
-well. That the estimates are equal is asserted. CPU time of all cores together, medians of turns. The
-ratio is how many times the reference's time an estimator takes. Needs a C compiler. Run it with
-`make bench`, or `python -m tests.bench models`.
+well. That the estimates are equal is asserted. CPU time of all cores together, medians of turns; the
+ratio is how many times the reference's an estimator takes. Run it with `python -m tests.bench models`.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,7 +11,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.ensemble import record_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
@@ -25,6 +23,7 @@ from replay.distributions.wrapped_normal import WrappedNormal
 from replay.engine.estimator import bind
 from replay.engine.replaying import collect, replay
 from replay.engine.sources import MemorySource, memory_source
+from tests.bench.columns import Floats, column, copied, offsets, offsets_of, prior, stamps_ns
 from tests.bench.loops import Call, calls_of
 from tests.bench.reference import bingham as bingham_reference
 from tests.bench.reference import inertial, landmarks, reactor, torus, vehicles
@@ -32,8 +31,6 @@ from tests.bench.reference.gaussian import ALL_WELL, unscented
 from tests.bench.timing import cpu_seconds
 
 TOLERANCE = 1e-9
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Row = tuple[str, str, str, str]
 # From the runs a call of the kernel, which returns the means of all runs end to end.
 Prepare = Callable[[list[MemorySource]], Callable[[], Floats]]
@@ -104,36 +101,6 @@ def estimated(case: Case, sources: list[MemorySource]) -> Floats:
     return np.concatenate(
         [outputs[f"/estimates/{case.estimator}/{name}"]["mean"] for name in case.outputs]
     )
-
-
-def column(sources: list[MemorySource], topic: str, field: str) -> NDArray:
-    """A field of all runs end to end."""
-    return np.ascontiguousarray(np.concatenate([source.streams[topic][field] for source in sources]))
-
-
-def stamps_ns(sources: list[MemorySource], topic: str) -> Integers:
-    """The stamps of all runs end to end."""
-    return np.concatenate([source.streams[topic].publish_time_ns for source in sources])
-
-
-def offsets_of(counts: list[int]) -> Integers:
-    """Where runs of so many rows begin and end."""
-    return np.concatenate([[0], np.cumsum(counts)])
-
-
-def offsets(sources: list[MemorySource], topic: str) -> Integers:
-    """Where the runs' messages begin and end."""
-    return offsets_of([len(source.streams[topic]) for source in sources])
-
-
-def prior(sources: list[MemorySource], topic: str, size: int) -> tuple[Floats, Floats]:
-    """Means (runs, n) and covariances (runs, n, n)."""
-    return column(sources, topic, "mean"), column(sources, topic, "covariance").reshape(-1, size, size)
-
-
-def copied(state: Any) -> Any:
-    """A NamedTuple of arrays that a kernel may work in."""
-    return type(state)(*(part.copy() for part in state))
 
 
 # Landmarks.
@@ -224,12 +191,6 @@ def reactor_kernel(sources: list[MemorySource]) -> Callable[[], Floats]:
         return results.mean
 
     return work
-
-
-def reactor_in_c(sources: list[MemorySource]) -> Callable[[], Floats]:
-    measured, runs = column(sources, "/pressure", "value")[:, 0].copy(), offsets(sources, "/pressure")
-    samples = unscented(2, 0.5)
-    return partial(reactor.compiled_c(), measured, samples.points[0], samples.weights[0], runs)
 
 
 # Vehicles.
@@ -361,7 +322,7 @@ def recorded(scenario: str, parameters: Mapping[str, Any], runs: int) -> list[Me
     return record_ensemble(scenario, parameters, 1, runs)
 
 
-KERNEL, C = "the kernel by hand", "C, gcc -O3"
+KERNEL = "the kernel by hand"
 UNGATED = {"gate_probability": 1.0}
 CASES = [
     *(
@@ -383,7 +344,7 @@ CASES = [
         "lrkf:ukf",
         {},
         ("state",),
-        {KERNEL: reactor_kernel, C: reactor_in_c},
+        {KERNEL: reactor_kernel},
         ({"steps": 2000}, 1),
         ({}, 1000),
     ),

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from time import process_time
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -60,14 +59,3 @@ def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
         for _ in replay(sources, bound, block_messages=1 << 40):
             pass
     return calls
-
-
-def first_use_s(bound: Sequence[Bound], sources: Sequence[Source]) -> float:
-    """CPU seconds until the loops are made of their models, compiled or loaded, and have run once."""
-    begin = process_time()
-    calls = calls_of(bound, sources)
-    taken = process_time() - begin
-    begin = process_time()
-    calls_of(bound, sources)
-    assert calls, "no filter is made of a model"
-    return taken - (process_time() - begin)

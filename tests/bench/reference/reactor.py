@@ -3,18 +3,15 @@
 As they were before filters were made from models (issue 13), to be timed against and for nothing else.
 """
 
-import ctypes
-import subprocess
-import tempfile
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from replay.engine.compile import compile_over_runs
+from tests.bench.reference import c
 from tests.bench.reference.gaussian import (
     ALL_WELL,
     NOT_FINITE,
@@ -182,17 +179,10 @@ def scratch(sets: SampleSets) -> tuple[Innovation, SampleMemory]:
     return no_innovation(2, 1), sample_memory(sets, states=2, values=2)
 
 
-@cache
 def compiled_c() -> Callable[[Floats, Floats, Floats, NDArray[np.int64]], Floats]:
     """`reactor.c`, compiled: (measured, points, weights, offsets) -> means (n, 2) of all runs."""
-    source = Path(__file__).with_suffix(".c")
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "reactor.so"
-        command = ["cc", "-O3", "-march=native", "-shared", "-fPIC", str(source), "-o", str(library)]
-        subprocess.run([*command, "-lm"], check=True)
-        function = ctypes.CDLL(str(library)).filter_runs
-    floats, integers = (np.ctypeslib.ndpointer(kind, flags="C") for kind in (np.float64, np.int64))
-    function.argtypes = [ctypes.c_int, integers, floats, ctypes.c_int, floats, floats, floats]
+    kinds = c.INTEGER, c.INTEGERS, c.FLOATS, c.INTEGER, c.FLOATS, c.FLOATS, c.FLOATS
+    function = c.compiled("reactor", "filter_runs", *kinds)
 
     def run(measured: Floats, points: Floats, weights: Floats, offsets: NDArray[np.int64]) -> Floats:
         means = np.empty((len(measured), 2))
