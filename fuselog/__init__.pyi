@@ -85,6 +85,7 @@ from replay.engine.sources import MemorySource as MemorySource
 from replay.inference import small_matrices as small_matrices
 from replay.inference.all_methods import modelled as modelled
 from replay.inference.checking import check_model as check_model
+from replay.inference.formulas import formulas as formulas
 from replay.inference.model import Control as Control
 from replay.inference.model import Map as Map
 from replay.inference.model import Model as Model

@@ -30,14 +30,19 @@ experiments = _listing("experiment", "List the shipped experiments, or all about
     "List the models, and the methods that estimate each, or all about NAME.",
     "fuselog models",
     "fuselog models robot",
+    "fuselog models robot --formulas",
 )
 @click.argument("name", required=False)
+@click.option("--formulas", is_flag=True, help="Print what NAME's functions and their derivatives are.")
 @json_option
-def models(name: str | None, as_json: bool) -> None:
+def models(name: str | None, formulas: bool, as_json: bool) -> None:
     """List the models and whether each method can estimate them or why not, or all about NAME."""
-    from pipeline.catalog import show_models
+    from pipeline.catalog import show_formulas, show_models
 
-    show_models(name, as_json=as_json)
+    if formulas:
+        show_formulas(name, as_json=as_json)
+    else:
+        show_models(name, as_json=as_json)
 
 
 @command(
