@@ -39,10 +39,14 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class Kernel:
-    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`."""
+    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
 
-    def __init__(self, run_once: FunctionType) -> None:
+    `title` says what it is, to who waits for it.
+    """
+
+    def __init__(self, run_once: FunctionType, title: str) -> None:
         self._function = run_once
+        self._title = title
         self._entries: dict[Any, tuple[Struct, Callable[..., None]]] = {}
         self._loaded: dict[Any, Callable[..., None]] = {}
         self._lock = Lock()
@@ -75,7 +79,7 @@ class Kernel:
     ) -> tuple[Struct, Callable[..., None]]:
         described = tuple(_with_types(each, kinds) for each in arguments)
         if described not in self._loaded:
-            self._loaded[described] = _entry(self._function, described)
+            self._loaded[described] = _entry(self._function, described, self._title)
         return Struct(f"={''.join(map(_letters, described))}"), self._loaded[described]
 
 
@@ -231,7 +235,7 @@ def text_of(function: FunctionType, kinds: Sequence[Any]) -> str:
     return program.text()
 
 
-def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., None]:
     """The kernel's entry: kept, or made."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
@@ -242,7 +246,6 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None
         path = None
     code = None if path is None else read_checked(path)
     if code is None:
-        title = f"{function.__module__}.{function.__name__}"
         if path is None:
             with compiling(title):
                 code = _made(function, kinds)
