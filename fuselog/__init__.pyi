@@ -28,6 +28,8 @@ from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
 from pipeline.exporting import export as export
 from pipeline.observing import observability as observability
+from pipeline.precompiling import Precompiled as Precompiled
+from pipeline.precompiling import precompile as precompile
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome
