@@ -28,6 +28,8 @@ from pipeline.experiment import Setting as Setting
 from pipeline.experiment import Study as Study
 from pipeline.exporting import export as export
 from pipeline.observing import observability as observability
+from pipeline.precompiling import Precompiled as Precompiled
+from pipeline.precompiling import precompile as precompile
 from pipeline.replays import Replay as Replay
 from pipeline.replays import replay as replay
 from pipeline.results import Outcome as Outcome
@@ -85,6 +87,7 @@ from replay.engine.sources import MemorySource as MemorySource
 from replay.inference import small_matrices as small_matrices
 from replay.inference.all_methods import modelled as modelled
 from replay.inference.checking import check_model as check_model
+from replay.inference.formulas import formulas as formulas
 from replay.inference.model import Control as Control
 from replay.inference.model import Map as Map
 from replay.inference.model import Model as Model

@@ -19,6 +19,7 @@ from replay.engine.estimator import Estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.binding import serving
 from replay.inference.estimators import registered_models
+from replay.inference.formulas import formulas, formulas_by_function
 from replay.inference.model import Model, ModelParameters
 from replay.inference.needs import needs_of
 from replay.inference.parameters import number_fields
@@ -89,6 +90,16 @@ def show_models(name: str | None, *, as_json: bool) -> None:
     if name is None and not as_json:
         rows = [[name, *_methods_of(model).values()] for name, model in registered_models().items()]
         print_table(["model", *METHODS], rows, "Methods that estimate them")
+
+
+def show_formulas(name: str | None, *, as_json: bool) -> None:
+    """Print the formulas of a model; raises BadInput where none is named, or there is no such model."""
+    if name is None:
+        raise BadInput("--formulas: give a model, as in fuselog models robot --formulas")
+    if as_json:
+        print_json({"name": name, "formulas": formulas_by_function(name)})
+    else:
+        say(formulas(name))
 
 
 def _methods_of(model: Model) -> dict[str, str]:

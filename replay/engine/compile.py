@@ -60,7 +60,9 @@ def compiled(
     return call
 
 
-def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) -> Callable[..., None]:
+def compile_over_runs(
+    run_once: Callable[..., None], *, allocates: bool = True, title: str = ""
+) -> Callable[..., None]:
     """Compile a function of one run into a loop over all runs, on all cores.
 
     Args:
@@ -69,6 +71,7 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
             specialised. It may use NumPy and functions that keep to the same.
         allocates: whether it makes arrays. A kernel that does not is compiled in a twentieth of the
             time, and is several times as fast.
+        title: what it is to who waits until it is compiled, such as "ekf of robot".
 
     Returns `loop(runs, *arguments, scratch=None, own=None)`; its results do not depend on the number of
     runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
@@ -79,16 +82,17 @@ def compile_over_runs(run_once: Callable[..., None], *, allocates: bool = True) 
     For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
     array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
     """
+    title = title or f"{run_once.__module__}.{run_once.__name__}"
 
     @cache
     def loop() -> Loop:
         if allocates:
             from replay.engine.through_numba import loop_of
 
-            return loop_of(run_once)
+            return loop_of(run_once, title)
         from replay.engine.kernels.native import Kernel
 
-        return Kernel(cast(FunctionType, run_once))
+        return Kernel(cast(FunctionType, run_once), title)
 
     def over_runs(runs: int, *arguments: Any, **memory: Any) -> None:
         if is_uncompiled():

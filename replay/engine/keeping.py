@@ -3,17 +3,14 @@
 import __future__
 
 import gc
-import logging
 import pickle
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from hashlib import sha256
 from importlib.metadata import version
-from multiprocessing import parent_process
 from pathlib import Path
-from threading import Timer
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -25,10 +22,8 @@ from numba.core.serialize import dumps
 
 from recorders.errors import BadInput
 from replay.engine.cache import cache_folder, in_turn, is_private, read_checked, say_once, write_checked
+from replay.engine.kernels.telling import compiling
 
-_LOG = logging.getLogger("fuselog")
-# What compiles in less time is not told of.
-_PATIENCE_S = 1.0
 # In place of the colours in which numba sets its error messages.
 _COLOURLESS = SimpleNamespace(
     **dict.fromkeys(("code", "errmsg", "filename", "highlight", "indicate", "reset"), str)
@@ -132,36 +127,17 @@ def _compiling(title: str) -> Iterator[None]:
     numba makes an error of every type that does not fit and tries the next; colours of these, which are
     there where colorama is installed, take a thirtieth.
     """
-    patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
-    patience.daemon = True
     collecting = gc.isenabled()
     colours = errors._termcolor_inst  # type: ignore[attr-defined]
     gc.disable()
     errors._termcolor_inst = _COLOURLESS  # type: ignore[attr-defined]
-    patience.start()
     try:
-        yield
+        with compiling(title):
+            yield
     finally:
-        patience.cancel()
         errors._termcolor_inst = colours  # type: ignore[attr-defined]
         if collecting:
             gc.enable()
-
-
-def _say(sentence: str) -> None:
-    """By the program's logging, as the command line sets it up; else on standard error, each once.
-
-    Not from a worker process, whose parent is what somebody watches.
-    """
-    if _LOG.hasHandlers():
-        _LOG.info(sentence)
-    elif parent_process() is None:
-        _print_once(sentence)
-
-
-@cache
-def _print_once(sentence: str) -> None:
-    print(f"fuselog: {sentence}", file=sys.stderr, flush=True)
 
 
 def _described(kind: Any) -> str:

@@ -35,13 +35,13 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
     name = bundle.add(function.__name__, function)
     names = ", ".join(inspect.signature(function).parameters)
     text = f"def kernel({names}):\n    return {name}({names})"
-    return _compile(bundle, name, text, function)
+    return _compile(bundle, name, text, f"{function.__module__}.{function.__name__}")
 
 
 class _Loop:
     """A function of one run as a loop over runs."""
 
-    def __init__(self, run_once: Callable[..., None]) -> None:
+    def __init__(self, run_once: Callable[..., None], title: str) -> None:
         bundle = Bundle()
         kernel = bundle.add("run_once", run_once)
         names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
@@ -51,7 +51,7 @@ class _Loop:
             f"        {kernel}(run, {names})"
         )
         self._name, self._places = run_once.__name__, bundle.places
-        self._loop = _compile(bundle, kernel, text, run_once)
+        self._loop = _compile(bundle, kernel, text, title)
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
         """The loop for these arguments."""
@@ -76,13 +76,11 @@ class _Loop:
 loop_of = _Loop
 
 
-def _compile(
-    bundle: Bundle, called: str, definition: str, function: Callable[..., Any]
-) -> Callable[..., Any]:
-    """The function `kernel` that calls one that a bundle holds, which is made of `function`."""
+def _compile(bundle: Bundle, called: str, definition: str, title: str) -> Callable[..., Any]:
+    """The function `kernel` that calls one that a bundle holds; `title` says what it is."""
     for own, source in bundle.definitions.items():
         if own not in vars(_PARTS):
             execute(source, own, _PARTS)
     needed = f"import numba\nfrom {_PARTS.__name__} import {called}"
     text = f"{needed}\n@numba.njit(nogil=True, {bundle.options})\n{definition}\n"
-    return load(text, f"{function.__module__}.{function.__name__}")
+    return load(text, title)

@@ -223,7 +223,7 @@ def back_memory(t: int) -> BackMemory:
 
 @lru_cache(maxsize=1)
 def _smoothing() -> Function:
-    return compile_over_runs(smooth, allocates=False)
+    return compile_over_runs(smooth, allocates=False, title="the bound of smoothers")
 
 
 def smooth(

@@ -46,7 +46,7 @@ from replay.inference.recursion import (
 from replay.inference.rewinding import issued
 from replay.inference.sensor_steps import slots_of
 from replay.inference.settings import complaint_of, reading_settings
-from replay.inference.stage import Stage
+from replay.inference.stage import Stage, title_of
 from replay.inference.steps import FAILURES, NOT_STARTED, Gaussian, Steps
 from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
@@ -86,7 +86,8 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
     steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
-    return compile_over_runs(loop, allocates=False), steps
+    title = title_of(stage.model, method.summary)
+    return compile_over_runs(loop, allocates=False, title=title), steps
 
 
 def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:

@@ -35,7 +35,7 @@ class Window(NamedTuple):
 @lru_cache(maxsize=64)
 def sliding_over_runs(kinds: tuple[str, ...]) -> Function:
     """The same over all runs, compiled; see `sliding`."""
-    return compile_over_runs(sliding(kinds), allocates=False)
+    return compile_over_runs(sliding(kinds), allocates=False, title="a smoother with a fixed lag")
 
 
 def sliding(kinds: tuple[str, ...]) -> Function:

@@ -25,7 +25,7 @@ from replay.inference.parameters import number_fields
 from replay.inference.recursion import Carried, Estimates, Happenings, Innovations, recursion
 from replay.inference.settings import reading_settings
 from replay.inference.smoothing import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
-from replay.inference.stage import Stage
+from replay.inference.stage import Stage, title_of
 from replay.inference.steps import Gaussian, Steps
 
 SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
@@ -63,7 +63,8 @@ def searching(stage: Stage) -> tuple[Function, Steps]:
     """The compiled search, and the steps that make its memory."""
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
-    return compile_over_runs(search(stage, steps, settings_of), allocates=False), steps
+    title = title_of(stage.model, "iterated smoother")
+    return compile_over_runs(search(stage, steps, settings_of), allocates=False, title=title), steps
 
 
 def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:

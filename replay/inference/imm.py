@@ -486,7 +486,7 @@ def smoothing_memory(modes: int) -> SmoothingMemory:
 
 @lru_cache(maxsize=16)
 def _smoothing(modes: int) -> Function:
-    return compile_over_runs(smoothing(modes), allocates=False)
+    return compile_over_runs(smoothing(modes), allocates=False, title="the smoother of modes")
 
 
 def smoothing(modes: int) -> Function:

@@ -36,7 +36,7 @@ from replay.inference.parameters import number_fields
 from replay.inference.recursion import Estimates, filled, no_results, recursion
 from replay.inference.sensor_steps import reading, sensor_derivative, sensor_noise, slots_of
 from replay.inference.settings import reading_settings
-from replay.inference.stage import Stage
+from replay.inference.stage import Stage, title_of
 from replay.inference.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
 from replay.inference.tuples import tuple_of
 
@@ -161,7 +161,8 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
 def _summing(stage: Stage) -> tuple[Function, Steps]:
     steps = gramian_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
-    return compile_over_runs(recursion(stage, steps, settings_of), allocates=False), steps
+    title = title_of(stage.model, "observability")
+    return compile_over_runs(recursion(stage, steps, settings_of), allocates=False, title=title), steps
 
 
 class Observability(IteratedSmoother):

@@ -34,7 +34,7 @@ from replay.inference.recursion import (
 )
 from replay.inference.sensor_steps import slots_of
 from replay.inference.settings import reading_settings
-from replay.inference.stage import Stage
+from replay.inference.stage import Stage, title_of
 from replay.inference.steps import FAILURES, Steps
 from replay.sampling.sets import sets_by_runs
 
@@ -153,7 +153,8 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Funct
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
     loop = going_back(stage.model, taking_in(stage, steps, reads), steps.estimate, structure)
-    return compile_over_runs(loop, allocates=False), steps
+    title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
+    return compile_over_runs(loop, allocates=False, title=title), steps
 
 
 def going_back(model: Model, take_in: Function, estimate: Function, structure: Structure) -> Function:

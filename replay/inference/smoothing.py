@@ -227,7 +227,7 @@ class BackMemory(NamedTuple):
 @lru_cache(maxsize=64)
 def going_back(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The same over all runs, compiled; see `way_back`."""
-    return compile_over_runs(way_back(kinds, correct), allocates=False)
+    return compile_over_runs(way_back(kinds, correct), allocates=False, title="a smoother's way back")
 
 
 def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:

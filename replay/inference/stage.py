@@ -1,9 +1,11 @@
 """A model as a method takes it: its functions traced, with the motion and the sensors that are used."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
+from recorders.registry import available
 from replay.inference.model import Model, Motion, Sensor
 from replay.inference.parameters import number_fields
 from replay.tracing.functions import Argument, Shape, traced
@@ -44,6 +46,19 @@ def stage_of(
         tuple(traced_sensor(model, sensor, names) for sensor in sensors),
         tuple(traced_motion(model, mode, names) for mode in modes),
     )
+
+
+def title_of(model: Model, summary: str) -> str:
+    """What the kernel of a method with this summary is called while one waits until it is compiled.
+
+    The model has its registered name where it is one of those that are loaded, which imports nothing.
+    """
+    found = (
+        (name, getattr(sys.modules.get(entry.module), entry.attr, None))
+        for name, entry in available("models").items()
+    )
+    named = [name for name, known in found if getattr(known, "summary", None) == model.summary]
+    return f"the {summary.partition(';')[0]} of {named[0] if named else model.summary}"
 
 
 def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motion:

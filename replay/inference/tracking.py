@@ -531,7 +531,7 @@ BY_PAIR = ("associated", "white", "factor")
 @lru_cache(maxsize=16)
 def _compiled(tracker: Tracker) -> Callable[..., None]:
     follow = tracking(tracker, reading_settings(tracker.names))
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(follow, allocates=False, title="a tracker")
 
 
 def track_scans(

@@ -1,12 +1,15 @@
 """`fuselog cache`: how much it holds; clearing removes what fuselog wrote and nothing else."""
 
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from replay.engine.cache import write_checked
+import fuselog as fl
+from replay.engine.cache import kept_files, write_checked
 
 
 @pytest.fixture
@@ -60,3 +63,40 @@ def test_links_and_folders_that_others_may_write_to_stay(
     assert f"{place}: cleared 1 files" in fuselog("cache", "--clear").out
     assert (place / "kernels/a.bin").read_bytes() == elsewhere.read_bytes()
     assert (place / "samples/c.bin").exists()
+
+
+@pytest.mark.paper
+@pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
+def test_what_was_compiled_ahead_is_not_compiled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_fuselog: Callable[..., subprocess.Popen[str]]
+) -> None:
+    """By other processes than those that compiled it, for another log with the same sensors."""
+    monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path / "cache"))
+    made = fl.precompile("robot", ["ekf", "ukf"], workers=2)
+    assert [each[:3] for each in made] == [("robot", "ekf", "landmarks"), ("robot", "ukf", "landmarks")]
+    assert not [each.why_not for each in made if each.why_not]
+    kept = set(kept_files())
+    assert kept
+    log = tmp_path / "log.mcap"
+    fl.write(log, fl.record("landmarks", seed=5, duration_s=3.0, robots=2))
+    replaying = start_fuselog("replay", str(log), "-e", "ekf", "-e", "ukf", "-o", f"{tmp_path}/est.mcap")
+    replaying.communicate()
+    assert replaying.returncode == 0
+    assert set(kept_files()) == kept
+
+
+def test_what_cannot_be_compiled_ahead_is_one_sentence(place: Path, fuselog: Callable[..., Any]) -> None:
+    for arguments, said in (
+        (["--warm", "robt"], "no model 'robt'; did you mean 'robot'?"),
+        (["--warm", "robot:ekff"], "no method 'ekff'; did you mean 'ekf'?"),
+        (["--warm", "robot:smoother:ekff"], "'ekff' is not a filter"),
+        (["--warm", "robot:analytic"], "the model lacks exact moments"),
+        (["robot"], "give --warm"),
+        (["--warm", "--clear"], "give one of the two"),
+    ):
+        told = fuselog("cache", *arguments)
+        assert (told.code, said in told.err) == (2, True), told.err
+    with pytest.raises(fl.BadInput, match="did you mean 'ukf'"):
+        fl.precompile(methods="ukff")
+    place.chmod(0o777)
+    assert "set FUSELOG_CACHE to a folder of your own" in fuselog("cache", "--warm", "robot").err

@@ -240,6 +240,14 @@ def test_lists_and_details(kind: str, name: str, words: list[str], fuselog: Fuse
     assert fuselog(kind, name, "--json").json == [row for row in listed if row["name"] == name]
 
 
+def test_the_formulas_of_a_model_are_printed(fuselog: Fuselog) -> None:
+    assert fuselog("models", "vehicle", "--formulas").out == fl.formulas("vehicle") + "\n"
+    told = fuselog("models", "vehicle", "--formulas", "--json").json
+    assert told["formulas"]["mode drive, move"][0].startswith("v1 = ")
+    assert "did you mean 'robot'?" in fuselog("models", "robt", "--formulas").err
+    assert "--formulas: give a model" in fuselog("models", "--formulas").err
+
+
 def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog) -> None:
     """Every cell of the table is filled, or says why not."""
     listed = {

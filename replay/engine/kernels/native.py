@@ -40,10 +40,14 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class Kernel:
-    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`."""
+    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
 
-    def __init__(self, run_once: FunctionType) -> None:
+    `title` says what it is, to who waits for it.
+    """
+
+    def __init__(self, run_once: FunctionType, title: str) -> None:
         self._function = run_once
+        self._title = title
         self._entries: dict[Any, tuple[Struct, Callable[..., Any]]] = {}
         self._loaded: dict[Any, Callable[..., Any]] = {}
         self._lock = Lock()
@@ -83,7 +87,8 @@ class Kernel:
         described = tuple(_with_types(each, kinds) for each in arguments)
         key = is_checked, described
         if key not in self._loaded:
-            self._loaded[key] = (_checked_entry if is_checked else _entry)(self._function, described)
+            make = _checked_entry if is_checked else _entry
+            self._loaded[key] = make(self._function, described, self._title)
         return Struct(f"={''.join(map(_letters, described))}"), self._loaded[key]
 
 
@@ -108,7 +113,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 
     once = call if returned == "None" else evaluate
     once.__module__, once.__name__ = function.__module__, function.__name__
-    kernel = Kernel(cast(FunctionType, once))
+    kernel = Kernel(cast(FunctionType, once), f"{function.__module__}.{function.__name__}")
 
     def called(*arguments: Any) -> Any:
         if returned == "None":
@@ -283,10 +288,11 @@ def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool
     return program
 
 
-def _checked_entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., None]:
+def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., None]:
     """The kernel's entry, which raises IndexError where an index is beyond its array; it is not kept."""
-    program = program_of(function, kinds, is_checked=True)
-    kernel = _loaded(object_code(program.text()))
+    with compiling(title):
+        program = program_of(function, kinds, is_checked=True)
+        kernel = _loaded(object_code(program.text()))
 
     def checked(*arguments: Any) -> None:
         fault = kernel(*arguments)
@@ -296,7 +302,7 @@ def _checked_entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[.
     return checked
 
 
-def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., int]:
+def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
     """The kernel's entry: kept, or made."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
@@ -307,7 +313,6 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...]) -> Callable[..., int]
         path = None
     code = None if path is None else _kept(path, key)
     if code is None:
-        title = f"{function.__module__}.{function.__name__}"
         if path is None:
             with compiling(title):
                 code = _made(function, kinds)

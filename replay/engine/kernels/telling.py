@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -14,14 +15,18 @@ _PATIENCE_S = 1.0  # what compiles in less time is not told of
 
 @contextmanager
 def compiling(title: str) -> Iterator[None]:
-    """Say what is compiled where that takes longer than a second."""
+    """Say what is compiled where that takes longer than a second, and how long it took."""
     patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
     patience.daemon = True
+    begun_s = time.perf_counter()
     patience.start()
     try:
         yield
     finally:
         patience.cancel()
+    took_s = time.perf_counter() - begun_s
+    if took_s > _PATIENCE_S:
+        _say(f"compiled {title} in {took_s:.1f} s")
 
 
 def _say(sentence: str) -> None:

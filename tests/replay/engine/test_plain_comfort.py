@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -318,23 +319,26 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.keeping._PATIENCE_S", 0.0)
+    monkeypatch.setattr("replay.engine.kernels.telling._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
     for _ in range(2):
         load.cache_clear()
         compile_over_runs(tracked)(2, *arguments)
     said = [record.getMessage() for record in caplog.records]
-    assert said == [f"compiling {tracked.__module__}.tracked, once"]
+    name = f"{tracked.__module__}.tracked"
+    assert said[0] == f"compiling {name}, once"
+    assert re.fullmatch(rf"compiled {name} in \d+\.\d s", said[1])
+    assert len(said) == 2
 
 
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
 def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
     """On standard error, as nothing else is there; not where the program logs in its own way."""
     code = (
-        "import sys, logging, replay.engine.keeping as keeping, numpy as np\n"
+        "import sys, logging, replay.engine.kernels.telling as telling, numpy as np\n"
         "from replay.engine.compile import compiled\n"
-        "keeping._PATIENCE_S = 0.0\n"
+        "telling._PATIENCE_S = 0.0\n"
         "if sys.argv[1:]: logging.basicConfig()\n"
         "from recorders.models.planar import wrap_angle\n"
         "for x in (1.0, 1): compiled(wrap_angle)(x)\n"
@@ -346,4 +350,8 @@ def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
         ).stderr
         for options in ([], ["logs"])
     ]
-    assert said == ["fuselog: compiling recorders.models.planar.wrap_angle, once\n", ""]
+    name = r"recorders\.models\.planar\.wrap_angle"
+    assert said[1] == ""
+    assert re.match(
+        rf"fuselog: compiling {name}, once\nfuselog: compiled {name} in \d+\.\d s\n", said[0]
+    )

@@ -1,0 +1,148 @@
+"""A graph as formulas that a person can read, which are Python: it computes the same of them.
+
+What is used more than once, unless that is short, and what would not fit in a line get lines of their
+own.
+"""
+
+import operator
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.tracing.derivatives import slopes_of
+from replay.tracing.functions import TracedFunction
+from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from replay.tracing.traced import Trace
+
+SHORTEST, LONGEST = 20, 100  # characters: what is shorter is repeated, what is longer gets a line
+
+# How tightly operators bind: as in Python, but that a remainder is set apart from products about it.
+_CHOICE, _OR, _AND, _NOT, _COMPARISON, _SUM, _REMAINDER, _PRODUCT, _SIGN, _POWER, _WHOLE = range(11)
+_OPERATORS: dict[Any, tuple[str, int]] = {
+    operator.or_: ("or", _OR),
+    operator.and_: ("and", _AND),
+    operator.xor: ("!=", _COMPARISON),
+    operator.lt: ("<", _COMPARISON),
+    operator.le: ("<=", _COMPARISON),
+    operator.gt: (">", _COMPARISON),
+    operator.ge: (">=", _COMPARISON),
+    operator.eq: ("==", _COMPARISON),
+    operator.ne: ("!=", _COMPARISON),
+    operator.add: ("+", _SUM),
+    operator.sub: ("-", _SUM),
+    operator.mul: ("*", _PRODUCT),
+    operator.truediv: ("/", _PRODUCT),
+    operator.mod: ("%", _REMAINDER),
+    operator.floordiv: ("//", _REMAINDER),
+}
+_KNOWN: dict[float, tuple[str, int]] = {
+    np.pi: ("pi", _WHOLE),
+    2.0 * np.pi: ("2 * pi", _PRODUCT),
+    0.5 * np.pi: ("pi / 2", _PRODUCT),
+    np.pi / 180.0: ("pi / 180", _PRODUCT),
+    180.0 / np.pi: ("180 / pi", _PRODUCT),
+}
+
+
+class _Text(NamedTuple):
+    """A formula, and how tightly its last operation binds."""
+
+    text: str
+    binds: int
+
+    def within(self, binds: int) -> str:
+        """It as a part of what binds so tightly, in parentheses where they are needed."""
+        return self.text if self.binds >= binds else f"({self.text})"
+
+
+def formulas_of(
+    function: TracedFunction,
+    inputs: Mapping[Any, str],
+    outputs: Mapping[str, Node],
+    by: Mapping[Any, str],
+) -> list[str]:
+    """The lines `name = formula` of a function's outputs, and of their derivatives that are not zero.
+
+    Args:
+        function: the function.
+        inputs: the names of what it is given, by place.
+        outputs: its nodes, by name.
+        by: those of the inputs by which it is differentiated.
+    """
+    trace, names = Trace(function.graph, {}), list(by.values())
+    seeds = {
+        function.graph.input(place): {number: function.graph.constant(1.0)}
+        for number, place in enumerate(by)
+    }
+    slopes = slopes_of(trace, list(outputs.values()), seeds)
+    derivatives = {
+        f"d {name} / d {names[number]}": node
+        for name, slope in zip(outputs, slopes, strict=True)
+        for number, node in slope.items()
+    }
+    return list(_lines({**outputs, **derivatives}, inputs))
+
+
+def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str]:
+    """Every named node, each behind the lines that it needs."""
+    everything = needed(named.values())
+    uses = Counter(argument for node in everything for argument in node.arguments)
+    uses.update(named.values())
+    found: dict[Node, _Text] = {}
+    free = (name for name in map("v{}".format, range(1, len(everything) + 1)))
+    taken = set(inputs.values())
+    for name, output in named.items():
+        for node in needed([output]):
+            if node in found:
+                continue
+            text = _text_of(node, [found[each] for each in node.arguments], inputs)
+            is_named = node is output and (name.isidentifier() or uses[node] == 1)
+            if not is_named and len(text.text) > (SHORTEST if uses[node] > 1 else LONGEST):
+                own = next(each for each in free if each not in taken)
+                yield f"{own} = {text.text}"
+                text = _Text(own, _WHOLE)
+            found[node] = text
+        yield f"{name} = {found[output].text}"
+        if name.isidentifier() and len(found[output].text) > SHORTEST:
+            found[output] = _Text(name, _WHOLE)
+
+
+def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str]) -> _Text:
+    """A node as a formula of those of its arguments."""
+    operation = node.operation
+    if operation is INPUT:
+        return _Text(inputs[node.value], _WHOLE)
+    if operation is CONSTANT:
+        return _constant(node.value)
+    if operation is SELECT:
+        condition, yes, no = given
+        said = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
+        return _Text(said, _CHOICE)
+    if operation is POWER:
+        return _Text(f"{given[0].within(_WHOLE)} ** {node.value}", _POWER)
+    if operation is operator.neg:
+        return _Text(f"-{given[0].within(_PRODUCT)}", _PRODUCT)
+    if operation is operator.not_:
+        return _Text(f"not {given[0].within(_NOT)}", _NOT)
+    if operation in _OPERATORS:
+        sign, binds = _OPERATORS[operation]
+        left, right = given
+        first = left.within(_SUM if binds == _COMPARISON else binds)  # Python chains comparisons
+        last = right.within(_SIGN if binds == _REMAINDER else binds + 1)
+        return _Text(f"{first} {sign} {last}", binds)
+    name = "abs" if operation is np.absolute else operation.__name__
+    return _Text(f"{name}({', '.join(each.text for each in given)})", _WHOLE)
+
+
+def _constant(value: Any) -> _Text:
+    if isinstance(value, bool):
+        return _Text(str(value), _WHOLE)
+    if value < 0.0 or str(value) == "-0.0":
+        text, binds = _constant(-value)
+        return _Text(f"-{text}", min(binds, _SIGN))
+    if value in _KNOWN:
+        return _Text(*_KNOWN[value])
+    text = repr(float(value))
+    return _Text(text.removesuffix(".0"), _WHOLE)
