@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from replay.engine.kernels.functions import FUNCTIONS
+from replay.engine.kernels.known import OPERATORS, as_python, from_python, is_in, is_known, is_not_in
 from replay.engine.kernels.numbers import (
-    FUNCTIONS,
     REAL,
     TRUTH,
     WHOLE,
@@ -28,68 +29,8 @@ from replay.engine.kernels.numbers import (
 from replay.engine.kernels.program import Program, definition_of
 from replay.engine.kernels.values import Array, Record, entries, load, made, part_of, store
 
-
-def _is_in(x: Any, many: Any) -> bool:
-    return x in many
-
-
-def _is_not_in(x: Any, many: Any) -> bool:
-    return x not in many
-
-
-_OPERATORS: dict[type[ast.AST], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.FloorDiv: operator.floordiv,
-    ast.Mod: operator.mod,
-    ast.Pow: operator.pow,
-    ast.BitAnd: operator.and_,
-    ast.BitOr: operator.or_,
-    ast.BitXor: operator.xor,
-    ast.LShift: operator.lshift,
-    ast.RShift: operator.rshift,
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-    ast.Is: operator.is_,
-    ast.IsNot: operator.is_not,
-    ast.In: _is_in,
-    ast.NotIn: _is_not_in,
-}
-
 # Functions that make arrays, and whether these are zero.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
-
-
-def is_known(value: Any) -> bool:
-    """Whether nothing of a value exists at run time only."""
-    if isinstance(value, Number | Array):
-        return False
-    parts = entries(value)
-    return parts is None or all(map(is_known, parts))
-
-
-def as_python(value: Any) -> Any:
-    """What is known, as Python has it."""
-    if isinstance(value, Record):
-        return value.type(*map(as_python, value.values))
-    return tuple(map(as_python, value)) if isinstance(value, tuple) else value
-
-
-def from_python(value: Any) -> Any:
-    """What Python has, as it is known while lowering."""
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return Record(type(value), tuple(map(from_python, value)))
-    if isinstance(value, tuple | list):
-        return tuple(map(from_python, value))
-    if isinstance(value, np.generic):
-        return value if isinstance(value, np.unsignedinteger) else value.item()
-    return value
 
 
 class Expressions:
@@ -206,7 +147,7 @@ class Expressions:
 
     def operation(self, node: ast.operator, left: Any, right: Any) -> Any:
         """The result of an operator."""
-        operation = _OPERATORS[type(node)]
+        operation = OPERATORS[type(node)]
         if is_known(left) and is_known(right):
             both = as_python(left), as_python(right)
             if operation is operator.truediv and both[1] == 0:
@@ -259,7 +200,7 @@ class Expressions:
         left, found = self.value(node.left), None
         for operation, right_node in zip(node.ops, node.comparators, strict=True):
             right = self.value(right_node)
-            each = self.compared(_OPERATORS[type(operation)], left, right)
+            each = self.compared(OPERATORS[type(operation)], left, right)
             if found is None or found is True:
                 found = each
             elif each is not True:
@@ -276,12 +217,12 @@ class Expressions:
         if operation in (operator.is_, operator.is_not):
             return operation is operator.is_not
         parts, others = entries(left), entries(right)
-        if operation in (_is_in, _is_not_in):
+        if operation in (is_in, is_not_in):
             alike = constant(False)
             for each in others or ():
                 same = self.emitter.truth(self.compared(operator.eq, left, each))
                 alike = binary(self.emitter, operator.or_, alike, same)
-            return alike if operation is _is_in else inverse(self.emitter, alike)
+            return alike if operation is is_in else inverse(self.emitter, alike)
         if parts is None or others is None:
             return compare(self.emitter, operation, self.scalar(left), self.scalar(right))
         if operation not in (operator.eq, operator.ne) or len(parts) != len(others):

@@ -17,7 +17,7 @@ import pytest
 
 from replay.engine.arrays import varying
 from replay.engine.compile import compile_over_runs
-from replay.engine.kernels import native
+from replay.engine.kernels import arguments, native
 from replay.engine.kernels.identity import identity
 
 # --- the key -----------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def test_sizes_up_to_64_are_part_of_a_key_and_what_varies_is_not(kernels: Path, 
 
 ELSEWHERE = """
 import numpy as np
-from replay.engine.kernels import native
+from replay.engine.kernels import arguments, native
 native._made = lambda *_: 1 / 0
 from tests.replay.engine.kernels.test_native import doubled, kernel_of
 from replay.engine.compile import compile_over_runs
@@ -189,7 +189,7 @@ def test_another_process_loads_what_is_kept_and_it_holds_no_address(kernels: Pat
     path.unlink()
     compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), np.zeros(1))
     assert path.read_bytes() == kept  # whatever lies where
-    text = native.program_of(kernel_of(doubled), (native.Kept("d", (None,), True),) * 2).text()
+    text = native.program_of(kernel_of(doubled), (arguments.Kept("d", (None,), True),) * 2).text()
     addresses = [int(number) for number in re.findall(r"(?<![\w%.])\d{9,}", text)]
     assert addresses == []
 
