@@ -124,7 +124,7 @@ class Motion:
             may have moved meanwhile; there are no estimates between.
         linear: whether `move` is linear in the state: sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
-            they are written by hand, jets give them else.
+            they are written by hand, the graph of `move` gives them else.
         moments: (mean, covariance, control, duration_s, parameters) moves both in place, exactly and
             without the additive noise; for the method `analytic`.
     """
