@@ -101,6 +101,8 @@ def compile_over_runs(
             _share(loop(), runs, *arguments, **memory)
 
     plain = uncompiled_over_runs(run_once)
+    if allocates and not is_uncompiled():
+        loop()  # says at once where a source is not at hand
     return over_runs
 
 

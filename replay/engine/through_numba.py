@@ -41,7 +41,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 class _Loop:
     """A function of one run as a loop over runs."""
 
-    def __init__(self, run_once: Callable[..., None], title: str) -> None:
+    def __init__(self, run_once: Callable[..., None], title: str = "") -> None:
         bundle = Bundle()
         kernel = bundle.add("run_once", run_once)
         names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
@@ -51,6 +51,7 @@ class _Loop:
             f"        {kernel}(run, {names})"
         )
         self._name, self._places = run_once.__name__, bundle.places
+        title = title or f"{run_once.__module__}.{run_once.__name__}"
         self._loop = _compile(bundle, kernel, text, title)
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
