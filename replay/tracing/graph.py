@@ -14,7 +14,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 
-MOST_NODES = 200_000
+MOST_NODES = 50_000
 INPUT, CONSTANT, POWER, SELECT = "input", "constant", "power", "select"
 _COMPARISONS = (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
 _TRUTHS = (
