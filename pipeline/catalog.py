@@ -99,7 +99,8 @@ def show_formulas(name: str | None, *, as_json: bool) -> None:
     if as_json:
         print_json({"name": name, "formulas": formulas_by_function(name)})
     else:
-        say(formulas(name))
+        for line in formulas(name).splitlines():
+            say(line)
 
 
 def _methods_of(model: Model) -> dict[str, str]:

@@ -1,12 +1,13 @@
 """The table `coverage`: what became of every topic of a log; nothing is unused in silence."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from replay.engine.sources import Source, is_sensed
 from replay.engine.usage import CONTROLS, LANDMARK, TRUTH, Row, Usage
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 COLUMNS = [*Row._fields]
 UNTAKEN = "the estimator does not take this topic"
@@ -40,8 +41,10 @@ def rows_of(usages: Mapping[str, Usage], others: Sequence[Row]) -> list[Row]:
     return [*rows, *(row for row in others if (row.estimator, row.topic) not in there)]
 
 
-def coverage_table(rows: Sequence[Row]) -> pd.DataFrame:
+def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
     """A row per estimator and topic; see `Row`."""
+    import pandas as pd  # which takes long to import
+
     return pd.DataFrame(rows, columns=COLUMNS).astype({"used": "Int64", "gated": "Int64"})
 
 

@@ -139,6 +139,7 @@ def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFER
     if function is None:
         return []
     assert isinstance(function, TracedFunction)
+    function = TracedFunction(function.function, function.arguments)  # a graph that nothing else was in
     result = function.result
     if len(returned) > len(result.returned):
         returned = [name for name in returned if name.startswith("variance")]

@@ -295,7 +295,7 @@ FAULTS = [
         EVALUATION,
     ),
     Fault(
-        "replay/judging/judge.py",
+        "replay/judging/tables.py",
         "sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))",
         "sigma = np.diagonal(errors.covariance, axis1=1, axis2=2)",
         EVALUATION,
@@ -394,8 +394,8 @@ FAULTS = [
     ),
     Fault(
         "replay/distributions/bingham_kernels.py",
-        "z -= z[len(z) - 1]",
-        "z -= z[0]",
+        "greatest = z[d - 1]",
+        "greatest = z[0]",
         "tests/replay/estimators/test_bingham_filter.py",
     ),
     Fault(
@@ -419,8 +419,8 @@ FAULTS = [
     ),
     Fault(
         "replay/estimators/inertial.py",
-        "integrate(_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s)), moments, work)",
-        "integrate(_isotropic(model.drift_sigma_rad * elapsed_s), moments, work)",
+        "_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)",
+        "_isotropic(model.drift_sigma_rad * elapsed_s, noise)",
         "tests/replay/estimators/test_inertial.py",
     ),
     Fault(
@@ -675,8 +675,8 @@ FAULTS = [
     ),
     Fault(
         "recorders/parsing.py",
-        "parse_float=_finite, parse_constant=_finite)",
-        "parse_float=_finite)",
+        "parse_float=number, parse_constant=number), text",
+        "parse_float=number), text",
         "tests/recorders/test_parameters.py",
     ),
 ]

@@ -295,7 +295,9 @@ def test_the_worked_example_of_the_page(
     run = fuselog("run", "run.mcap", "-e", "ekf", *settings, *over, "--out", "run").json
     expected = {**tuned["ekf"], "sigma_range_m": 0.3}
     assert expected.items() <= run["settings"]["parameters"]["ekf"].items()
-    further = fuselog("tune", "run.mcap", "-e", "ekf", "--free", "sigma_range_m", *settings).json
+    further = fuselog(
+        "tune", "run.mcap", "-e", "ekf", "--free", "sigma_range_m", *settings, "--out", "further"
+    ).json
     [row] = further["parameters"]
     assert row["start"] == tuned["ekf"]["sigma_range_m"] == pytest.approx(row["value"], rel=1e-4)
     report = fuselog("report", "out/tune", "-o", "tune.html")
