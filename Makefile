@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast fast-lane estimators-lane inference-lane pipeline-lane lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast fast-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -21,10 +21,10 @@ demo: .venv/with-fuselog
 	@echo "Logs and estimates:  demo/landmarks/logs, demo/landmarks/estimates (MCAP)"
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
-# all tests, in three lanes of like length, and the linters, side by side; what is about one family is in
+# all tests, in four lanes of like length, and the linters, side by side; what is about one family is in
 # one lane, so that what its kernels share is compiled once
 test: .venv/with-test
-	$(MAKE) -j4 estimators-lane inference-lane pipeline-lane lint
+	$(MAKE) -j5 pipeline-lane estimators-lane inference-lane rooms-lane lint
 
 test-fast: lint fast-lane
 
@@ -38,7 +38,10 @@ inference-lane: .venv/with-test
 	$(BIN)/pytest tests/replay --ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
 
 pipeline-lane: .venv/with-test
-	$(BIN)/pytest --ignore=tests/replay
+	$(BIN)/pytest tests/pipeline
+
+rooms-lane: .venv/with-test
+	$(BIN)/pytest --ignore=tests/replay --ignore=tests/pipeline
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .
