@@ -1,10 +1,10 @@
 """Gathers what a kernel is made of: the sources of its functions and of all that they call."""
 
 import ast
+import copy
 import inspect
 import os
 import sys
-import textwrap
 from collections.abc import Mapping
 from hashlib import sha256
 from types import FunctionType, ModuleType
@@ -13,6 +13,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from recorders.errors import BadInput
+from replay.engine.kernels.program import definition_of
 
 # What a version names, which is part of every key; of any other module the sources are needed.
 _VERSIONED = {*sys.stdlib_module_names, "numpy", "numba"}
@@ -173,19 +174,7 @@ def _literal(value: Any) -> str | None:
 
 def _definition(function: FunctionType) -> ast.FunctionDef:
     """A function's source without its decorators and docstring."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError) as error:
-        raise BadInput(
-            f"the source of {function.__qualname__} cannot be found ({error}); "
-            "define it as a function in a file"
-        ) from error
-    definition = tree.body[0]
-    if not isinstance(definition, ast.FunctionDef):
-        raise BadInput(
-            f"{function.__qualname__} is not a `def` function, of which kernels are made; write it as "
-            "one"
-        )
+    definition = copy.deepcopy(definition_of(function)[0])  # which is changed here
     definition.decorator_list = []
     if ast.get_docstring(definition) is not None:
         definition.body = definition.body[1:]

@@ -166,7 +166,8 @@ def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
     definition = tree.body[0]
     if not isinstance(definition, ast.FunctionDef):
         raise BadInput(
-            f"{function.__qualname__} is no `def` function, of which kernels are made; write it as one"
+            f"{function.__qualname__} is not a `def` function, of which kernels are made; write it as "
+            "one"
         )
     first = min([definition.lineno, *(each.lineno for each in definition.decorator_list)])
     return definition, function.__code__.co_filename, function.__code__.co_firstlineno - first
