@@ -28,7 +28,7 @@ def executed(path: Path) -> Any:
 
 def _is_notice(output: Any) -> bool:
     lines = output.text.splitlines() if output.get("name") == "stderr" else [""]
-    return all(line.startswith("fuselog: compiling ") for line in lines)
+    return all(line.startswith(("fuselog: compiling ", "fuselog: compiled ")) for line in lines)
 
 
 def printed(notebook: Any) -> list[str]:
