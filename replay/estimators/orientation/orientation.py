@@ -86,8 +86,8 @@ def of_inertial_samples(
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
 ) -> Estimator[Any]:
-    """An estimator of orientation from nine-axis samples; see
-    `replay.engine.api.functions.recursive`.""" return recursive(
+    """An estimator of orientation from nine-axis samples; see `recursive`."""
+    return recursive(
         summary,
         parameters=parameters,
         streams={"inertial": schemas.INERTIAL_SAMPLE},
