@@ -14,13 +14,13 @@ from pipeline.checking.golden import (
     make,
 )
 from pipeline.checking.stored import SUFFIX, Golden, read, write
-from pipeline.ensemble import Settings
-from pipeline.folders import logs_in
-from pipeline.outputs import Kind, check_files
-from pipeline.results import RESULT_FILE, read_result
+from pipeline.logs.folders import logs_in
+from pipeline.output.outputs import Kind, check_files
+from pipeline.output.results import RESULT_FILE, read_result
+from pipeline.runs.ensemble import Settings
 from recorders.errors import BadInput
 from recorders.log import open_log
-from replay.engine.sources import LogSource, MemorySource
+from replay.engine.streams.sources import LogSource, MemorySource
 
 Runs = Mapping[str, LogSource | MemorySource]
 

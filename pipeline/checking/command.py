@@ -7,9 +7,9 @@ from pipeline.checking.checking import check, runs_of, update
 from pipeline.checking.golden import Tolerance
 from pipeline.checking.junit import JUNIT, write_junit
 from pipeline.checking.stored import read
-from pipeline.outputs import check_files
-from pipeline.settings import settings_of_estimators
-from pipeline.terminal import print_json, say
+from pipeline.output.outputs import check_files
+from pipeline.output.terminal import print_json, say
+from pipeline.runs.settings import settings_of_estimators
 from recorders.errors import BadInput
 
 

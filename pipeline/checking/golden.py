@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.checking.stored import FORMAT, Golden
-from pipeline.ensemble import Settings, hash_files, hash_streams, replay_in_memory
-from pipeline.starting import order_of
+from pipeline.runs.ensemble import Settings, hash_files, hash_streams, replay_in_memory
+from pipeline.runs.initial_states import order_of
 from recorders.errors import BadInput, some_of
 from recorders.log import Stream, schemas
 from recorders.models.planar import wrap_angle
-from replay.engine.sources import LogSource, MemorySource
-from replay.judging.evaluation import split_topic
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.judging.errors.evaluation import split_topic
 
 # Of each stream as many rows as this many numbers of the whole golden allow, between the bounds.
 NUMBERS, FEWEST_ROWS, MOST_ROWS = 6000, 6, 32

@@ -4,7 +4,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from pipeline.checking.checking import Checked
-from pipeline.outputs import Kind
+from pipeline.output.outputs import Kind
 from recorders.atomic import whole_file
 
 NAME = "fuselog check"

@@ -65,7 +65,7 @@ def run(
     --set gate_probability=1 of all estimators that have it, --set gap_limit_s=1 an entry of the
     experiment.
     """
-    from pipeline.experiment_commands import run_named
+    from pipeline.command_line.experiment_commands import run_named
 
     stated = {"runs": runs, "seed": seed, "arrival_order": arrival_order or None, "late": late}
     over = {key: value for key, value in stated.items() if value is not None}
@@ -113,7 +113,7 @@ def sweep(
     A table has every metric at every point, and within what nine in ten runs lie; figures show them as
     curves, or as heat maps over two parameters. A key is as --set has it.
     """
-    from pipeline.experiment_commands import sweep_named
+    from pipeline.command_line.experiment_commands import sweep_named
 
     over = {key: value for key, value in {"runs": runs, "seed": seed}.items() if value is not None}
     sweep_named(experiment, labels, over, **options)
@@ -128,8 +128,8 @@ def sweep(
 @click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
 def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
-    from pipeline.outputs import REPORT, check_files
-    from pipeline.report import write_report
+    from pipeline.output.outputs import REPORT, check_files
+    from pipeline.output.report import write_report
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
     write_report(list(results), out, viewer=viewer)

@@ -100,7 +100,7 @@ def evaluate(
     absolute and relative pose errors, APE and RPE, as evo has them. With --align or --delta, so are
     estimated positions of logs; all other metrics are then of the aligned estimates.
     """
-    from pipeline.commands import evaluate_logs, evaluate_trajectory
+    from pipeline.command_line.commands import evaluate_logs, evaluate_trajectory
 
     given = {
         "align": align,
@@ -213,6 +213,6 @@ def observability(logs: tuple[Path, ...], **options: Any) -> None:
     For every run and window: the rank and the eigenvalues of the local Gramian along the smoothed
     trajectory, in units of the prior's information.
     """
-    from pipeline.observing import show_observability
+    from pipeline.api.observability import show_observability
 
     show_observability(list(logs), **options)

@@ -12,7 +12,7 @@ def _listing(kind: str, text: str, example: str) -> click.Command:
     @click.argument("name", required=False)
     @json_option
     def listing(name: str | None, as_json: bool) -> None:
-        from pipeline import catalog
+        from pipeline.api import catalog
 
         catalog.show(getattr(catalog, f"{kind}s")(), kind, name, as_json=as_json)
 
@@ -38,7 +38,7 @@ experiments = _listing("experiment", "List the shipped experiments, or all about
 @json_option
 def models(name: str | None, formulas: bool, as_json: bool) -> None:
     """List the models and whether each method can estimate them or why not, or all about NAME."""
-    from pipeline.catalog import show_formulas, show_models
+    from pipeline.api.catalog import show_formulas, show_models
 
     if formulas:
         show_formulas(name, as_json=as_json)
@@ -71,10 +71,10 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
     if clear and warm:
         raise BadInput("fuselog cache --clear --warm: give one of the two, and then the other")
     if warm:
-        from pipeline.precompiling import show_precompiling
+        from pipeline.api.precompiling import show_precompiling
 
         show_precompiling(pairs, as_json=as_json)
         return
-    from pipeline.information import show_cache
+    from pipeline.logs.information import show_cache
 
     show_cache(clear=clear, as_json=as_json)

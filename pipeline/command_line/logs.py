@@ -23,7 +23,7 @@ from pipeline.command_line.recording import say_written
 from recorders.errors import BadInput, printable
 
 if TYPE_CHECKING:
-    from pipeline.surgery import Changed
+    from pipeline.logs.edit import Changed
 
 
 @command(
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @json_option
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     """Say what LOG holds: the run, its topics, schemas, message counts, the models that fit it."""
-    from pipeline.information import show_log
+    from pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
 
@@ -59,7 +59,7 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 @gap_option
 def view(path: Path, **options: Any) -> None:
     """Open PATH (a log, an estimates log, a result folder or an .rrd) in the Rerun viewer."""
-    from pipeline.commands import view_path
+    from pipeline.command_line.commands import view_path
 
     view_path(path, **options)
 
@@ -91,7 +91,7 @@ def export(path: Path, to: Any, **options: Any) -> None:
     and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a table; to
     foxglove one log of the messages that Foxglove and Rerun show.
     """
-    from pipeline.exporting import export as export_log
+    from pipeline.logs.exporting import export as export_log
 
     done = export_log(path, to=to, **options)
     for note in done.notes:
@@ -127,7 +127,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 
     Maps, priors and what was said at the first stamp of the log stay whole, whatever the span.
     """
-    from pipeline.surgery import cut as cut_log
+    from pipeline.logs.edit import cut as cut_log
 
     _say_changed(cut_log(path, decimate=_pairs("--decimate", decimate), **options))
 
@@ -148,7 +148,7 @@ def cut(path: Path, decimate: tuple[str, ...], **options: Any) -> None:
 @recover_option
 def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> None:
     """Write one log of LOGS, which have no topic in common: fuselog relabel renames topics."""
-    from pipeline.surgery import merge as merge_logs
+    from pipeline.logs.edit import merge as merge_logs
 
     offsets_s = {}
     for log, text in _pairs("--offset", offsets).items():
@@ -174,7 +174,7 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     The model inertial takes them as it takes sensors: a body that stands has no velocity, and one that
     rolls on wheels moves neither to the side nor up.
     """
-    from pipeline.surgery import constrain as constrain_log
+    from pipeline.logs.edit import constrain as constrain_log
     from recorders.parameters import parse_settings
 
     _say_changed(constrain_log(path, settings=parse_settings(settings), **options))
@@ -203,7 +203,7 @@ def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
 @recover_option
 def relabel(path: Path, topics: tuple[str, ...], components: tuple[str, ...], **options: Any) -> None:
     """Write PATH, a log or an estimates log, with other names; what refers to them follows."""
-    from pipeline.surgery import relabel as relabel_log
+    from pipeline.logs.edit import relabel as relabel_log
 
     done = relabel_log(
         path, topics=_pairs("--topic", topics), components=_pairs("--component", components), **options

@@ -41,9 +41,9 @@ def record(
     settings: tuple[str, ...],
 ) -> None:
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
-    from pipeline.commands import companions_if
-    from pipeline.experiment import load_scenario
-    from pipeline.outputs import RECORDED, check_files
+    from pipeline.command_line.commands import companions_if
+    from pipeline.output.outputs import RECORDED, check_files
+    from pipeline.runs.experiment import load_scenario
     from recorders.log import open_log, write_log
     from recorders.parameters import merge, parse_settings
     from recorders.recording import record_run
@@ -105,7 +105,7 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
-    from pipeline.outputs import check_files, imported
+    from pipeline.output.outputs import check_files, imported
     from recorders.parameters import parse_settings
     from recorders.recording import import_log
 
@@ -129,7 +129,7 @@ def import_(
 
 def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
     """Write a mapping of tables to start from, and say how to go on."""
-    from pipeline.outputs import MAPPING, check_files
+    from pipeline.output.outputs import MAPPING, check_files
     from recorders.atomic import whole_file
     from recorders.importers.tables.guessing import guess
 

@@ -86,7 +86,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     --set gate_probability=1 sets a parameter of all estimators that have it, --set
     ekf.gate_probability=1 of one.
     """
-    from pipeline.commands import replay_logs
+    from pipeline.command_line.commands import replay_logs
 
     replay_logs(list(logs), list(names), **options)
 

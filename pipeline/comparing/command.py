@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.comparing.comparing import compare
-from pipeline.outputs import check_outputs
-from pipeline.settings import settings_of_estimators
-from pipeline.terminal import print_json, print_table, progress, say, warn
+from pipeline.output.outputs import check_outputs
+from pipeline.output.terminal import print_json, print_table, progress, say, warn
+from pipeline.runs.settings import settings_of_estimators
 
 COLUMNS = {
     "quantity": "metric",

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.charts import Axis, Chart, Panel, band, curve, level
+from pipeline.api.api import ResultFolder
+from pipeline.api.replays import Kind, replay
 from pipeline.comparing.sides import (
     Given,
     Side,
@@ -20,16 +21,15 @@ from pipeline.comparing.sides import (
     of_result,
     of_trajectory,
 )
-from pipeline.door import ResultFolder
-from pipeline.ensemble import Progress, hash_files, judge_logs, no_progress
-from pipeline.outputs import TIMELINE, check_files, check_folder
-from pipeline.replays import Kind, replay
-from pipeline.results import RESULT_FILE, Outcome, result_folder, write_outcome
+from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
+from pipeline.output.outputs import TIMELINE, check_files, check_folder
+from pipeline.output.results import RESULT_FILE, Outcome, result_folder, write_outcome
+from pipeline.runs.ensemble import Progress, hash_files, judge_logs, no_progress
 from recorders.errors import BadInput, choices, some_of
 from recorders.log import NotMcap, RunMetadata, open_log, schemas
 from recorders.trajectories import read_trajectory
-from replay.engine.sources import LogSource, MemorySource, Source
-from replay.judging.differences import (
+from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.judging.errors.differences import (
     FEWEST_RUNS,
     NATS,
     Aim,
@@ -37,7 +37,7 @@ from replay.judging.differences import (
     aim_of,
     paired_difference,
 )
-from replay.judging.trajectories import truth_of
+from replay.judging.errors.trajectories import truth_of
 
 MARGIN = 0.02
 # The differences over time have at most so many spans.
@@ -255,7 +255,7 @@ def compare(
 
     Raises BadInput where there are not two sides, or they have nothing in common.
 
-    >>> from pipeline.door import record, write
+    >>> from pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=5.0))
     >>> found = compare("run.mcap", estimators=["ekf", {"sure": {"kind": "ekf", "sigma_range_m": 0.02}}])
     >>> found.table.query("quantity == 'nees'")["runs"].tolist()

@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.ensemble import Progress, judge_logs, parts_of
-from pipeline.estimates import log_of_estimates, stated_estimators
-from pipeline.experiment import Experiment, Setting, load_scenario
-from pipeline.replays import Replay, replay
-from pipeline.results import RESULT_FILE, Result, read_result, read_table, split_metric
-from pipeline.runner import Runner
-from pipeline.starting import check_same_run
+from pipeline.api.replays import Replay, replay
+from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
+from pipeline.runs.ensemble import Progress, judge_logs, parts_of
+from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.initial_states import check_same_run
+from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
 from recorders.parameters import build
 from recorders.trajectories import read_trajectory
-from replay.engine.estimator import configure
-from replay.engine.sources import LogSource, MemorySource, Source
-from replay.judging.evaluation import POSITION, split_topic
-from replay.judging.measuring import find_metrics
-from replay.judging.metrics import rmse_of
+from replay.engine.replaying.estimator import configure
+from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.judging.errors.evaluation import POSITION, split_topic
+from replay.judging.errors.trajectories import estimates_of
+from replay.judging.metrics.measuring import find_metrics
+from replay.judging.metrics.metrics import rmse_of
 from replay.judging.tables import joined
-from replay.judging.trajectories import estimates_of
 
 # Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.
 SAME = 1e-6

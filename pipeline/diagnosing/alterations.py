@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recorders.log import Stream
 from recorders.models.orientation import compose
-from replay.engine.sources import MemorySource
+from replay.engine.streams.sources import MemorySource
 
 Alteration = Callable[[Stream, float], Stream]
 STRAY = 20.0  # in the unit of the vector

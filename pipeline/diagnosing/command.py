@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.outputs import check_outputs
-from pipeline.results import plain
-from pipeline.settings import settings_of_estimators
-from pipeline.terminal import print_json, print_metrics, print_table, say, status
+from pipeline.output.outputs import check_outputs
+from pipeline.output.results import plain
+from pipeline.output.terminal import print_json, print_metrics, print_table, say, status
+from pipeline.runs.settings import settings_of_estimators
 from recorders.errors import BadInput
 from recorders.log import open_log
 from recorders.parameters import parse_settings
-from replay.engine.sources import LogSource
+from replay.engine.streams.sources import LogSource
 
 
 def diagnose_log(

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.charts import Axis, Chart, Panel, curve, level
+from pipeline.api.api import ResultFolder
+from pipeline.api.replays import Kind as EstimatorKind
+from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.findings import (
     Finding,
@@ -25,22 +27,20 @@ from pipeline.diagnosing.findings import (
 )
 from pipeline.diagnosing.hypotheses import Kind, hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.door import ResultFolder
-from pipeline.ensemble import judge_logs
-from pipeline.estimates import log_of_estimates, stated_estimators
-from pipeline.outputs import TIMELINE, check_files, check_folder
-from pipeline.replays import Kind as EstimatorKind
-from pipeline.replays import Log, Replay, replay, settings_of, sources_of
-from pipeline.results import Outcome, result_folder, split_metric, write_outcome
-from pipeline.studies.localization import summarise, summary_table
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.outputs import TIMELINE, check_files, check_folder
+from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.runs.ensemble import judge_logs
+from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.studies.toolkit.localization import summarise, summary_table
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Schema, Stream, schemas
 from recorders.parameters import merge
-from replay.engine.estimator import Bound, bind
-from replay.engine.failures import reason_stream
-from replay.engine.sources import LogSource, MemorySource
-from replay.judging.evaluation import split_topic
-from replay.judging.measuring import metric_key
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.streams.failures import reason_stream
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.judging.errors.evaluation import split_topic
+from replay.judging.metrics.measuring import metric_key
 
 MOST_SENTENCES = 5
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
@@ -234,7 +234,7 @@ def diagnose(
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
     no innovations.
 
-    >>> from pipeline.door import record
+    >>> from pipeline.api.api import record
     >>> found = diagnose(record("landmarks", duration_s=20.0), "ekf", set={"sigma_range_m": 0.02})
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')

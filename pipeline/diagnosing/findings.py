@@ -14,8 +14,8 @@ from scipy.stats import kurtosis
 from pipeline.diagnosing.hypotheses import Kind
 from recorders.log import Stream
 from replay.distributions import chi2
-from replay.judging.evaluation import split_topic
-from replay.judging.whiteness import whitened, whiteness
+from replay.judging.consistency.whiteness import whitened, whiteness
+from replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
 TAIL = 3.0  # standard deviations

@@ -19,10 +19,10 @@ from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.log import Stream, Topic
 from recorders.parameters import Parameters
-from replay.engine.channels import stated
-from replay.engine.estimator import Bound
-from replay.engine.sources import MemorySource
-from replay.judging.evaluation import split_topic
+from replay.engine.replaying.estimator import Bound
+from replay.engine.streams.channels import stated
+from replay.engine.streams.sources import MemorySource
+from replay.judging.errors.evaluation import split_topic
 
 Kind = Literal[
     "measurement noise",

@@ -17,9 +17,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
-from replay.engine.estimator import Bound, bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import Ensemble, MemorySource
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import Ensemble, MemorySource
 
 Floats = NDArray[np.float64]
 Gains = Callable[[Sequence[float]], Sequence[float]]  # of the values of one number

@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.charts import Axis, Chart, Panel, curve, level
 from pipeline.diagnosing import alterations as alter
 from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
 from pipeline.diagnosing.hypotheses import Kind
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.ensemble import hash_streams
-from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Outcome
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
 from recorders.parameters import merge
 from recorders.recording import record_run
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.streams.sources import MemorySource, memory_source
 
 WORTH = 10.0  # of log-likelihood: a fault whose removal gains less is not counted
 FIRST = 0.8  # of the faults that are counted, the least share to be named first
@@ -255,7 +255,7 @@ SCENARIOS = {
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.experiment.Study`."""
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
     rows: list[dict[str, Any]] = []
     clean: list[MemorySource] = []
     for name, scenario in SCENARIOS.items():

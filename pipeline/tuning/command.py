@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.folders import logs_in
-from pipeline.outputs import check_folder
-from pipeline.results import plain
-from pipeline.settings import settings_of_estimators
-from pipeline.terminal import print_json, print_metrics, print_table, say, status, warn
+from pipeline.logs.folders import logs_in
+from pipeline.output.outputs import check_folder
+from pipeline.output.results import plain
+from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
+from pipeline.runs.settings import settings_of_estimators
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
 from recorders.log import open_log
-from replay.engine.sources import LogSource
+from replay.engine.streams.sources import LogSource
 
 
 def tune_logs(

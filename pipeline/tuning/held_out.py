@@ -7,16 +7,16 @@ or what the log states; others, held out, are replayed with either values.
 from collections.abc import Collection
 from dataclasses import replace
 
-from pipeline.ensemble import hash_streams
-from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Outcome
-from pipeline.runner import Runner
-from pipeline.studies.localization import summarise
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.localization import summarise
 from pipeline.tuning.outcome import START, TUNED
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.engine.sources import MemorySource
+from replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
@@ -28,7 +28,7 @@ class HeldOutOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.experiment.Study`."""
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
     options: HeldOutOptions = setting.options
     if not (options.free and options.tuned_by and options.held_out and len(experiment.estimators) == 1):
         raise BadInput(

@@ -15,18 +15,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.executors import Team, threads
+from pipeline.runs.executors import Team, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import Bound, Opened, Opening, Recursive, bind
-from replay.engine.failures import sentences_of
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import Ensemble, MemorySource, Source
+from replay.engine.replaying.estimator import Bound, Opened, Opening, Recursive, bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import Ensemble, MemorySource, Source
+from replay.judging.consistency.whiteness import whitened
 from replay.judging.judge import Judge
-from replay.judging.measuring import Sums, plus
-from replay.judging.whiteness import whitened
+from replay.judging.metrics.measuring import Sums, plus
 
 Floats = NDArray[np.float64]
 By = Literal["likelihood", "nis", "nees", "rmse"]

@@ -13,20 +13,20 @@ import pandas as pd
 import tomli_w
 from numpy.typing import NDArray
 
-from pipeline.charts import Axis, Chart, Panel, curve, level
-from pipeline.door import ResultFolder
-from pipeline.outputs import check_folder
-from pipeline.replays import Replay, replay
-from pipeline.results import Outcome, result_folder, split_metric, write_outcome
-from pipeline.studies.localization import summarise, summary_table
+from pipeline.api.api import ResultFolder
+from pipeline.api.replays import Replay, replay
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.outputs import check_folder
+from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.studies.toolkit.localization import summarise, summary_table
 from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, profiles
 from pipeline.tuning.objective import Objective, innovations_in
 from pipeline.tuning.search import Coordinates
-from replay.engine.sources import LogSource, MemorySource
-from replay.judging.evaluation import split_topic
-from replay.judging.measuring import metric_key
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.judging.consistency.whiteness import whitened, whiteness
+from replay.judging.errors.evaluation import split_topic
+from replay.judging.metrics.measuring import metric_key
 from replay.judging.tables import joined
-from replay.judging.whiteness import whitened, whiteness
 
 Floats = NDArray[np.float64]
 Source = LogSource | MemorySource

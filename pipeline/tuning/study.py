@@ -12,15 +12,15 @@ import numpy as np
 import pandas as pd
 from pydantic import PositiveFloat
 
-from pipeline.charts import Axis, Chart, Panel, curve, level
-from pipeline.ensemble import hash_streams
-from pipeline.experiment import Experiment, Setting, Study
-from pipeline.results import Outcome
-from pipeline.runner import Runner
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.engine.sources import MemorySource
+from replay.engine.streams.sources import MemorySource
 
 COVERAGE = 0.95
 
@@ -33,7 +33,7 @@ class TuningOptions(Parameters):
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
-    """Run the experiment; see `pipeline.experiment.Study`."""
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
     options: TuningOptions = setting.options
     if not options.true or len(experiment.estimators) != 1:
         raise BadInput(f"experiment '{experiment.title}': give one estimator, and [options.true]")

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.executors import Team, crew_of, of_executor
-from pipeline.replays import Kind, Log, settings_of, sources_of
+from pipeline.api.replays import Kind, Log, settings_of, sources_of
+from pipeline.runs.executors import Team, crew_of, of_executor
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -38,8 +38,8 @@ from pipeline.tuning.search import (
 )
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
-from replay.engine.channels import stated
-from replay.engine.estimator import Bound, Recursive, bind
+from replay.engine.replaying.estimator import Bound, Recursive, bind
+from replay.engine.streams.channels import stated
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
@@ -87,7 +87,7 @@ def tune(
     Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
     Raises BadInput where there is nothing to search, or no log can be replayed at the start.
 
-    >>> from pipeline.door import record
+    >>> from pipeline.api.api import record
     >>> log = record("landmarks", duration_s=20.0)
     >>> found = tune(log, "ekf", "sigma_range_m", set={"sigma_range_m": 0.5})
     >>> found.parameters["value"].round(1).tolist()

@@ -1,7 +1,7 @@
 """The log contract: schemas, columns, and the reading and writing of MCAP files."""
 
 from recorders.log.companions import Companion
-from recorders.log.container import NotMcap
+from recorders.log.container.reading import NotMcap
 from recorders.log.opening import Log, Topic, open_log
 from recorders.log.reader import read_blocks, read_empty, read_span, read_streams
 from recorders.log.run import RunMetadata

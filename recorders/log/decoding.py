@@ -13,7 +13,7 @@ from mcap import records
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.log.chunks import Contents
+from recorders.log.container.chunks import Contents
 from recorders.log.layout import RECORD_HEAD, Layout, columns_of, layout_of, windows
 from recorders.log.loops import HEAD_BYTES
 from recorders.log.opening import Log

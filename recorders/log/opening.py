@@ -9,7 +9,7 @@ from mcap import records
 
 from recorders.errors import BadInput
 from recorders.log.companions import COMPANION_OF
-from recorders.log.container import Container, open_container
+from recorders.log.container.reading import Container, open_container
 from recorders.log.run import RECORD_NAME, RunMetadata
 
 

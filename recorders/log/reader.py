@@ -11,12 +11,12 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log.ahead import ahead
-from recorders.log.chunks import Contents, Damaged, Span, open_region
-from recorders.log.container import Region, read_bytes
+from recorders.log.container.ahead import ahead
+from recorders.log.container.chunks import Contents, Damaged, Span, open_region
+from recorders.log.container.reading import Region, read_bytes
+from recorders.log.container.sealed import PUBLISH_SPANS, noted_span
 from recorders.log.decoding import Decoder
 from recorders.log.opening import Log
-from recorders.log.sealed import PUBLISH_SPANS, noted_span
 from recorders.log.streams import Clock, Stream, check_stream, concatenate
 
 # Beyond every stamp that MCAP can state.

@@ -15,9 +15,9 @@ from recorders.log.companions import (
     chunks_of_companions,
     descriptor_set,
 )
-from recorders.log.container_writer import ContainerWriter
+from recorders.log.container.packing import chunks_of
+from recorders.log.container.writing import ContainerWriter
 from recorders.log.layout import layout_of
-from recorders.log.packing import chunks_of
 from recorders.log.run import RECORD_NAME, RunMetadata
 from recorders.log.schemas import Schema
 from recorders.log.streams import Stream, check_stream

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recorders.models.orientation import SIGNS
 from replay.distributions.gaussian_kernels import solve_in_place
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 
 Vector = NDArray | tuple[float, ...]
 

@@ -16,7 +16,7 @@ from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal_kernels as kernels
 from replay.distributions.batches import flatten
 from replay.distributions.wrapped_normal_kernels import Mixture
-from replay.engine.compile import compiled
+from replay.engine.compiling.compile import compiled
 
 _product_mixture = compiled(kernels.product_mixture, allocates=False)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.models.planar import Component, Components, wrap_angle
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 
 TURN = 2.0 * math.pi
 # exp(-UNIFORM / 2) is below the rounding of 1: no larger variance is told from a uniform distribution.

@@ -4,15 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from recorders.errors import BadInput, choices
-from replay.engine.estimator import Estimator, set_by_variant
-from replay.inference.bank import BANK
-from replay.inference.bound import POSTERIOR_BOUND
+from replay.engine.replaying.estimator import Estimator, set_by_variant
 from replay.inference.estimators import modelled_by
-from replay.inference.imm import INTERACTING
-from replay.inference.iterated import SMOOTHING
-from replay.inference.methods import FILTERS, Method
-from replay.inference.model import Model
-from replay.inference.particle_filter import BOOTSTRAP
+from replay.inference.kalman.methods import FILTERS, Method
+from replay.inference.model.model import Model
+from replay.inference.modes.gaussian_sum import BANK
+from replay.inference.modes.imm import INTERACTING
+from replay.inference.particles.filter import BOOTSTRAP
+from replay.inference.smoothing.bound import POSTERIOR_BOUND
+from replay.inference.smoothing.iterated import SMOOTHING
 
 METHODS: Mapping[str, Method] = {
     **FILTERS,
@@ -29,7 +29,7 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
 
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
-    >>> from replay.estimators.landmarks import ROBOT
+    >>> from replay.estimators.models.landmarks import ROBOT
     >>> modelled(ROBOT, "particles:500").parameters().particles
     500
     """

@@ -14,9 +14,10 @@ from recorders.log import Topic
 from recorders.parameters import Parameters, build
 from recorders.registry import available, load
 from replay.engine.arrays import Floats
-from replay.engine.estimator import Bound, Estimator, Recursive
-from replay.engine.geodetic import stated_origin
-from replay.inference.augmentation import (
+from replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from replay.engine.streams.geodetic import stated_origin
+from replay.inference.kalman.methods import Method
+from replay.inference.model.augmentation import (
     Start,
     augmented,
     augmented_stage,
@@ -24,18 +25,17 @@ from replay.inference.augmentation import (
     estimated,
     with_walks,
 )
-from replay.inference.binding import Found, roles_of, topics_of
-from replay.inference.filtering import Filter, samplers_of
-from replay.inference.methods import Method
-from replay.inference.model import Model, ModelParameters, Motion
-from replay.inference.needs import OWN_MODEL, elsewhere, names_state, nearest, needs_of
-from replay.inference.opening import Beginning
-from replay.inference.rewinding import Rewinding
-from replay.inference.settings import (
+from replay.inference.model.binding import Found, roles_of, topics_of
+from replay.inference.model.model import Model, ModelParameters, Motion
+from replay.inference.model.requirements import OWN_MODEL, elsewhere, names_state, nearest, needs_of
+from replay.inference.model.settings import (
     assumed_of,
     settings_of,
 )
-from replay.inference.stage import Stage, stage_of
+from replay.inference.model.stage import Stage, stage_of
+from replay.inference.run.filtering import Filter, samplers_of
+from replay.inference.run.initialization import Beginning
+from replay.inference.run.out_of_sequence import Rewinding
 
 
 @lru_cache(maxsize=256)

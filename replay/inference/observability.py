@@ -19,26 +19,26 @@ from pydantic import PositiveFloat
 from recorders.errors import BadInput, choices
 from recorders.log import make_stream, schemas
 from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.blocks import Ragged, copied
-from replay.engine.compile import compile_over_runs
-from replay.engine.estimator import Estimator
-from replay.engine.tangent import tangent_components
-from replay.inference.affine import carrying
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.replaying.estimator import Estimator
+from replay.engine.streams.blocks import Ragged, copied
+from replay.engine.vectors.tangent import tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
-from replay.inference.filtering import State
-from replay.inference.gaussian import kalman_step, keep_measured, multiply_into, whiten
-from replay.inference.iterated import ITERATED, IteratedSmoother, Way
-from replay.inference.manifold import differencing, is_flat
-from replay.inference.methods import Method, MethodParameters
-from replay.inference.model import Model
-from replay.inference.motion_steps import motion_derivative
-from replay.inference.parameters import number_fields
-from replay.inference.recursion import Estimates, filled, no_results, recursion
-from replay.inference.sensor_steps import reading, sensor_derivative, sensor_noise, slots_of
-from replay.inference.settings import reading_settings
-from replay.inference.stage import Stage, title_of
-from replay.inference.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
-from replay.inference.tuples import tuple_of
+from replay.inference.kalman.methods import Method, MethodParameters
+from replay.inference.kalman.predict import motion_derivative
+from replay.inference.kalman.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
+from replay.inference.kalman.update import reading, sensor_derivative, sensor_noise, slots_of
+from replay.inference.linear_algebra.gaussian import kalman_step, keep_measured, multiply_into, whiten
+from replay.inference.linear_algebra.manifold import differencing, is_flat
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.model.model import Model
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.settings import reading_settings
+from replay.inference.model.stage import Stage, title_of
+from replay.inference.run.filtering import State
+from replay.inference.run.recursion import Estimates, filled, no_results, recursion
+from replay.inference.smoothing.affine import carrying
+from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
 
 RANK_TOLERANCE = 1e-10  # of the largest eigenvalue and for each component
 WEAK = 10.0  # priors

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import schemas
-from replay.engine.blocks import Ragged
-from replay.engine.failures import sentences_of
-from replay.engine.sources import Source
-from replay.judging.bounds import Bounds
-from replay.judging.evaluation import (
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import Source
+from replay.judging.consistency.bounds import Bounds
+from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
     chi_square_interval,
@@ -27,13 +27,21 @@ from replay.judging.evaluation import (
     split_topic,
     unjudged,
 )
-from replay.judging.means import MeansOfAll
-from replay.judging.measuring import Measurement, Metric, Output, Sums, find_metrics, metric_key, plus
-from replay.judging.metrics import covered, estimated_share
-from replay.judging.quantities import Quantities, columns_of
-from replay.judging.set_errors import SetErrors, set_errors
-from replay.judging.sums import BinnedSums
-from replay.judging.truths import Truths
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.means import MeansOfAll
+from replay.judging.metrics.measuring import (
+    Measurement,
+    Metric,
+    Output,
+    Sums,
+    find_metrics,
+    metric_key,
+    plus,
+)
+from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.quantities import Quantities, columns_of
+from replay.judging.metrics.sums import BinnedSums
+from replay.judging.sets.errors import SetErrors, set_errors
 
 if TYPE_CHECKING:
     import pandas as pd

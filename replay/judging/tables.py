@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 import pandas as pd
 
-from replay.judging.bounds import Bounds
-from replay.judging.evaluation import Errors, Floats, rmse_interval
-from replay.judging.metrics import step_bounds
-from replay.judging.quantities import Quantities
+from replay.judging.consistency.bounds import Bounds
+from replay.judging.errors.evaluation import Errors, Floats, rmse_interval
+from replay.judging.metrics.metrics import step_bounds
+from replay.judging.metrics.quantities import Quantities
 
 
 def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:

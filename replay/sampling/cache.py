@@ -1,7 +1,8 @@
 """The sample cache: LCD sets are computed once, kept on disk, and never trusted when damaged.
 
-A file (see `replay.engine.cache`) holds a NumPy npz archive whose members are named after their sets.
-Common sets ship with the package (see `replay.sampling.ship`); others are kept in the user's cache.
+A file (see `replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named after
+their sets. Common sets ship with the package (see `replay.sampling.ship`); others are kept in the user's
+cache.
 """
 
 import io
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.cache import cache_folder, is_private, read_checked, write_checked
+from replay.engine.compiling.cache import cache_folder, is_private, read_checked, write_checked
 from replay.sampling.distance import Array
 from replay.sampling.lcd import Report, check_count, lcd_samples, moment_corrected, silent
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from replay.engine.compile import compiled
+from replay.engine.compiling.compile import compiled
 
 Array = NDArray[np.float64]
 

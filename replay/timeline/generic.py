@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput
 from recorders.log import Field, Stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
-from replay.engine.geodetic import stated_origin
-from replay.judging.evaluation import Floats
-from replay.timeline.about import draw_about
-from replay.timeline.canvas import (
+from replay.engine.streams.geodetic import stated_origin
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.about import draw_about
+from replay.timeline.drawing.canvas import (
     PALETTE,
     Canvas,
     Scene,
@@ -29,18 +29,9 @@ from replay.timeline.canvas import (
     entity_path,
     thin,
 )
-from replay.timeline.directional import draw_triads, space_view
-from replay.timeline.events import NOT_SENSED, above_events, draw_events
-from replay.timeline.geodetic import degrees_of, draw_fixes, draw_way, map_view
-from replay.timeline.landmarks import (
-    ARROW_SHARE,
-    draw_sights,
-    draw_track,
-    landmarks_of,
-    tracks_of,
-)
-from replay.timeline.navigation import draw_navigation
-from replay.timeline.plane import (
+from replay.timeline.drawing.events import NOT_SENSED, above_events, draw_events
+from replay.timeline.drawing.geodetic import degrees_of, draw_fixes, draw_way, map_view
+from replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
     draw_clouds,
@@ -52,7 +43,7 @@ from replay.timeline.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.plots import (
+from replay.timeline.drawing.plots import (
     POINTS,
     draw_components,
     draw_curve,
@@ -61,7 +52,16 @@ from replay.timeline.plots import (
     plot_view,
     shown_unit,
 )
-from replay.timeline.thinning import KEPT_ROWS, curves_of
+from replay.timeline.drawing.thinning import KEPT_ROWS, curves_of
+from replay.timeline.families.directional import draw_triads, space_view
+from replay.timeline.families.landmarks import (
+    ARROW_SHARE,
+    draw_sights,
+    draw_track,
+    landmarks_of,
+    tracks_of,
+)
+from replay.timeline.families.navigation import draw_navigation
 
 FIXES = frozenset(schema.full_name for schema in (schemas.POSITION_FIX, schemas.COURSE_FIX))
 LANDMARK, POSE = schemas.LANDMARK.full_name, schemas.POSE.full_name

@@ -14,14 +14,14 @@ import rerun.blueprint as rrb
 from recorders.errors import BadInput, choices, printable
 from recorders.log import Stream
 from recorders.registry import available, load
-from replay.engine.blocks import Ragged
-from replay.engine.sources import Source
-from replay.judging.evaluation import Errors, errors_at
-from replay.timeline.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import Source
+from replay.judging.errors.evaluation import Errors, errors_at
+from replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
+from replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 from replay.timeline.generic import TIMELINE as GENERIC
 from replay.timeline.side_by_side import draw_side_by_side
 from replay.timeline.sinks import open_recording
-from replay.timeline.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
 
 # A receiver is sent so many messages of outputs at once.
 LIVE_MESSAGES = 20_000

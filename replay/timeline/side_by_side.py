@@ -11,9 +11,9 @@ from uuid import uuid4
 import numpy as np
 import rerun.blueprint as rrb
 
-from replay.judging.evaluation import Errors, Floats
-from replay.timeline.canvas import Canvas, Scene, entity_path, escaped
-from replay.timeline.plots import LINE, draw_curve, plot_view
+from replay.judging.errors.evaluation import Errors, Floats
+from replay.timeline.drawing.canvas import Canvas, Scene, entity_path, escaped
+from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
 
 Board = rrb.Container | rrb.View
 

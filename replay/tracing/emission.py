@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.engine.kernels.functions import FUNCTIONS
-from replay.engine.kernels.numbers import (
+from replay.engine.compiling.kernels.functions import FUNCTIONS
+from replay.engine.compiling.kernels.numbers import (
     REAL,
     Emitter,
     Number,

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.kernels.identity import digest_of
-from replay.engine.kernels.numbers import REAL, Emitter, Number, constant
-from replay.engine.kernels.program import Instance, Program, called
-from replay.engine.kernels.values import Array, Record, entries, load, part_of, store
+from replay.engine.compiling.kernels.identity import digest_of
+from replay.engine.compiling.kernels.numbers import REAL, Emitter, Number, constant
+from replay.engine.compiling.kernels.program import Instance, Program, called
+from replay.engine.compiling.kernels.values import Array, Record, entries, load, part_of, store
 from replay.tracing.derivatives import slopes_of
 from replay.tracing.emission import emit, python_of
 from replay.tracing.graph import INPUT, Graph, Node, described, needed
@@ -85,7 +85,7 @@ class TracedFunction:
         )
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
-        """Write a call of it; see `replay.engine.kernels.expressions`."""
+        """Write a call of it; see `replay.engine.compiling.kernels.expressions`."""
         numbers = _called(program, emitter, self, self.outputs, arguments)
         count = len(self.result.returned)
         for (argument, place, _), number in zip(self.result.written, numbers[count:], strict=True):

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.ensemble import record_ensemble
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource
+from pipeline.runs.ensemble import record_ensemble
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource
 from tests.bench.bench_models import sightings
 from tests.bench.columns import Floats, column, offsets, prior, stamps_ns
 from tests.bench.loops import calls_of

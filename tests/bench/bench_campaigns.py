@@ -11,10 +11,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from pipeline.campaigns import cells_of, judge_all
-from pipeline.executors import Crew, processes
-from pipeline.experiment import Experiment, Setting, load_experiment, run_experiment
-from pipeline.kept import kept_cells
+from pipeline.runs.campaigns import cells_of, judge_all
+from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.executors import Crew, processes
+from pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
 from tests.bench.timing import cpu_seconds, seconds
 
 RUNS = 2000

@@ -11,7 +11,7 @@ import numpy as np
 
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
-from replay.estimators.bingham import BinghamNoise, Steps, make_steps, run_bingham_filter
+from replay.estimators.directional.bingham import BinghamNoise, Steps, make_steps, run_bingham_filter
 from tests.bench.timing import median_seconds, seconds
 
 REVERSE = np.eye(4)[::-1]

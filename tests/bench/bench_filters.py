@@ -26,9 +26,9 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import UnscentedKalmanUpdater
 
 from recorders.recording import record_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
 from tests.bench.timing import cpu_seconds
 
 TOLERANCE = 1e-6

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from recorders.models.optical import line_of_sight
-from replay.estimators import optical
-from replay.estimators.optical import Scene
+from replay.estimators.localization import optical
+from replay.estimators.localization.optical import Scene
 from tests.bench.timing import seconds
 
 SCENARIOS = Path(__file__).parents[2] / "data" / "scenarios"

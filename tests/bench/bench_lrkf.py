@@ -25,10 +25,10 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
-from pipeline.ensemble import record_ensemble
+from pipeline.runs.ensemble import record_ensemble
 from recorders.models.reactor import react
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
 from replay.sampling import Samples, parse_sampling
 from tests.bench.reference.reactor import compiled_c
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.ensemble import record_ensemble
+from pipeline.runs.ensemble import record_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import wrap_angle
 from recorders.recording import Recording, simulation_stamps_ns
@@ -20,9 +20,9 @@ from recorders.simulators.headings import equal_sigmas
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
 from tests.bench.columns import Floats, column, copied, offsets, offsets_of, prior, stamps_ns
 from tests.bench.loops import Call, calls_of
 from tests.bench.reference import bingham as bingham_reference

@@ -8,9 +8,9 @@ with `make bench`, or `python -m tests.bench navigation`.
 import numpy as np
 
 from recorders.recording import record_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
 from tests.bench.reference import navigation
 from tests.bench.timing import cpu_seconds
 

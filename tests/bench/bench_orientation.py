@@ -11,11 +11,11 @@ import numpy as np
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.inertial import product
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators.complementary import HALF
-from replay.estimators.inertial import triad
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.orientation.complementary import HALF
+from replay.estimators.orientation.inertial import triad
 from tests.bench.timing import median_seconds, seconds
 
 COUNT, STEP_NS, THEIRS = 100_000, 10_000_000, 500

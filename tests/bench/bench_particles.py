@@ -19,11 +19,11 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
-from pipeline.ensemble import record_ensemble
+from pipeline.runs.ensemble import record_ensemble
 from recorders.models.vehicles import noise_moments, turn
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource
 from tests.bench.timing import cpu_seconds
 
 Floats = NDArray[np.float64]

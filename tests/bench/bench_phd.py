@@ -13,19 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from pipeline.ensemble import replay_in_memory
+from pipeline.runs.ensemble import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.engine.blocks import gather
-from replay.estimators.gaussian_mixture_phd import (
+from replay.engine.streams.blocks import gather
+from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
     scans_of,
     settings_of,
     start,
 )
-from replay.judging.set_distances import gospa
-from replay.judging.set_errors import CUTOFF_M, set_errors
-from replay.judging.truths import Truths
+from replay.judging.errors.truths import Truths
+from replay.judging.sets.distances import gospa
+from replay.judging.sets.errors import CUTOFF_M, set_errors
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source
 
 RUNS = 6

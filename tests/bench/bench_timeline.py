@@ -9,9 +9,9 @@ import rerun as rr
 import rerun.chunk as rc
 
 from recorders.recording import record_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import memory_source
 from replay.judging.judge import Judge
 from replay.timeline.show import show
 

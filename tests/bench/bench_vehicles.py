@@ -18,11 +18,11 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
-from pipeline.ensemble import record_ensemble
+from pipeline.runs.ensemble import record_ensemble
 from recorders.models.vehicles import noise_moments, turn
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource
 
 RUNS = 200
 REPEATS = 5

@@ -8,11 +8,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.estimator import Bound
-from replay.engine.replaying import replay
-from replay.engine.sources import Source
-from replay.inference import filtering
-from replay.inference.recursion import Estimates, Innovations, filled
+from replay.engine.replaying.estimator import Bound
+from replay.engine.replaying.replaying import replay
+from replay.engine.streams.sources import Source
+from replay.inference.run import filtering
+from replay.inference.run.recursion import Estimates, Innovations, filled
 
 Floats = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from time import process_time
 from typing import Any
 
-from pipeline.ensemble import record_ensemble
-from replay.engine.estimator import Bound, bind
-from replay.engine.sources import MemorySource
+from pipeline.runs.ensemble import record_ensemble
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.streams.sources import MemorySource
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
 from tests.bench.loops import Call, calls_of

@@ -19,12 +19,12 @@ from typing import NamedTuple
 
 import matplotlib as mpl
 
-from pipeline.campaigns import Cell, cells_of
-from pipeline.charts import Axis, Chart, Panel, curve, draw, level
-from pipeline.ensemble import RUNS_AT_ONCE
-from pipeline.executors import processes
-from pipeline.experiment import Setting, load_experiment, run_experiment
-from pipeline.kept import kept_cells
+from pipeline.output.charts import Axis, Chart, Panel, curve, draw, level
+from pipeline.runs.campaigns import Cell, cells_of
+from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.ensemble import RUNS_AT_ONCE
+from pipeline.runs.executors import processes
+from pipeline.runs.experiment import Setting, load_experiment, run_experiment
 from tests.bench.timing import seconds
 
 DOCS = Path(__file__).parents[2] / "docs"

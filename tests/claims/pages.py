@@ -23,10 +23,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
-from pipeline.catalog import scenarios
-from pipeline.claims import Verdict
-from pipeline.experiment import load_experiment, shipped
-from pipeline.results import MetricValue, Result, read_result
+from pipeline.api.catalog import scenarios
+from pipeline.output.claims import Verdict
+from pipeline.output.results import MetricValue, Result, read_result
+from pipeline.runs.experiment import load_experiment, shipped
 from recorders.importers.tables.mapping import read_mapping
 from recorders.importers.tables.mapping import shipped as shipped_mappings
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.claims import Claim
-from pipeline.experiment import load_experiment, shipped
-from pipeline.results import Outcome, result_folder, write_outcome
+from pipeline.output.claims import Claim
+from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.runs.experiment import load_experiment, shipped
 from recorders.importers.tables.mapping import shipped as shipped_mappings
 from tests.bench import __main__ as bench
 from tests.claims import pages

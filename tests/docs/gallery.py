@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from pipeline.catalog import Entry, experiments
+from pipeline.api.catalog import Entry, experiments
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEAD = """---

@@ -10,10 +10,10 @@ from pathlib import Path
 import click
 from PIL import Image
 
+from pipeline.api.api import record
+from pipeline.api.replays import replay
 from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.door import record
-from pipeline.experiment import shipped
-from pipeline.replays import replay
+from pipeline.runs.experiment import shipped
 from recorders.errors import choices
 from replay.timeline.viewer import screenshot
 from tests.docs.gallery import DOCS

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
-from pipeline import catalog
-from pipeline.catalog import Entry
+from pipeline.api import catalog
+from pipeline.api.catalog import Entry
 from recorders.log.schemas import SCHEMAS, Field, Schema
 from recorders.parameters import describe, explain
 from replay.inference.all_methods import METHODS

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.command_line import main
-from pipeline.kept import Kept
+from pipeline.runs.checkpoints import Kept
 from tests.faults import Tally
 
 COMMANDS = (

@@ -24,8 +24,8 @@ from mcap.writer import Writer
 
 from pipeline.command_line import main
 from recorders.log import Stream
-from recorders.log.chunks import MAGIC
-from recorders.log.sealed import seal
+from recorders.log.container.chunks import MAGIC
+from recorders.log.container.sealed import seal
 from recorders.recording import record_run
 from tests.faults import Tally
 from tests.faults.damaged_logs import tally

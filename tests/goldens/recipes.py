@@ -13,12 +13,12 @@ from typing import Any
 import click
 import numpy as np
 
-from pipeline.experiment import Experiment, load_experiment, load_scenario, shipped
-from pipeline.studies.los_moving import unknowns
+from pipeline.runs.experiment import Experiment, load_experiment, load_scenario, shipped
+from pipeline.studies.optical.moving import unknowns
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
 from recorders.simulators.moving_optical import MovingOpticalParameters
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.streams.sources import MemorySource, memory_source
 
 # Of each importer, or mapping of tables: what to give it in the folder of real data, and the archive
 # that this is in.

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.checking.golden import Replayed, Tolerance, Tolerances, golden_of, make
 from pipeline.checking.stored import SUFFIX, Golden
-from pipeline.experiment import run_experiment
+from pipeline.runs.experiment import run_experiment
 from tests.goldens.recipes import RECIPES, first_log
 
 FOLDER = Path(__file__).parent / "stored"

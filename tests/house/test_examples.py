@@ -30,10 +30,10 @@ def test_what_one_begins_with_has_an_example() -> None:
         "recorders.log.streams:Stream",
         "recorders.log.streams:make_stream",
         "recorders.recording:record_run",
-        "replay.engine.covariances:normalized_error_squared",
-        "replay.engine.plain:batch",
-        "replay.engine.plain:recursive",
-        "replay.inference.model:Model",
+        "replay.engine.vectors.covariances:normalized_error_squared",
+        "replay.engine.api.functions:batch",
+        "replay.engine.api.functions:recursive",
+        "replay.inference.model.model:Model",
     ):
         module, _, name = each.partition(":")
         assert ">>> " in getattr(import_module(module), name).__doc__, each

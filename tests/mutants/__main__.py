@@ -15,7 +15,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 
-from pipeline.terminal import print_table
+from pipeline.output.terminal import print_table
 from tests.mutants.faults import FAULTS, Fault, faulty
 
 ROOT = Path(__file__).parents[2]

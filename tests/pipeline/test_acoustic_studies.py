@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.results import Outcome
-from pipeline.studies.acoustic_recordings import (
+from pipeline.output.results import Outcome
+from pipeline.studies.acoustic.recordings import (
     Options,
     Published,
     _explained,
@@ -14,11 +14,11 @@ from pipeline.studies.acoustic_recordings import (
     differences_of,
     known_place,
 )
-from pipeline.studies.acoustic_sequence import claims, log_ratio, of_runs, positions, shots_of
+from pipeline.studies.acoustic.sequence import claims, log_ratio, of_runs, positions, shots_of
 from recorders.errors import BadInput
 from recorders.recording import import_run, record_run
-from replay.engine.sources import memory_source
-from replay.judging.evaluation import Errors
+from replay.engine.streams.sources import memory_source
+from replay.judging.errors.evaluation import Errors
 
 
 def test_a_shot_is_where_it_was_fired_and_when_it_was_heard_last():

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import rerun.chunk
 
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
 HEADER = "Time,MMSI,Latitude_degrees,Longitude_degrees,COG_degrees,SOG_knots"

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 from tests.claims.pages import FOLDER
 

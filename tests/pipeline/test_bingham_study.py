@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
 pytestmark = pytest.mark.paper

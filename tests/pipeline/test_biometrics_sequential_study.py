@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.biometrics_sequential import Drawn, Options, wald_tests, watched
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.biometrics.sequential import Drawn, Options, wald_tests, watched
 from recorders.errors import BadInput
 
 USERS = 400

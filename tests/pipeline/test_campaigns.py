@@ -15,15 +15,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from pipeline import campaigns
 from pipeline.command_line import main
-from pipeline.executors import Here, Team, crew_of, version_of_code
-from pipeline.experiment import experiment_of_logs, load_experiment, run_experiment
-from pipeline.kept import kept_cells
+from pipeline.runs import campaigns
+from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.executors import Here, Team, crew_of, version_of_code
+from pipeline.runs.experiment import experiment_of_logs, load_experiment, run_experiment
 from recorders.errors import BadInput
 from recorders.log import write_log
 from recorders.recording import record_run
-from replay.judging.sums import BinnedSums
+from replay.judging.metrics.sums import BinnedSums
 from tests.bench import scaling
 
 # Three cells, of which the last is small.
@@ -202,7 +202,7 @@ class Dying(Here):
 
 def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
     """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
-    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     drives, place = tmp_path / "drives", tmp_path / "result"
     drives.mkdir()
     logs = [drives / f"{seed}.mcap" for seed in (1, 2)]

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.results import result_folder
+from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 
 Fuselog = Callable[..., Any]
@@ -93,7 +93,7 @@ def test_more_runs_than_are_replayed_at_once(
     here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thousand logs must not need a thousand open files: they are replayed in parts."""
-    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     logs = [str(world / "log.mcap"), str(world / "other.mcap")]
     in_parts = fuselog("replay", *logs, "-e", "ekf", "--out", "a", "--json").json["metrics"]
     monkeypatch.undo()
@@ -106,7 +106,7 @@ def test_a_part_of_the_runs_that_cannot_start_fails_alone(
     world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one run of an ensemble does; where no run of any part can start, that is bad input."""
-    monkeypatch.setattr("pipeline.ensemble.RUNS_AT_ONCE", 1)
+    monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
     good, bad = str(world / "log.mcap"), str(world / "bad-prior.mcap")
     said = fuselog("replay", good, bad, "-e", "ekf", "--out", "both", "--json")
     assert said.code == 0, said.err
@@ -326,7 +326,7 @@ HEAVY = (
     *("scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.spatial"),
 )
 # What compiles and loads kernels.
-KERNELS = ("replay.engine.keeping", "replay.engine.inlining")
+KERNELS = ("replay.engine.compiling.keeping", "replay.engine.compiling.inlining")
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ KERNELS = ("replay.engine.keeping", "replay.engine.inlining")
         (["info", "log.mcap"], (*HEAVY, *KERNELS, "scipy.special", "concurrent.futures.process")),
         (["models"], (*HEAVY, *KERNELS, "scipy.special")),
         (["metrics"], (*HEAVY, *KERNELS, "scipy.special")),
-        (["replay", "log.mcap", "-e", "ekf", "-e", "ukf"], (*HEAVY, "pipeline.experiment")),
+        (["replay", "log.mcap", "-e", "ekf", "-e", "ukf"], (*HEAVY, "pipeline.runs.experiment")),
         (["estimators"], (*KERNELS, "matplotlib", "rerun", "sklearn", "scipy.stats")),
         (["scenarios"], (*KERNELS, "matplotlib", "rerun", "sklearn", "scipy.stats", "h5py")),
     ],

@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.results import Outcome
-from pipeline.studies import localization
-from pipeline.studies.consistency import ConsistencyOptions, study
+from pipeline.output.results import Outcome
+from pipeline.studies.toolkit import localization
+from pipeline.studies.toolkit.consistency import ConsistencyOptions, study
 
 
 def steps(estimator: str, nees: Any) -> pd.DataFrame:

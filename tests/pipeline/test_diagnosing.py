@@ -19,7 +19,7 @@ from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
 from pipeline.diagnosing.hypotheses import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Peak, Trial, interval, peak
-from replay.engine.estimator import bind
+from replay.engine.replaying.estimator import bind
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 
 Fuselog = Callable[..., Any]

@@ -15,10 +15,11 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.charts import Chart
-from pipeline.claims import Claim
-from pipeline.ensemble import hash_files, hash_streams, record_ensemble
-from pipeline.experiment import (
+from pipeline.output.charts import Chart
+from pipeline.output.claims import Claim
+from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.runs.ensemble import hash_files, hash_streams, record_ensemble
+from pipeline.runs.experiment import (
     Experiment,
     Setting,
     Study,
@@ -26,14 +27,13 @@ from pipeline.experiment import (
     load_experiment,
     run_experiment,
 )
-from pipeline.results import Outcome, result_folder, write_outcome
-from pipeline.studies.localization import summarise
+from pipeline.studies.toolkit.localization import summarise
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
 from recorders.parameters import build
 from recorders.recording import Recording
-from replay.engine.blocks import gather
-from replay.engine.sources import memory_source
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import memory_source
 from replay.judging.judge import Judge
 
 pytestmark = pytest.mark.paper
@@ -377,7 +377,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
         (setting.folder / "half").write_text("written")
         raise ZeroDivisionError("no runs")
 
-    monkeypatch.setattr("pipeline.experiment.load", lambda *_: Study("fails", divide))
+    monkeypatch.setattr("pipeline.runs.experiment.load", lambda *_: Study("fails", divide))
     with pytest.raises(BadInput, match="study mine raised ZeroDivisionError: no runs"):
         run_experiment("x", Experiment(title="x", study="mine"), tmp_path / "out")
     assert not list(tmp_path.iterdir())

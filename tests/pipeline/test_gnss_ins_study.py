@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.results import Result
-from pipeline.studies.gnss_ins import GnssInsOptions, ignoring_delay
-from pipeline.studies.outages import (
+from pipeline.output.results import Result
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.navigation.gnss_ins import GnssInsOptions, ignoring_delay
+from pipeline.studies.navigation.outages import (
     Rows,
     coasted,
     error_table,
@@ -25,7 +25,7 @@ from pipeline.studies.outages import (
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
-from replay.engine.sources import MemorySource
+from replay.engine.streams.sources import MemorySource
 
 
 def accelerated() -> Rows:

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.studies.imu_grades import Limit, Span, _claim, horizontal
-from replay.judging.evaluation import Errors
+from pipeline.studies.navigation.imu_grades import Limit, Span, _claim, horizontal
+from replay.judging.errors.evaluation import Errors
 
 
 def test_errors_count_in_the_outage_alone():

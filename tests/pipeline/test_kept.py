@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.executors import Here, Team
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.kept import Kept, kept_cells
+from pipeline.runs.checkpoints import Kept, kept_cells
+from pipeline.runs.executors import Here, Team
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 from tests.pipeline.conftest import Said
 

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.results import read_result
+from pipeline.output.results import read_result
 from recorders.log import Stream, open_log, read_streams
-from replay.engine.failures import sentences_of
+from replay.engine.streams.failures import sentences_of
 
 Fuselog = Callable[..., Any]
 Streams = dict[str, Stream]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.results import Result
+from pipeline.output.results import Result
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
 pytestmark = pytest.mark.paper

@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.studies.los_moving import _claims, prior_sigmas, seconds_of, unknowns, weakest
+from pipeline.studies.optical.moving import _claims, prior_sigmas, seconds_of, unknowns, weakest
 from recorders.simulators.moving_optical import MovingOpticalParameters
-from replay.judging.evaluation import Errors
+from replay.judging.errors.evaluation import Errors
 
 COMPONENTS = (
     "target_1_x_m",

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.experiment import Experiment, load_experiment, run_experiment
-from pipeline.studies.lrkf_dimension import (
+from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
+from pipeline.studies.sampling.lrkf_dimension import (
     Drive,
     Options,
     Waves,

@@ -11,7 +11,7 @@ import fuselog as fl
 from recorders.log import make_stream, schemas
 from recorders.models.states import state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.judging.track_distances import hota
+from replay.judging.tracks.distances import hota
 from tests.replay.estimators.test_tracker import RADAR, SECOND, log, passing, sensor
 
 Fuselog = Callable[..., Any]

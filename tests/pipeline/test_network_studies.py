@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
+from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
 pytestmark = pytest.mark.paper

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.orientation import error_angles
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.navigation.orientation import error_angles
 from recorders.errors import BadInput
 from tests.replay.timeline.test_timeline import read
 

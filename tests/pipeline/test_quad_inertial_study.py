@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.quad_inertial import (
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.navigation.quad_inertial import (
     Flight,
     _highest,
     flight_of,
@@ -23,8 +23,8 @@ from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.states import NAVIGATION, state_metadata
 from recorders.recording import import_run
-from replay.engine.sources import memory_source
-from replay.estimators.navigation import INERTIAL
+from replay.engine.streams.sources import memory_source
+from replay.estimators.navigation.navigation import INERTIAL
 from tests.replay.inference.replays import outputs
 
 SECOND = 10**9

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.ranging import Recording, Replayed
-from pipeline.studies.uwb_outdoor import Window, printed, published_rmse, scored_truth
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.ranging.ranging import Recording, Replayed
+from pipeline.studies.ranging.uwb_outdoor import Window, printed, published_rmse, scored_truth
 from recorders.errors import BadInput
 from recorders.recording import import_run
-from replay.engine.sources import memory_source
+from replay.engine.streams.sources import memory_source
 
 CASES = {
     "Trajectory_A/Case_1": ((51.625, 191.375), {"LS": (1.0384, 1.5735), "ESKF": (1.1158, None)}),

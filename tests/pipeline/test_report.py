@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.charts import (
+from pipeline.output.charts import (
     COLOURS,
     REFERENCE_COLOUR,
     Axis,
@@ -27,10 +27,10 @@ from pipeline.charts import (
     interval,
     level,
 )
-from pipeline.claims import Claim
-from pipeline.report import write_report
-from pipeline.report.verdict import verdict
-from pipeline.results import Outcome, Result, result_folder, write_outcome
+from pipeline.output.claims import Claim
+from pipeline.output.report import write_report
+from pipeline.output.report.verdict import verdict
+from pipeline.output.results import Outcome, Result, result_folder, write_outcome
 from recorders.errors import BadInput
 from recorders.log import open_log, read_streams
 
@@ -112,7 +112,7 @@ def test_the_page_is_whole_offline_and_small(result: Path, page_file: Path) -> N
         each[name] or "" for _, each in page.elements for name in ("src", "href") if name in each
     ]
     assert all(address.startswith(("#", "data:")) for address in addresses)
-    assets = resources.files("pipeline.report")
+    assets = resources.files("pipeline.output.report")
     scripts = [(assets / name).read_text() for name in ("plotly-basic.min.js", "page.js")]
     kinds = [each.get("type") for each in page.all("script")]
     run = [text for text, kind in zip(page.texts["script"], kinds, strict=True) if kind is None]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.ensemble import record_ensemble
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.error_bounds import BoundOptions, state_bounds
+from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
 from recorders.errors import BadInput
 
 SHORT = {"duration_s": 12.0, "runs": 1, "robots": 2, "landmarks": 5}

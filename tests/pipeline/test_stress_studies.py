@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.ensemble import record_ensemble
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.cooperative_stress import (
+from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.networks.cooperative_stress import (
     CooperativeStressOptions,
     _edited,
     _lying,

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from numpy.testing import assert_array_equal
 
 import fuselog as fl
-import pipeline.surgery as surgery
+import pipeline.logs.edit as surgery
 from recorders.log import read_span
 
 Fuselog = Callable[..., Any]

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline import experiment
 from pipeline.command_line import main
-from pipeline.sweeps import parse_over, points_of
+from pipeline.runs import experiment
+from pipeline.runs.sweeps import parse_over, points_of
 from recorders.errors import BadInput
 
 SHORT = ["--runs", "4", "--set", "duration_s=3"]

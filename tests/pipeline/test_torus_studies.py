@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.torus import PropagationOptions, propagation_errors
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.sampling.torus import PropagationOptions, propagation_errors
 from recorders.errors import BadInput
 
 pytestmark = pytest.mark.paper

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.experiment import load_experiment, run_experiment
-from pipeline.studies.repetitions import Interval, mean_interval
-from pipeline.studies.tracking import difference, figures_of, lower
-from replay.judging.track_errors import TracksAt
+from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from pipeline.studies.tracking.tracking import difference, figures_of, lower
+from replay.judging.tracks.errors import TracksAt
 
 
 def test_figures_of_whole_tracks():

@@ -17,13 +17,13 @@ import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.executors import Here
-from pipeline.results import read_result
+from pipeline.output.results import read_result
+from pipeline.runs.executors import Here
 from pipeline.tuning.objective import Best
 from pipeline.tuning.search import Cost, curvature
 from recorders.log import RunMetadata
 from recorders.recording import Recording
-from replay.engine.sources import memory_source
+from replay.engine.streams.sources import memory_source
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 

@@ -9,7 +9,7 @@ from recorders.models.scores import comparisons_of
 from recorders.parameters import build
 from recorders.recording import record_run
 from recorders.simulators.biometrics import FAILURE, GENUINE_SCORES, C, G, R
-from replay.judging.verification import identified
+from replay.judging.consistency.verification import identified
 
 pytestmark = pytest.mark.paper
 

@@ -7,7 +7,7 @@ import pytest
 
 from recorders.log import Stream
 from recorders.recording import record_run
-from replay.engine.sources import memory_source
+from replay.engine.streams.sources import memory_source
 
 
 def recorded(seed: int, **parameters: float) -> Mapping[str, Stream]:

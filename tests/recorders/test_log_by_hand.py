@@ -26,11 +26,11 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.ahead import ahead
-from recorders.log.chunks import Damaged, Span, open_region
+from recorders.log.container.ahead import ahead
+from recorders.log.container.chunks import Damaged, Span, open_region
+from recorders.log.container.sealed import seal, unseal
 from recorders.log.layout import layout_of
 from recorders.log.loops import agree
-from recorders.log.sealed import seal, unseal
 
 # Two blocks of five scans; the second block reaches back, and stamps are equal within and across them.
 NUMBERS = [[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]]

@@ -302,7 +302,7 @@ def test_a_chunk_that_does_not_fit_into_memory_is_told_as_such(tmp_path, monkeyp
     def lack(_):
         raise MemoryError
 
-    monkeypatch.setattr("recorders.log.chunks.scan", lack)
+    monkeypatch.setattr("recorders.log.container.chunks.scan", lack)
     assert "the chunk at byte 8 does not fit into memory: it states 3 bytes" in refusal(path)
     assert "does not fit into memory" in open_log(path, recover=True).loss_statement
 

@@ -19,7 +19,7 @@ from recorders.log import (
     schemas,
     write_log,
 )
-from recorders.log.ahead import THREADS, ahead
+from recorders.log.container.ahead import THREADS, ahead
 from recorders.log.schemas import SCHEMAS
 from tests.recorders.log_samples import LARGEST_TIME, assert_same, rows_read, some_streams, streams
 

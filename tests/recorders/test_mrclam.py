@@ -11,12 +11,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.recording import Recording, import_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.evaluation import errors_of
-from replay.judging.metrics import ACCURACY, CONSISTENCY
-from replay.judging.truths import Truths
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.errors.evaluation import errors_of
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
 
 # A set of one robot: two barcodes known, one not; times out of order; comments as in the real files.
 SMALL = {

@@ -12,7 +12,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, describe, explain, merge, parse_settings
 from recorders.parsing import parse_json, read_toml
-from replay.estimators.landmarks import ROBOT
+from replay.estimators.models.landmarks import ROBOT
 
 
 class Inner(Parameters):

@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recorders.errors import BadInput
 from recorders.importers.ros import importer
-from recorders.importers.ros.bags import open_bag
+from recorders.importers.ros.files.bags import open_bag
+from recorders.importers.ros.files.sqlite_pages import missing_bytes, whole_rows
 from recorders.importers.ros.layouts import Messages, MessageType, by_size, definitions_of
 from recorders.importers.ros.messages import TYPES
 from recorders.importers.ros.parameters import RosParameters
-from recorders.importers.ros.sqlite_pages import missing_bytes, whole_rows
 from recorders.log import Stream, open_log, read_streams
 from recorders.recording import import_log, import_run
 

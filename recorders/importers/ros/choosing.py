@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from recorders.errors import BadInput, choices, some_of
-from recorders.importers.ros.bags import Bag
+from recorders.importers.ros.files.bags import Bag
+from recorders.importers.ros.files.raw import Connection
 from recorders.importers.ros.layouts import MessageType, Undecodable, definitions_of
 from recorders.importers.ros.mapping import MessageMapping, read_mapping, taken
 from recorders.importers.ros.messages import FRAME, STAMP, TRANSFORM_TYPES, TYPES, Taken
 from recorders.importers.ros.parameters import RosParameters
-from recorders.importers.ros.raw import Connection
 
 
 class Reader(NamedTuple):

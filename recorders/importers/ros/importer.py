@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.importers.ros.bags import Bag, open_bag
 from recorders.importers.ros.choosing import choose, stream_names
 from recorders.importers.ros.clocks import Clocks
+from recorders.importers.ros.files.bags import Bag, open_bag
+from recorders.importers.ros.files.raw import Batch, Connection
 from recorders.importers.ros.layouts import Messages, Undecodable, by_size
 from recorders.importers.ros.messages import CHILD_FRAME, Part, as_truth, stamps_ns
 from recorders.importers.ros.parameters import RosParameters
-from recorders.importers.ros.raw import Batch, Connection
 from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
 from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
 from recorders.log import Stream, schemas

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from replay.distributions.bingham import Bingham
 from replay.distributions.bingham_kernels import predict, turn_columns, update
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 
 
 class Steps(NamedTuple):

@@ -21,7 +21,7 @@ from replay.distributions.bingham_kernels import (
     update,
     weighted_outer,
 )
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 
 _NS = 1e-9
 

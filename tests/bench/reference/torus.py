@@ -22,7 +22,7 @@ from replay.distributions.wrapped_normal_kernels import (
     fit_samples,
     five_samples,
 )
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 from tests.bench.reference.gaussian import wrap_angle
 
 

@@ -14,7 +14,7 @@ from replay.distributions.torus_mixtures import (
     fit_wrapped_mixture,
 )
 from replay.distributions.wrapped_normal import WrappedNormal
-from replay.estimators.grid import torus_grid
+from replay.estimators.directional.grid import torus_grid
 
 WEIGHTS, MEANS = np.array([0.3, 0.7]), np.array([[3.0, 2.0], [-1.0, 3.1]])
 COVARIANCES = np.array([[[0.5, 0.2], [0.2, 0.3]], [[0.1, -0.05], [-0.05, 0.2]]])

@@ -13,7 +13,7 @@ from replay.distributions.wrapped_normal import (
     WrappedNormal,
     make_wrapped_normal,
 )
-from replay.estimators.grid import torus_grid
+from replay.estimators.directional.grid import torus_grid
 
 SIGMA = np.array([0.8, 1.3])
 

@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-import replay.engine.compile
+import replay.engine.compiling.compile
 from recorders.errors import BadInput
-from recorders.importers.ros import ros1_file
+from recorders.importers.ros.files import ros1_file
 from recorders.log import loops
-from replay.engine.cache import cache_folder, in_turn
-from replay.engine.compile import compile_over_runs, compiled
-from replay.engine.keeping import load
-from replay.engine.kernels import native
-from replay.engine.kernels.native import Kernel
-from replay.engine.through_numba import loop_of
+from replay.engine.compiling.cache import cache_folder, in_turn
+from replay.engine.compiling.compile import compile_over_runs, compiled
+from replay.engine.compiling.keeping import load
+from replay.engine.compiling.kernels import native
+from replay.engine.compiling.kernels.native import Kernel
+from replay.engine.compiling.through_numba import loop_of
 
 # A module with models and a kernel of its own, as a third party would write them: plain functions.
 MODULE = """
@@ -51,14 +51,14 @@ MODULE = """
     columns = Columns(np.arange(3.0), np.zeros(3))
 """
 BY_NUMBA = f"""{MODULE}
-    from replay.engine.through_numba import loop_of
+    from replay.engine.compiling.through_numba import loop_of
 
     loop = loop_of(kernel(model))
     loop.of((columns,))(0, 3)
     print(*columns.found, "cached" if loop._loop.stats.cache_hits else "compiled")
 """
 OURS = f"""{MODULE}
-    from replay.engine.kernels import native
+    from replay.engine.compiling.kernels import native
 
     made, make = [], native._made
     native._made = lambda *given: made.append(given) or make(*given)
@@ -82,7 +82,7 @@ def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]
             "FUSELOG_CACHE": str(cache),
             "PYTHONDONTWRITEBYTECODE": "1",  # a file changed within a second would be run as it was
             "PYTHONPATH": str(
-                Path(replay.engine.compile.__file__).parents[2]
+                Path(replay.engine.compiling.compile.__file__).parents[2]
             ),  # the tree that is under test
         },
         capture_output=True,
@@ -109,7 +109,7 @@ def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(
 HOLDER = """
     import sys
     from pathlib import Path
-    from replay.engine.cache import cache_folder, in_turn
+    from replay.engine.compiling.cache import cache_folder, in_turn
 
     with in_turn(Path(sys.argv[1])):
         print("held", flush=True)
@@ -148,7 +148,7 @@ def test_nobody_waits_long_for_a_kernel_and_not_at_all_for_the_killed(
     path = kernels / "kernel.bin"
     holder = started(HOLDER, path)
     assert holder.stdout.readline() == "held\n"
-    monkeypatch.setattr("replay.engine.cache._TURN_S", 0.1)
+    monkeypatch.setattr("replay.engine.compiling.cache._TURN_S", 0.1)
     with in_turn(path) as waited:
         assert waited
     holder.kill()
@@ -189,7 +189,7 @@ def test_what_is_imported_by_name_is_compiled_anew_when_its_module_changes(tmp_p
 CALLED_FROM_PYTHON = """
     import numpy as np
     from model import moved
-    from replay.engine.compile import compiled
+    from replay.engine.compiling.compile import compiled
 
     @compiled
     def kernel(given, found):
@@ -306,7 +306,7 @@ def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
     """A whole file that cannot be loaded all the same."""
     assert not by_numba()
     with monkeypatch.context() as broken:
-        broken.setattr("replay.engine.keeping.pickle.loads", lambda _: 1 / 0)
+        broken.setattr("replay.engine.compiling.keeping.pickle.loads", lambda _: 1 / 0)
         assert not by_numba()
     assert by_numba()
 
@@ -556,7 +556,7 @@ def test_what_cannot_be_compiled_is_told_in_one_sentence():
 FORKED = """
     import os
     import numpy as np
-    from replay.engine.compile import compile_over_runs
+    from replay.engine.compiling.compile import compile_over_runs
 
     def one(run, found, memory):
         memory[0] = run

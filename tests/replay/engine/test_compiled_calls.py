@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from recorders.errors import BadInput
-from replay.engine.compile import compile_over_runs, compiled
-from replay.inference.association import marginals
+from replay.engine.compiling.compile import compile_over_runs, compiled
+from replay.inference.association.association import marginals
 
 
 def total(values: np.ndarray, factor: float) -> float:

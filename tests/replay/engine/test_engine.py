@@ -13,11 +13,11 @@ from numpy.testing import assert_array_equal
 from recorders.errors import BadInput
 from recorders.log import Clock, LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording, record_run
-from replay.engine.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
-from replay.engine.estimator import Bound, Recursive, bind
-from replay.engine.replaying import Report, collect, replay
-from replay.engine.results import state_stream
-from replay.engine.sources import Ensemble, LogSource, MemorySource, Source, memory_source
+from replay.engine.replaying.estimator import Bound, Recursive, bind
+from replay.engine.replaying.replaying import Report, collect, replay
+from replay.engine.streams.blocks import Block, Ragged, filled_rows, gather, merge_events, ragged_rows
+from replay.engine.streams.results import state_stream
+from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, Source, memory_source
 
 ESTIMATORS = ("dead-reckoning", "ekf", "ukf")
 

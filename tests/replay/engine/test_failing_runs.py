@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from pipeline import ensemble
-from pipeline.ensemble import Part
+from pipeline.runs import ensemble
+from pipeline.runs.ensemble import Part
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.parameters import Parameters
 from recorders.recording import Recording
-from replay.engine.blocks import Ragged, gather
-from replay.engine.compile import compile_over_runs
-from replay.engine.estimator import Batch, Estimator, Recursive
-from replay.engine.failures import Failure, failure_stream, sentences_of
-from replay.engine.given import Floats, Given, Integers, Messages
-from replay.engine.outputs import Estimates, Results
-from replay.engine.plain import batch, each_run, recursive
-from replay.engine.replaying import Report, collect, replay
-from replay.engine.sources import LogSource, MemorySource, Source, memory_source
-from replay.engine.supervision import find_unsound
+from replay.engine.api.functions import batch, each_run, recursive
+from replay.engine.api.inputs import Floats, Given, Integers, Messages
+from replay.engine.api.outputs import Estimates, Results
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.replaying.estimator import Batch, Estimator, Recursive
+from replay.engine.replaying.replaying import Report, collect, replay
+from replay.engine.replaying.supervision import find_unsound
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.failures import Failure, failure_stream, sentences_of
+from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
 from replay.judging.judge import Judge
-from replay.judging.measuring import Output
-from replay.judging.metrics import COVERAGE
+from replay.judging.metrics.measuring import Output
+from replay.judging.metrics.metrics import COVERAGE
 
 STEP_NS = 10**8
 COUNT = 200

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from replay.engine.compile import compiled
+from replay.engine.compiling.compile import compiled
 from replay.engine.philox import fill_normals, philox, run_key
 
 normals = compiled(fill_normals, allocates=False)

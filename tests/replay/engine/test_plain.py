@@ -11,14 +11,14 @@ from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import Recording
-from replay.engine.blocks import Block, Ragged, gather, merge_events
-from replay.engine.estimator import Estimator
-from replay.engine.failures import sentences_of
-from replay.engine.given import Floats, Given, Integers, Messages
-from replay.engine.outputs import Estimates, Results, Solution
-from replay.engine.plain import batch, each_run, recursive
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.api.functions import batch, each_run, recursive
+from replay.engine.api.inputs import Floats, Given, Integers, Messages
+from replay.engine.api.outputs import Estimates, Results, Solution
+from replay.engine.replaying.estimator import Estimator
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource, memory_source
 
 STREAMS = {"heading": schemas.BEARING}
 WHOLE = {"prior": schemas.GAUSSIAN_ESTIMATE}

@@ -10,13 +10,13 @@ from numpy.testing import assert_array_equal
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream
 from recorders.recording import record_run
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
-from replay.engine.failures import sentences_of
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.measuring import Output
-from replay.judging.metrics import COVERAGE
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.metrics.measuring import Output
+from replay.judging.metrics.metrics import COVERAGE
 
 VEHICLES = {"duration_s": 20.0}
 

@@ -8,12 +8,12 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.blocks import gather
-from replay.engine.sources import memory_source
-from replay.engine.tangent import are_kinds, between, difference, tangent_components
-from replay.judging.evaluation import errors_of, truth_at
-from replay.judging.metrics import ACCURACY
-from replay.judging.truths import Truths
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import memory_source
+from replay.engine.vectors.tangent import are_kinds, between, difference, tangent_components
+from replay.judging.errors.evaluation import errors_of, truth_at
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.metrics import ACCURACY
 
 QUATERNION = ["quaternion"] * 4
 

@@ -13,12 +13,12 @@ from recorders.errors import BadInput
 from recorders.models import acoustic as model
 from recorders.models.acoustic import Medium, Noise
 from recorders.models.planar import wrap_angle
-from replay.engine.covariances import normalized_error_squared
-from replay.estimators import acoustic
-from replay.estimators.acoustic import Detections, Mode, Setting
-from replay.inference.least_squares import Solution, Status, information_root
-from replay.judging.consistency import ellipse_area
-from replay.judging.evaluation import chi_square_interval
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.estimators.localization import acoustic
+from replay.estimators.localization.acoustic import Detections, Mode, Setting
+from replay.estimators.localization.least_squares import Solution, Status, information_root
+from replay.judging.consistency.consistency import ellipse_area
+from replay.judging.errors.evaluation import chi_square_interval
 
 pytestmark = pytest.mark.paper
 

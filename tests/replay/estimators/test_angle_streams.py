@@ -7,15 +7,15 @@ import pytest
 
 from recorders.errors import BadInput
 from recorders.recording import record_run
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
-from replay.engine.failures import sentences_of
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators import optical
-from replay.estimators.optical import Scene
-from replay.judging.evaluation import errors_of
-from replay.judging.truths import Truths
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.localization import optical
+from replay.estimators.localization.optical import Scene
+from replay.judging.errors.evaluation import errors_of
+from replay.judging.errors.truths import Truths
 
 
 def source(scenario: str, run: int = 0, **parameters: object) -> MemorySource:

@@ -12,9 +12,9 @@ from recorders.log import Stream, make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import axis_angle_between, conjugate, rotate
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators.attitude import ATTITUDE
-from replay.inference.model import Model
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.navigation.attitude import ATTITUDE
+from replay.inference.model.model import Model
 from tests.replay.inference.replays import outputs
 
 RATE_HZ, SECONDS = 25.0, 30

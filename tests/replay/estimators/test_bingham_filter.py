@@ -11,7 +11,7 @@ from recorders.models.directional_noise import sample_projected_gaussian
 from recorders.models.orientation import axis_angle_between, compose, left_matrix
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
-from replay.estimators.bingham import (
+from replay.estimators.directional.bingham import (
     BinghamNoise,
     Gaussian,
     GaussianNoise,
@@ -20,7 +20,7 @@ from replay.estimators.bingham import (
     run_bingham_filter,
     run_kalman_filter,
 )
-from replay.estimators.grid import run_axis_grid_filter
+from replay.estimators.directional.grid import run_axis_grid_filter
 
 pytestmark = pytest.mark.paper
 

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 from sklearn.mixture import GaussianMixture
 
-from pipeline.ensemble import replay_ensemble
-from pipeline.experiment import load_experiment
-from pipeline.studies.biometrics_claims import PAPER_FUSED, REAL_COUNTS, SINGLE
+from pipeline.runs.ensemble import replay_ensemble
+from pipeline.runs.experiment import load_experiment
+from pipeline.studies.biometrics.claims import PAPER_FUSED, REAL_COUNTS, SINGLE
 from recorders.errors import BadInput
 from recorders.recording import import_run, record_run
-from replay.engine.sources import memory_source
-from replay.estimators.biometrics import (
+from replay.engine.streams.sources import memory_source
+from replay.estimators.biometrics.biometrics import (
     RULES,
     ClassifierParameters,
     all_pairs,
@@ -23,9 +23,8 @@ from replay.estimators.biometrics import (
     trimmed_pairs,
     user_folds,
 )
-from replay.estimators.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
-from replay.judging.measuring import find_metrics, measure
-from replay.judging.verification import (
+from replay.estimators.biometrics.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
+from replay.judging.consistency.verification import (
     Fused,
     bootstrap_users,
     cost_of_ratio,
@@ -35,6 +34,7 @@ from replay.judging.verification import (
     roc,
     verification_rate,
 )
+from replay.judging.metrics.measuring import find_metrics, measure
 
 pytestmark = pytest.mark.paper
 

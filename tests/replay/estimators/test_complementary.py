@@ -5,10 +5,10 @@ import pytest
 
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource, memory_source
 
 COUNT, STEP_NS = 40, 10_000_000
 # after the last sample, by ahrs 0.4.0 from the same start (its north is x for Madgwick: turned to y)

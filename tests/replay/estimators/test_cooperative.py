@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from pipeline.ensemble import replay_ensemble
+from pipeline.runs.ensemble import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
 from recorders.recording import Recording, import_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import memory_source
-from replay.judging.metrics import ACCURACY, CONSISTENCY
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import memory_source
+from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY
 from tests.bench.reference.landmarks import range_bearing_jacobian
 from tests.replay.estimators.test_covariance_intersection import fuse_sighting
 

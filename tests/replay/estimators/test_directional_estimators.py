@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
-from replay.engine.sources import memory_source
-from replay.judging.metrics import CONSISTENCY
+from replay.engine.streams.sources import memory_source
+from replay.judging.metrics.metrics import CONSISTENCY
 
 FILTERS = {
     "axis": {"bingham-axis": {}, "kalman-axis": {}},

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ensemble import judge, replay_in_memory
+from pipeline.runs.ensemble import judge, replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
-from replay.engine.blocks import gather
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.estimators.gaussian_mixture_phd import (
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import gather
+from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
     Scans,
     filter_scans,
@@ -20,8 +20,8 @@ from replay.estimators.gaussian_mixture_phd import (
     scans_of,
     settings_of,
 )
-from replay.judging.set_errors import set_errors
-from replay.judging.truths import Truths
+from replay.judging.errors.truths import Truths
+from replay.judging.sets.errors import set_errors
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source
 
 STATED = {"variance_m2": "0.5", "detection_probability": "0.9", "clutter_per_m2": "1e-3"}

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.models.orientation import axis_angle_between
-from replay.estimators.inertial import (
+from replay.estimators.orientation.inertial import (
     InertialModel,
     InertialSamples,
     OrientationEstimates,

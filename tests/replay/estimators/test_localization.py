@@ -13,14 +13,14 @@ from scipy.stats import chi2, t
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, schemas
 from recorders.recording import Recording, record_run
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
-from replay.engine.failures import sentences_of
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.evaluation import Errors, chi_square_interval, errors_of, innovations_of
-from replay.judging.metrics import INNOVATION
-from replay.judging.truths import Truths
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.errors.evaluation import Errors, chi_square_interval, errors_of, innovations_of
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.metrics import INNOVATION
 from replay.sampling.samplers import unscented
 
 Floats = NDArray[np.float64]

@@ -6,20 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.ensemble import record_ensemble
+from pipeline.runs.ensemble import record_ensemble
 from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log
 from recorders.models.planar import range_bearing
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import LogSource, MemorySource
-from replay.estimators.extended_target import EXTENDED_TARGET, measure
-from replay.estimators.reactor import REACTOR
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.estimators.models.extended_target import EXTENDED_TARGET, measure
+from replay.estimators.models.reactor import REACTOR
 from replay.inference.all_methods import METHODS
-from replay.inference.gaussian import no_innovation
-from replay.inference.regression import regression, sample_memory, sampled_sensor
-from replay.inference.stage import stage_of
-from replay.inference.steps import Gaussian
+from replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
+from replay.inference.kalman.steps import Gaussian
+from replay.inference.linear_algebra.gaussian import no_innovation
+from replay.inference.model.stage import stage_of
 from replay.sampling import Samples, parse_sampling
 from replay.sampling.sets import SampleSets
 

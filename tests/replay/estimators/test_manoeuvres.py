@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.ensemble import record_ensemble, replay_ensemble
-from replay.engine.sources import MemorySource
-from replay.estimators.vehicle_kalman import VEHICLE
-from replay.inference.checking import check_model
+from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.models.vehicle_kalman import VEHICLE
+from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 RUNS = 200

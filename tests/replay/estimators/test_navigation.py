@@ -15,14 +15,14 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
 from recorders.recording import import_run, record_run
-from replay.engine.blocks import gather
-from replay.engine.geodetic import in_plane, origins_of
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import difference
-from replay.estimators.alignment import align
-from replay.estimators.navigation import INERTIAL, NavigationParameters
-from replay.estimators.turning import move, move_back
-from replay.inference.checking import check_model
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.geodetic import in_plane, origins_of
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import difference
+from replay.estimators.navigation.alignment import align
+from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
+from replay.estimators.navigation.turning import move, move_back
+from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 # --- the mathematics -------------------------------------------------------------------------------

@@ -13,13 +13,13 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.parameters import build
 from recorders.recording import Recording, record_run
-from replay.engine.blocks import gather
-from replay.engine.estimator import find_estimator
-from replay.engine.failures import sentences_of
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import difference
-from replay.estimators.alignment import align
-from replay.estimators.navigation import INERTIAL, NavigationParameters
+from replay.engine.replaying.estimator import find_estimator
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import difference
+from replay.estimators.navigation.alignment import align
+from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_imm import twins
 

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from recorders.log import make_stream, schemas
 from recorders.recording import record_run
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import difference
-from replay.estimators import navigation_sensors as sensors
-from replay.estimators.alignment import specific_force
-from replay.estimators.navigation import INERTIAL, NavigationParameters
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import difference
+from replay.estimators.navigation import sensors
+from replay.estimators.navigation.alignment import specific_force
+from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
 from tests.replay.inference.replays import outputs
 
 TURNED = Rotation.from_euler("ZYX", [2.0, 0.3, -0.4])

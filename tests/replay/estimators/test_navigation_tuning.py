@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.experiment import load_experiment
+from pipeline.runs.experiment import load_experiment
 from recorders.recording import import_run
-from replay.engine.sources import memory_source
+from replay.engine.streams.sources import memory_source
 
 pytestmark = pytest.mark.paper
 

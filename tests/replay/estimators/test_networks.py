@@ -6,14 +6,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from pipeline.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import memory_source
-from replay.estimators.covariance_intersection import RULES
-from replay.estimators.networks import ALONE, CENTRALISED, TRAP, Rule
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import memory_source
+from replay.estimators.networks.covariance_intersection import RULES
+from replay.estimators.networks.networks import ALONE, CENTRALISED, TRAP, Rule
 
 pytestmark = pytest.mark.paper
 

@@ -9,11 +9,11 @@ from scipy.optimize import least_squares
 
 from recorders.errors import BadInput
 from recorders.models.planar import wrap_angle
-from replay.engine.covariances import normalized_error_squared
-from replay.estimators import optical
-from replay.estimators.optical import Scene
-from replay.inference.least_squares import Status, cramer_rao_bound, solve
-from replay.judging.evaluation import chi_square_interval
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.estimators.localization import optical
+from replay.estimators.localization.least_squares import Status, cramer_rao_bound, solve
+from replay.estimators.localization.optical import Scene
+from replay.judging.errors.evaluation import chi_square_interval
 
 pytestmark = pytest.mark.paper
 

@@ -12,8 +12,8 @@ import fuselog as fl
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import import_run, record_run
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators.ranging import (
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.models.ranging import (
     RANGING_POSE,
     RANGING_POSITION,
     PoseRangingParameters,
@@ -23,10 +23,10 @@ from replay.estimators.ranging import (
     see,
     see_by_tag,
 )
-from replay.inference.augmentation import augmented
-from replay.inference.checking import check_model
-from replay.inference.gaussian import widening
-from replay.inference.point_errors import PointError
+from replay.inference.linear_algebra.gaussian import widening
+from replay.inference.model.augmentation import augmented
+from replay.inference.model.checking import check_model
+from replay.inference.model.point_errors import PointError
 from tests.replay.inference.replays import bound, outputs
 
 # --- the models ------------------------------------------------------------------------------------

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ensemble import replay_in_memory
+from pipeline.runs.ensemble import replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run
-from replay.engine.blocks import Block, gather, merge_events
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.measuring import Output, find_metrics, measure
-from replay.judging.tracks import kept, live_counts, track_table
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Block, gather, merge_events
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.metrics.measuring import Output, find_metrics, measure
+from replay.judging.tracks.tracks import kept, live_counts, track_table
 
 TOPIC = "/estimates/report-tracker/track"
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.ensemble import record_ensemble, replay_ensemble
-from replay.engine.blocks import Ragged
-from replay.engine.sources import MemorySource
-from replay.estimators.moving_sets import (
+from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.sets.moving_sets import (
     Headings,
     Motion,
     all_headings_of,
@@ -20,13 +20,13 @@ from replay.estimators.moving_sets import (
     to_rings,
     within_l8,
 )
-from replay.estimators.set_filter import (
+from replay.estimators.sets.set_filter import (
     CONTRADICTS_ITSELF,
     CONTRADICTS_PAST,
     FRAME_WRONG,
     PAST_WRONG,
 )
-from replay.judging.set_filter_evaluation import judge_filter
+from replay.judging.sets.filter_evaluation import judge_filter
 
 DRIVE = {
     "landmarks": 5,

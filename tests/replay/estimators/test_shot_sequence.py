@@ -10,15 +10,15 @@ import pytest
 from recorders.errors import BadInput
 from recorders.models.acoustic import Medium, Noise, clear_side, hear
 from recorders.recording import record_run
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators import shot_sequence
-from replay.estimators.shot_sequence import (
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.models import shot_sequence
+from replay.estimators.models.shot_sequence import (
     MOVING_SHOOTER,
     MovingShooterParameters,
     find_shooter,
     log_likelihood,
 )
-from replay.inference.checking import check_model
+from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 AIR: dict[str, Any] = {"speed_of_sound_mps": 342.0, "mach_number": 2.0}

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import record_run
-from replay.engine.sources import MemorySource, memory_source
-from replay.estimators.sound_source import SOUND_SOURCE, SoundSourceParameters, find_source
-from replay.inference.checking import check_model
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.models.sound_source import SOUND_SOURCE, SoundSourceParameters, find_source
+from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 SPEED = 343.0

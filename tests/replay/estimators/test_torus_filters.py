@@ -10,8 +10,8 @@ from recorders.models.headings import turn_on, turn_together
 from recorders.models.planar import wrap_angle
 from replay.distributions import wrapped_normal
 from replay.distributions.wrapped_normal import WrappedNormal, make_wrapped_normal
-from replay.estimators.grid import run_torus_grid_filter, torus_grid
-from replay.estimators.torus import (
+from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from replay.estimators.directional.torus import (
     HeadingModel,
     make_heading_model,
     run_toroidal_filter,

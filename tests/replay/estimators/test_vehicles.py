@@ -8,26 +8,26 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from pipeline.ensemble import record_ensemble, replay_in_memory
-from pipeline.studies.vehicles_cases import Scores, scores_of
+from pipeline.runs.ensemble import record_ensemble, replay_in_memory
+from pipeline.studies.vehicles.cases import Scores, scores_of
 from recorders.errors import BadInput
 from recorders.log import Clock
 from recorders.models.vehicles import into_frame
-from replay.engine.sources import MemorySource
-from replay.estimators.vehicle_association import (
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.vehicles.association import (
     Scanning,
     all_maps,
     best_maps,
     log_likelihoods,
     log_permanents,
 )
-from replay.estimators.vehicle_bounds import bounds, exact_total_error, follow_axis
-from replay.estimators.vehicle_registration import register
-from replay.estimators.vehicles import Joint, collapse, position_rows
-from replay.judging.evaluation import errors_of
-from replay.judging.label_errors import assigned_squared_error, fixed_squared_error, total_error
-from replay.judging.set_distances import gospa
-from replay.judging.truths import Truths
+from replay.estimators.vehicles.bounds import bounds, exact_total_error, follow_axis
+from replay.estimators.vehicles.registration import register
+from replay.estimators.vehicles.vehicles import Joint, collapse, position_rows
+from replay.judging.errors.evaluation import errors_of
+from replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error, total_error
+from replay.judging.errors.truths import Truths
+from replay.judging.sets.distances import gospa
 
 pytestmark = pytest.mark.paper
 

@@ -10,8 +10,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate, rotate
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
 
 Floats = NDArray[np.float64]
 STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {

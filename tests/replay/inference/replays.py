@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from recorders.parameters import build
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import Bound
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import Source
+from replay.engine.replaying.estimator import Bound
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import Source
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
-from replay.inference.model import Model
+from replay.inference.model.model import Model
 
 
 def bound(model: Model, method: str, sources: Sequence[Source], **values: Any) -> list[Bound]:

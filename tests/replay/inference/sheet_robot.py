@@ -6,7 +6,7 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.planar import drive, wrap_angle
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.streams.sources import MemorySource, memory_source
 
 EPOCH_NS = 10**9
 STEP_S = 0.1

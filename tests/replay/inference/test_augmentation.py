@@ -9,16 +9,16 @@ from numpy.testing import assert_allclose, assert_equal
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
-from replay.engine.blocks import gather
-from replay.engine.sources import MemorySource
-from replay.estimators.landmarks import RECKONING, ROBOT
-from replay.inference.augmentation import augmented
-from replay.inference.checking import check_model
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.models.landmarks import RECKONING, ROBOT
+from replay.inference.model.augmentation import augmented
+from replay.inference.model.checking import check_model
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import (

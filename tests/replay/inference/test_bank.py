@@ -10,11 +10,11 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import difference
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import difference
 from replay.inference.all_methods import modelled
-from replay.inference.bank import cut, widest
-from replay.inference.model import Control, Model, ModelParameters, Motion
+from replay.inference.model.model import Control, Model, ModelParameters, Motion
+from replay.inference.modes.gaussian_sum import cut, widest
 from tests.replay.inference.replays import outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
@@ -159,7 +159,7 @@ def test_a_bank_finds_an_unknown_heading_and_knows_how_well():
 
 
 def test_what_has_no_angle_is_refused():
-    from replay.estimators.ranging import RANGING_POSITION
+    from replay.estimators.models.ranging import RANGING_POSITION
 
     with pytest.raises(BadInput, match="lacks an angle or an orientation in its state, across which"):
         modelled(RANGING_POSITION, "bank:ekf")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.ensemble import Part, record_ensemble, replay_ensemble, replay_parts
-from pipeline.studies.localization import error_charts
+from pipeline.runs.ensemble import Part, record_ensemble, replay_ensemble, replay_parts
+from pipeline.studies.toolkit.localization import error_charts
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.bound import back_memory, smooth
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.judging.bounds import Bounds, Output
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.smoothing.bound import back_memory, smooth
+from replay.judging.consistency.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.test_cells import NEAR_LINEAR, SCENARIOS

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from replay.inference.checking import check_model
 from replay.inference.estimators import registered_models
-from replay.inference.model import Correction, Model, Motion
+from replay.inference.model.checking import check_model
+from replay.inference.model.model import Correction, Model, Motion
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

@@ -12,12 +12,12 @@ from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.parameters import build
 from recorders.recording import Recording
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource, memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import MemorySource, memory_source
 from replay.inference import estimators
 from replay.inference.all_methods import METHODS
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

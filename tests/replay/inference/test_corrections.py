@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from replay.estimators.navigation import INERTIAL
-from replay.estimators.turning import heading, move, move_back
-from replay.inference.augmentation import augmented
-from replay.inference.corrections import comparing, correcting, relinearising, sloping
-from replay.inference.manifold import differencing
+from replay.estimators.navigation.navigation import INERTIAL
+from replay.estimators.navigation.turning import heading, move, move_back
+from replay.inference.linear_algebra.manifold import differencing
+from replay.inference.model.augmentation import augmented
+from replay.inference.model.corrections import comparing, correcting, relinearising, sloping
 
 MODEL = augmented(INERTIAL, ("lever_x_m",))
 N, T = MODEL.size, MODEL.tangent

@@ -12,9 +12,9 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.estimator import Recursive
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.engine.replaying.estimator import Recursive
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
 from tests.replay.inference.replays import bound, outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")

@@ -12,11 +12,11 @@ from recorders.log import Stream, make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.geodesy import earth_centred, out_of_tangent_plane
 from recorders.recording import Recording
-from replay.engine.blocks import gather
-from replay.engine.failures import sentences_of
-from replay.engine.geodetic import in_plane
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.model import Model, ModelParameters, Motion
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.geodetic import in_plane
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Model, ModelParameters, Motion
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]

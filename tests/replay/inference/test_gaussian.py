@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from recorders.log import schemas
-from replay.engine.results import ALL_WELL
+from replay.engine.streams.results import ALL_WELL
 from replay.inference.all_methods import METHODS
-from replay.inference.gaussian import cholesky
-from replay.inference.model import Control, Map, Model, ModelParameters, Motion, Sensor
-from replay.inference.recursion import fault_of
-from replay.inference.sensor_steps import kalman_update
-from replay.inference.stage import Stage, stage_of
-from replay.inference.steps import (
+from replay.inference.kalman.steps import (
     NOT_FINITE,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -28,6 +23,11 @@ from replay.inference.steps import (
     Workspace,
     workspace,
 )
+from replay.inference.kalman.update import kalman_update
+from replay.inference.linear_algebra.gaussian import cholesky
+from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.stage import Stage, stage_of
+from replay.inference.run.recursion import fault_of
 from replay.sampling.samplers import unscented
 from replay.sampling.sets import SampleSets
 

@@ -16,12 +16,12 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import rotation_vector
-from replay.inference import filtering
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
-from replay.inference.imm import Memory, changing, mixing
-from replay.inference.model import Model, ModelParameters, Motion, Sensor, Switching
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Switching
+from replay.inference.modes.imm import Memory, changing, mixing
+from replay.inference.run import filtering
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

@@ -10,13 +10,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import Batch, Recursive
-from replay.engine.failures import sentences_of
-from replay.engine.late import parse_late, taking_late
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import MemorySource
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
+from replay.engine.replaying.estimator import Batch, Recursive
+from replay.engine.replaying.late import parse_late, taking_late
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import MemorySource
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import bound
 from tests.replay.inference.test_imm import SWITCHING_A

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from replay.inference.least_squares import (
+from replay.estimators.localization.least_squares import (
     SENTENCES,
     Linearization,
     Status,

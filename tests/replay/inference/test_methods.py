@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from recorders.models.orientation import compose, conjugate
-from replay.engine.tangent import rotation_vector
-from replay.inference.manifold import resetting
-from replay.inference.regression import regression, sample_memory
+from replay.engine.vectors.tangent import rotation_vector
+from replay.inference.kalman.regression import regression, sample_memory
+from replay.inference.linear_algebra.manifold import resetting
 from replay.sampling.sets import SampleSets
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.observing import observability
+from pipeline.api.observability import observability
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.measurements import PLANE
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.iterated import IteratedSmoother
-from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.engine.streams.measurements import PLANE
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.smoothing.iterated import IteratedSmoother
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.test_smoothers import LEVEL, levels
 

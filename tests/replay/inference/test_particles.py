@@ -18,17 +18,17 @@ from recorders.errors import BadInput
 from recorders.log import schemas
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
-from replay.engine.blocks import Ragged
-from replay.engine.estimator import bind
 from replay.engine.philox import fill_normals, philox, unit
-from replay.engine.sources import memory_source
-from replay.engine.tangent import rotation_vector
+from replay.engine.replaying.estimator import bind
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import memory_source
+from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import of_any_model
-from replay.inference.model import Motion
-from replay.inference.particle_filter import BOOTSTRAP
-from replay.judging.measuring import Output
-from replay.judging.metrics import PARTICLES
+from replay.inference.model.model import Motion
+from replay.inference.particles.filter import BOOTSTRAP
+from replay.judging.metrics.measuring import Output
+from replay.judging.metrics.metrics import PARTICLES
 from replay.sampling.resampling import choose_systematically
 from tests.replay.inference import attitude, scalar, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
@@ -183,7 +183,7 @@ def plain(told: list[Any], particles: int, key: Any) -> tuple[Floats, Floats, Fl
 def test_every_step_is_that_of_a_plain_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same random numbers: missing components, equal stamps, angles, resampling."""
     key = np.array([1, 2], np.uint64)
-    monkeypatch.setattr("replay.inference.particle_filter.run_key", lambda *_: key)
+    monkeypatch.setattr("replay.inference.particles.filter.run_key", lambda *_: key)
     told = vehicle_a.simulate(7)[0][:34]
     assert sum(np.isnan(each[3]).any() for each in told) > 2
     means, covariances, effective, likelihoods, resamplings = plain(told, 60, key)

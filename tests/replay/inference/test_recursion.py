@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
-from replay.engine.blocks import Ragged
-from replay.engine.sources import LogSource, MemorySource, memory_source
-from replay.inference.happenings import times_alone, with_ticks
-from replay.inference.recursion import no_results
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.inference.run.events import times_alone, with_ticks
+from replay.inference.run.recursion import no_results
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ensemble import replay_ensemble
+from pipeline.runs.ensemble import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording, import_run
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import rotation_vector
-from replay.inference import smoothers
-from replay.inference.manifold import resetting
-from replay.inference.model import Model, ModelParameters, Motion, Sensor
-from replay.inference.smoothing import solve_semidefinite
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.tangent import rotation_vector
+from replay.inference.linear_algebra.manifold import resetting
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.smoothing import smoothers
+from replay.inference.smoothing.backward_pass import solve_semidefinite
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

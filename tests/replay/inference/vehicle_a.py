@@ -10,9 +10,9 @@ from recorders.log import Field, Schema, make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.planar import range_bearing
 from recorders.recording import Recording
-from replay.engine.measurements import PLANE
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.engine.streams.measurements import PLANE
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
 
 Floats = NDArray[np.float64]
 MEAN = np.array([0.0, 0.0, 0.0, 1.0, 0.2])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
-from replay.engine.sources import MemorySource, memory_source
-from replay.inference.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
 
 Floats = NDArray[np.float64]
 EPOCH_NS = 10**9

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from replay.engine.covariances import normalized_error_squared
-from replay.judging.consistency import component_error_squared, dilution_of_precision, ellipse_area
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.judging.consistency.consistency import (
+    component_error_squared,
+    dilution_of_precision,
+    ellipse_area,
+)
 
 
 def test_nees_of_mixed_units() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.comparing.sides import Side, of_replay
-from replay.judging.differences import aim_of, paired_difference
+from replay.judging.errors.differences import aim_of, paired_difference
 
 PAIRS, RUNS = 200, 50
 CALLED = ("better", "worse", "higher", "lower")

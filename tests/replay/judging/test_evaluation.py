@@ -23,15 +23,15 @@ from recorders.log import (
 )
 from recorders.log.streams import empty_stream
 from recorders.recording import Recording
-from replay.engine.blocks import Ragged, gather
-from replay.engine.covariances import normalized_error_squared
-from replay.engine.sources import MemorySource, memory_source
-from replay.engine.tangent import truth_at
-from replay.judging.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.engine.vectors.tangent import truth_at
+from replay.judging.errors.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
+from replay.judging.errors.truths import Truths
 from replay.judging.judge import Judge
-from replay.judging.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
+from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
 from replay.judging.tables import error_table
-from replay.judging.truths import Truths
 
 SECOND = 1_000_000_000
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}

@@ -11,14 +11,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.log import Clock, Stream, make_stream, schemas
 from recorders.recording import record_run
-from replay.engine.blocks import Ragged, gather
-from replay.engine.estimator import bind
-from replay.engine.replaying import Report, collect, replay
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.evaluation import chi_square_interval, rmse_interval
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import Report, collect, replay
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.errors.evaluation import chi_square_interval, rmse_interval
+from replay.judging.errors.truths import Truths
 from replay.judging.judge import Judge
-from replay.judging.sums import BinnedSums
-from replay.judging.truths import Truths
+from replay.judging.metrics.sums import BinnedSums
 
 GAP_S = 0.2
 

@@ -5,10 +5,10 @@ import pytest
 
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
-from replay.engine.blocks import Ragged
-from replay.judging.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
-from replay.judging.measuring import Output, find_metrics, measure, metric_of_sums
-from replay.judging.metrics import ACCURACY, FAILURES, INNOVATION, LIKELIHOOD
+from replay.engine.streams.blocks import Ragged
+from replay.judging.errors.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
+from replay.judging.metrics.measuring import Output, find_metrics, measure, metric_of_sums
+from replay.judging.metrics.metrics import ACCURACY, FAILURES, INNOVATION, LIKELIHOOD
 
 
 def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:

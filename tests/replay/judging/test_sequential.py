@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from replay.judging.sequential import (
+from replay.judging.consistency.sequential import (
     Rates,
     decide,
     first_alarm,

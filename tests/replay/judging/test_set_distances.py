@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from recorders.errors import BadInput
-from replay.judging.set_distances import gospa, ospa
+from replay.judging.sets.distances import gospa, ospa
 
 THREE = [(0, 0), (10, 0), (0, 10)]
 EMPTY = np.empty((0, 2))

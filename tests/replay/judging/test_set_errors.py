@@ -5,11 +5,11 @@ import pytest
 
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import Recording
-from replay.engine.blocks import gather
-from replay.engine.sources import MemorySource, memory_source
-from replay.judging.measuring import measure
-from replay.judging.set_errors import SETS, set_errors
-from replay.judging.truths import Truths
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.measuring import measure
+from replay.judging.sets.errors import SETS, set_errors
 
 SECOND = 1_000_000_000
 PLANE = {"components": "x_m,speed_mps,y_m", "kinds": "linear,linear,linear"}

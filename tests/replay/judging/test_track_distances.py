@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from replay.judging.set_distances import gospa, gospa_pairs
-from replay.judging.track_distances import THRESHOLDS, hota, idf1, trajectory_gospa
+from replay.judging.sets.distances import gospa, gospa_pairs
+from replay.judging.tracks.distances import THRESHOLDS, hota, idf1, trajectory_gospa
 
 NO = (np.nan, np.nan)
 TRUTHS = np.array(

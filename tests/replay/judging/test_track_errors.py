@@ -9,8 +9,8 @@ import pytest
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.recording import import_run
-from replay.engine.sources import memory_source
-from replay.judging.track_errors import (
+from replay.engine.streams.sources import memory_source
+from replay.judging.tracks.errors import (
     TracksAt,
     as_trajectories,
     instants_of,

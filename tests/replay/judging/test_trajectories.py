@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.trajectories import Trajectory, read_trajectory
-from replay.engine.covariances import normalized_error_squared
-from replay.engine.tangent import difference
-from replay.judging.alignment import Alignment, aligned, aligned_estimates, alignment_of
-from replay.judging.trajectories import (
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.engine.vectors.tangent import difference
+from replay.judging.errors.alignment import Alignment, aligned, aligned_estimates, alignment_of
+from replay.judging.errors.trajectories import (
     Comparison,
     compare,
     estimated_offset_s,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from recorders.log import Stream, make_stream, schemas
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.judging.whiteness import whitened, whiteness
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.judging.consistency.whiteness import whitened, whiteness
 from tests.replay.inference.sheet_robot import of_sigmas, recorded
 
 

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.states import NAVIGATION, state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
-from replay.engine.blocks import gather
-from replay.engine.sources import memory_source
-from replay.timeline.geodetic import POOR, QUALITIES
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import memory_source
+from replay.timeline.drawing.geodetic import POOR, QUALITIES
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read
 

@@ -5,12 +5,12 @@ import pytest
 
 from recorders.log import schemas
 from recorders.recording import record_run
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.engine.sources import memory_source
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import memory_source
 from replay.judging.judge import Judge
-from replay.judging.set_evaluation import areas_of, frames_of
-from replay.timeline.networks import ARRIVED, LOST
+from replay.judging.sets.evaluation import areas_of, frames_of
+from replay.timeline.families.networks import ARRIVED, LOST
 from replay.timeline.show import show
 from tests.replay.timeline.test_timeline import read
 

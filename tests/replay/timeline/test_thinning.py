@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
-from pipeline.ensemble import Part, replay_parts
+from pipeline.runs.ensemble import Part, replay_parts
 from recorders.log import make_stream, open_log, schemas, write_log
 from recorders.recording import record_run
-from replay.engine.sources import LogSource
-from replay.timeline.canvas import thin_curve
-from replay.timeline.thinning import thinned_stream
+from replay.engine.streams.sources import LogSource
+from replay.timeline.drawing.canvas import thin_curve
+from replay.timeline.drawing.thinning import thinned_stream
 from replay.timeline.viewer import listen
 from tests.replay.timeline.test_timeline import read
 

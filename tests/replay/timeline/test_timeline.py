@@ -26,17 +26,17 @@ from scipy.stats import chi2
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, open_log, schemas
 from recorders.recording import record_run
-from replay.engine.blocks import Ragged, gather
-from replay.engine.estimator import bind
-from replay.engine.measurements import PLANE, covariances_of
-from replay.engine.replaying import collect
-from replay.engine.replaying import replay as replayed
-from replay.engine.sources import LogSource, MemorySource, memory_source
-from replay.judging.evaluation import Errors, chi_square_interval
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect
+from replay.engine.replaying.replaying import replay as replayed
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.measurements import PLANE, covariances_of
+from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.judging.errors.evaluation import Errors, chi_square_interval
 from replay.judging.judge import Judge
-from replay.timeline.canvas import DRAWN_ROWS, PALETTE, thin
-from replay.timeline.landmarks import GATED
-from replay.timeline.plane import ellipses
+from replay.timeline.drawing.canvas import DRAWN_ROWS, PALETTE, thin
+from replay.timeline.drawing.plane import ellipses
+from replay.timeline.families.landmarks import GATED
 from replay.timeline.show import Drawing, show
 from replay.timeline.sinks import open_recording
 from replay.timeline.viewer import Listener, listen, screenshot, view

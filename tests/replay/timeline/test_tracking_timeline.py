@@ -7,9 +7,9 @@ import numpy as np
 from recorders.log import make_stream, schemas
 from recorders.models.states import state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS
-from replay.engine.estimator import bind
-from replay.engine.replaying import collect, replay
-from replay.judging.track_errors import instants_of, track_errors, tracks_at
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.judging.tracks.errors import instants_of, track_errors, tracks_at
 from replay.timeline.show import show
 from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
 from tests.replay.timeline.test_timeline import read

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from replay.engine.arrays import Floats
-from replay.engine.compile import compile_over_runs
+from replay.engine.compiling.compile import compile_over_runs
 from replay.tracing.functions import Derivative, TracedFunction
 from replay.tracing.graph import Node
 from replay.tracing.traced import Trace

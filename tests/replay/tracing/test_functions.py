@@ -15,9 +15,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from recorders.errors import BadInput
-from replay.engine.compile import compile_over_runs
-from replay.inference.checking import check_model
-from replay.inference.model import Model
+from replay.engine.compiling.compile import compile_over_runs
+from replay.inference.model.checking import check_model
+from replay.inference.model.model import Model
 from replay.tracing.functions import Shape, TracedFunction, traced
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, VALUE, source

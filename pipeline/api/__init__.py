@@ -1,0 +1,1 @@
+"""What `import fuselog` offers, on which the commands rest; begin with `api`."""

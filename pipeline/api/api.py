@@ -1,0 +1,246 @@
+"""What `import fuselog` offers in place of the commands: logs, recordings, experiments, lists.
+
+Everything raises BadInput as the commands do, with the same sentences. docs/python.md shows how to use
+it; `pipeline.api.replays` has the replay.
+"""
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.api import catalog
+from pipeline.api.catalog import Entry
+from pipeline.output.outputs import LOG, check_files, check_folder
+from pipeline.output.results import Result, read_table
+from pipeline.runs.executors import crew_of, of_executor
+from pipeline.runs.experiment import (
+    load_experiment,
+    load_scenario,
+    read_experiment,
+    require_campaign,
+    run_experiment,
+)
+from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
+from pipeline.studies.toolkit.localization import summary_table
+from recorders.errors import BadInput, UnknownName, choices
+from recorders.log import Stream, open_log, write_log
+from recorders.parameters import merge
+from recorders.recording import import_run, record_run
+from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+
+
+def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
+    """Open a log: a mapping of its topics to their streams, each read when it is asked for.
+
+    Args:
+        path: an MCAP file.
+        recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
+
+    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+
+    >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
+    >>> log = open("run.mcap")
+    >>> log.run.scenario, len(log)
+    ('landmarks', 5)
+    >>> log["/robot1/odometry"]["forward_mps"].shape
+    (40,)
+    """
+    log = open_log(path, recover=recover)
+    if log.loss_statement:
+        warnings.warn(log.loss_statement, stacklevel=2)
+    return LogSource(log)
+
+
+def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
+    """Record a run of a scenario, in memory: it reads and replays like a log, and can be written.
+
+    Args:
+        scenario: a name (`scenarios` has them), or a TOML file.
+        seed: of the random numbers.
+        run: which run of the seed; scenario, parameters, seed and run give the same streams.
+        parameters: what differs from the scenario's own.
+
+    Raises BadInput for an unknown scenario or parameter.
+
+    >>> record("landmarks", seed=7, duration_s=2.0)["/robot1/odometry"].topic
+    '/robot1/odometry'
+    """
+    recorder, values, _ = load_scenario(str(scenario))
+    return memory_source(*record_run(recorder, merge(values, parameters), seed, run))
+
+
+def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySource:
+    """Import real data, as their publishers lay them out, into memory.
+
+    Raises BadInput for an unknown importer or parameter, or data that it cannot read.
+    """
+    return memory_source(*import_run(importer, Path(path), parameters))
+
+
+def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
+    """Write a recording, or streams of your own, as a log; it appears whole or not at all.
+
+    Raises BadInput where a stream breaks its schema, or what is in the place is no log of ours.
+    """
+    check_files([(Path(path), LOG)], {})
+    if isinstance(streams, MemorySource):
+        write_log(path, streams.streams.values(), streams.run)
+        return
+    given = list(streams)
+    if not all(isinstance(each, Stream) for each in given):
+        raise BadInput(
+            f"{path}: there is nothing to write; give streams, as make_stream makes them, or a recording"
+        )
+    write_log(path, given)
+
+
+@dataclass(frozen=True)
+class ResultFolder:
+    """A result folder, and what its result.json says."""
+
+    folder: Path
+    result: Result
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """A row per metric: estimator, quantity, case, value."""
+        return summary_table(self.result.metrics)
+
+    @property
+    def claims(self) -> pd.DataFrame:
+        """A row per statement of a paper: what is printed, what we measured, our verdict, and why."""
+        return pd.DataFrame([vars(claim) for claim in self.result.claims])
+
+    @cached_property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """All tables by name."""
+        paths = sorted((self.folder / "tables").glob("*.parquet"))
+        return {path.stem: read_table(path) for path in paths}
+
+
+def run(
+    experiment: str | Path,
+    /,
+    *,
+    runs: int | None = None,
+    seed: int | None = None,
+    data: str | Path | None = None,
+    out: str | Path | None = None,
+    logs: int = 20,
+    errors: bool = False,
+    workers: int = 1,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+) -> ResultFolder:
+    """Run an experiment into a result folder.
+
+    Args:
+        experiment: a name (`experiments` has them), or a TOML file.
+        runs: how many, if not as many as the experiment says.
+        seed: another than the experiment's.
+        data: the real data, where the experiment imports any.
+        out: the folder, by default out/ and the experiment's name.
+        logs: of how many runs the logs are kept.
+        errors: whether every single error is kept.
+        workers: processes that share the runs; a script that asks for more than one guards its own
+            work with `if __name__ == "__main__":`, as they import it.
+        scheduler: a Dask scheduler whose workers share them, or `local:N`.
+        executor: anything else that works on them, whose workers see this machine's files.
+        set: entries of the experiment, parameters of its scenario, or of its estimators by label:
+            `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
+
+    Raises BadInput where it cannot be run, or the folder holds something else than a result.
+    """
+    over = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    name, found = load_experiment(str(experiment), set or {}, over)
+    if workers > 1 or scheduler is not None or executor is not None:
+        require_campaign(found, "leave out workers, scheduler and executor")
+    folder = Path("out", name) if out is None else Path(out)
+    place = None if data is None else Path(data)
+    files = [Path(experiment)] if str(experiment).endswith(".toml") else []
+    check_folder(folder, {"input": files if place is None else [*files, place]})
+    crew = crew_of(workers, scheduler, found.runs) if executor is None else of_executor(executor)
+    return ResultFolder(
+        folder, run_experiment(name, found, folder, data=place, logs=logs, errors=errors, crew=crew)
+    )
+
+
+def sweep(
+    experiment: str | Path,
+    over: Mapping[str, Iterable[Any]],
+    /,
+    *,
+    runs: int | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    executor: Executor | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+) -> ResultFolder:
+    """Run an experiment at all points of a grid into a result folder, whose table `sweep` has them.
+
+    Args:
+        experiment: a name (`experiments` has them), or a TOML file.
+        over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`.
+        runs: how many at each point, if not as many as the experiment says.
+        seed: another than the experiment's.
+        out: the folder, by default out/ and the experiment's name with -sweep.
+        workers: as for `run`.
+        scheduler: as for `run`.
+        executor: as for `run`.
+        set: as for `run`.
+
+    Raises BadInput where it cannot be run, or the folder holds something else than a result.
+    """
+    given = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
+    overs = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
+    points = points_of(overs)
+    stated = read_experiment(str(experiment))
+    found = [stated.with_settings(merge(set or {}, nested(point)), given) for point in points]
+    folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
+    check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
+    runs_in_all = sum(each.runs for each in found)
+    crew = crew_of(workers, scheduler, runs_in_all) if executor is None else of_executor(executor)
+    return ResultFolder(folder, run_sweep(stated.name, overs, points, found, folder, crew=crew))
+
+
+class Catalog(Mapping[str, Entry]):
+    """What there is of a kind, by name; raises `UnknownName` for another, with the one that is near."""
+
+    def __init__(self, kind: str, list_entries: Callable[[], list[Entry]]) -> None:
+        self._kind, self._list = kind, list_entries
+
+    @cached_property
+    def _entries(self) -> dict[str, Entry]:
+        return {entry.name: entry for entry in self._list()}
+
+    def __getitem__(self, name: str) -> Entry:
+        if name not in self._entries:
+            raise UnknownName(f"no {self._kind} '{name}'; {choices(name, self._entries)}")
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __repr__(self) -> str:
+        width = max(map(len, self), default=0)
+        return "\n".join(f"{name:{width}}  {entry.what}" for name, entry in self.items())
+
+
+scenarios = Catalog("scenario", catalog.scenarios)
+estimators = Catalog("estimator", catalog.estimators)
+models = Catalog("model", catalog.models)
+metrics = Catalog("metric", catalog.metrics)
+experiments = Catalog("experiment", catalog.experiments)

@@ -1,0 +1,220 @@
+"""What there is to choose from: scenarios, estimators, metrics, experiments; lists and details."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from pipeline.output.terminal import print_json, print_table, say
+from pipeline.runs.experiment import Experiment, load_scenario, shipped
+from recorders.errors import BadInput, choices
+from recorders.parameters import build, describe, explain
+from recorders.parsing import read_toml
+from recorders.recording import Importer, Recorder
+from recorders.registry import available, load
+from replay.engine.replaying.estimator import Estimator
+from replay.inference.all_methods import METHODS
+from replay.inference.estimators import registered_models
+from replay.inference.model.binding import serving
+from replay.inference.model.formulas import formulas, formulas_by_function
+from replay.inference.model.model import Model, ModelParameters
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.requirements import needs_of
+from replay.judging.metrics.measuring import Metric
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing to choose: what it is in a line, more facts, its parameters, and values it sets.
+
+    `stated` are the parameters that a log's channels state where they are not given.
+    """
+
+    name: str
+    what: str
+    facts: Mapping[str, str] = field(default_factory=dict)
+    parameters: type[BaseModel] | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    stated: Collection[str] = ()
+
+
+def scenarios() -> list[Entry]:
+    """Recorders, and the scenario files that ship."""
+    files = [_entry(name, partial(_scenario, name, path)) for name, path in shipped("scenarios").items()]
+    return _registered("recorders", Recorder, _recorder) + files
+
+
+def estimators() -> list[Entry]:
+    """Estimators with what they need of a log."""
+    return _registered("estimators", Estimator, _estimator)
+
+
+def models() -> list[Entry]:
+    """Models with what they are made of, and the methods that estimate them."""
+    return _registered("models", Model, _model)
+
+
+def metrics() -> list[Entry]:
+    """Metrics that judge estimates."""
+    return _registered("metrics", Metric, _metric)
+
+
+def experiments() -> list[Entry]:
+    """Shipped experiments."""
+    files = shipped("experiments").items()
+    return [_entry(name, partial(_experiment, name, path)) for name, path in files]
+
+
+def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) -> None:
+    """Print a list, or all about one of its entries."""
+    if name is not None:
+        known = {entry.name: entry for entry in entries}
+        if name not in known:
+            raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
+        entries = [known[name]]
+    if as_json:
+        print_json([_as_json(entry) for entry in entries])
+    elif name is None:
+        print_table([kind, "what"], [[entry.name, entry.what] for entry in entries])
+        say(f"For all about one of them: fuselog {kind}s NAME")
+    else:
+        _print_details(entries[0])
+
+
+def show_models(name: str | None, *, as_json: bool) -> None:
+    """Print the models and the methods that estimate each, or all about one of them."""
+    show(models(), "model", name, as_json=as_json)
+    if name is None and not as_json:
+        rows = [[name, *_methods_of(model).values()] for name, model in registered_models().items()]
+        print_table(["model", *METHODS], rows, "Methods that estimate them")
+
+
+def show_formulas(name: str | None, *, as_json: bool) -> None:
+    """Print the formulas of a model; raises BadInput where none is named, or there is no such model."""
+    if name is None:
+        raise BadInput("--formulas: give a model, as in fuselog models robot --formulas")
+    if as_json:
+        print_json({"name": name, "formulas": formulas_by_function(name)})
+    else:
+        for line in formulas(name).splitlines():
+            say(line)
+
+
+def _methods_of(model: Model) -> dict[str, str]:
+    """For every method "yes", or what the model lacks for it."""
+    lacking = {name: method.lacks(model) for name, method in METHODS.items()}
+    return {name: f"no: it lacks {what}" if what else "yes" for name, what in lacking.items()}
+
+
+def _registered(kind: str, expected: type, described: Callable[[str, Any], Entry]) -> list[Entry]:
+    """An entry for every registered name."""
+
+    def make(name: str) -> Entry:
+        return described(name, load(kind, name, expected))
+
+    return [_entry(name, partial(make, name)) for name in available(kind)]
+
+
+def _entry(name: str, make: Callable[[], Entry]) -> Entry:
+    """An entry, or where it cannot be had, why."""
+    try:
+        return make()
+    except BadInput as error:
+        return Entry(name, str(error))
+
+
+def _scenario(name: str, path: Path) -> Entry:
+    recorder, values, _ = load_scenario(name)
+    kind = load("recorders", recorder, Recorder).parameters
+    facts = {"record with": f"fuselog record {name}"}
+    return Entry(name, read_toml(path).get("title", ""), facts, kind, values)
+
+
+def _recorder(name: str, recorder: Recorder[Any]) -> Entry:
+    is_import = isinstance(recorder, Importer)
+    command = f"fuselog import {name} PATH" if is_import else f"fuselog record {name}"
+    return Entry(name, recorder.summary, {"record with": command}, recorder.parameters)
+
+
+def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
+    facts = {"needs": estimator.needs}
+    if estimator.variant:
+        facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
+    return Entry(name, estimator.summary, facts, estimator.parameters)
+
+
+def _model(name: str, model: Model) -> Entry:
+    facts = {"state": _listed(model.state)}
+    for sensor in model.all_sensors:
+        of = f" of {', '.join(each.topic for each in sensor.maps)}" if sensor.maps else ""
+        taken = " or ".join(serving(sensor.schema))
+        facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({taken})"
+    for control in [model.control, *model.control.instead] if model.control else []:
+        facts[f"control {control.topic}"] = ", ".join(control.components)
+    if model.modes:
+        facts["modes"] = ", ".join(model.modes)
+    if model.estimable:
+        facts["estimable"] = _listed(model.estimable)
+    facts["needs"] = needs_of(model)
+    facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
+    own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
+    stated = own & {*number_fields(model.parameters)}
+    return Entry(name, model.summary, facts, model.parameters, stated=stated)
+
+
+def _listed(components: Mapping[str, str]) -> str:
+    """Components, each with its kind unless that is linear."""
+    return ", ".join(
+        name if kind == "linear" else f"{name} ({kind})" for name, kind in components.items()
+    )
+
+
+def _metric(name: str, metric: Metric[Any, Any]) -> Entry:
+    return Entry(name, metric.summary, {"judges": metric.judges.__name__})
+
+
+def _experiment(name: str, path: Path) -> Entry:
+    experiment = build(Experiment, read_toml(path), f"experiment {name}")
+    facts = {"study": experiment.study, "estimators": ", ".join(experiment.estimators)}
+    if experiment.record:
+        facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
+    if experiment.import_:
+        facts["imports"] = f"{experiment.import_.source}; give its place with --data"
+    return Entry(name, experiment.title, facts)
+
+
+def _as_json(entry: Entry) -> dict[str, Any]:
+    schema = entry.parameters.model_json_schema() if entry.parameters else None
+    return {
+        "name": entry.name,
+        "what": entry.what,
+        **{key.replace(" ", "_"): fact for key, fact in entry.facts.items()},
+        "parameters": schema,
+        "values": dict(entry.values),
+    }
+
+
+def _print_details(entry: Entry) -> None:
+    say(f"{entry.name}: {entry.what}")
+    for key, fact in entry.facts.items():
+        say(f"{key}: {fact}")
+    if entry.parameters:
+        described = describe(entry.parameters, entry.values)
+        table = [
+            [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
+            for each in described
+        ]
+        if any(each.meaning for each in described):
+            print_table(["parameter", "default", "accepts", "meaning"], table)
+        elif table:
+            print_table(["parameter", "default", "accepts"], [row[:-1] for row in table])
+        for place, text in explain(entry.parameters).items() if table else ():
+            say(f"\n{place}\n{text}" if place else f"\n{text}")
+
+
+def _default(value: object, *, is_stated: bool) -> object:
+    """A parameter's default in words, where it is what a log's channels state."""
+    return "from the log" if value is None and is_stated else value

@@ -1,0 +1,138 @@
+"""Observability of logs: a table for Python, and the command that prints it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pipeline.api.replays import Log, sources_of
+from pipeline.output.terminal import print_json, print_table
+from pipeline.runs.initial_states import span_of
+from pipeline.runs.settings import sigmas_of
+from recorders.errors import BadInput
+from recorders.log import open_log
+from recorders.parameters import parse_settings
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.inference.model.model import Model
+from replay.inference.observability import OBSERVABILITY, Spectrum, in_words, observability_of
+
+NAME = "observability"
+
+
+def observability(
+    logs: Log | Iterable[Log],
+    model: str | Model | None = None,
+    *,
+    window_s: float | None = None,
+    scales: Mapping[str, float] | None = None,
+    end_s: float | None = None,
+    **parameters: Any,
+) -> pd.DataFrame:
+    """What the measurements of a log tell of a model's state, in units of what the prior tells.
+
+    Args:
+        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        model: a registered name, or a model of your own; by default the registered one that fits.
+        window_s: how long the windows are, in seconds; by default each run is one.
+        scales: what is worth one, by component, instead of the prior's standard deviation.
+        end_s: where the runs end, in seconds since each one's epoch.
+        parameters: of the model.
+
+    Returns a row per run, case and window: its span, how many measurements it has, the rank and the
+    eigenvalues of the local Gramian, ascending, the direction of the least in state units and of length
+    one, and what that means in words.
+    Raises BadInput where no model fits, or nothing is measured.
+
+    >>> from pipeline.api.api import record
+    >>> table = observability(record("landmarks", duration_s=2.0), window_s=1.0)
+    >>> table["rank"].tolist()
+    [3, 3]
+    """
+    sources = [span_of(source, None, end_s, "publish_time") for source in sources_of(logs)]
+    given = {"model": model, "window_s": window_s, "scales": dict(scales or {}) or None}
+    kind: Any = OBSERVABILITY
+    if isinstance(model, Model):
+        kind = observability_of(model)
+        del given["model"]
+    settings = {name: value for name, value in given.items() if value is not None} | parameters
+    bound = bind(NAME, sources, {"kind": kind, **settings})
+    rows: list[dict[str, Any]] = []
+    for topic, ragged in collect(replay(sources, bound)).items():
+        if topic.endswith(f"/{NAME}"):
+            case = topic.removeprefix(f"/estimates/{NAME}").removesuffix(f"/{NAME}").strip("/")
+            rows += _rows(sources, case, ragged)
+    if not any(row["measurements"] for row in rows):
+        raise BadInput(
+            f"{sources[0].name}: no sensor of the model measured anything in the span; give another span"
+        )
+    return pd.DataFrame(rows)
+
+
+def _rows(
+    sources: Sequence[LogSource | MemorySource], case: str, ragged: Ragged
+) -> Iterable[dict[str, Any]]:
+    components = ragged.stream.metadata["components"].split(",")
+    for run, source in enumerate(sources):
+        stream, zero_ns = ragged.of_run(run), source.zero_ns("publish_time")
+        for row, end_ns in enumerate(stream.publish_time_ns):
+            values, direction = stream["eigenvalues"][row], stream["direction"][row]
+            told = Spectrum(values, int(stream["rank"][row]), direction)
+            measured = int(stream["measurements"][row])
+            yield {
+                "run": run,
+                "case": case,
+                "begin_s": (int(stream["begin_time_ns"][row]) - zero_ns) * 1e-9,
+                "end_s": (int(end_ns) - zero_ns) * 1e-9,
+                "measurements": measured,
+                "rank": told.rank,
+                "eigenvalues": values.tolist(),
+                "direction": dict(zip(components, direction.tolist(), strict=True)),
+                "weakest": in_words(told, components) if measured else "nothing was measured",
+            }
+
+
+def show_observability(
+    logs: Sequence[Path],
+    *,
+    model: str | None,
+    window_s: float | None,
+    scales: Sequence[str],
+    end_s: float | None,
+    recover: bool,
+    as_json: bool,
+    settings: Sequence[str],
+) -> None:
+    """Print the table of `observability`."""
+    if window_s is not None and window_s <= 0:
+        raise BadInput(f"--window {window_s:g}: give seconds above zero, such as 10")
+    found = observability(
+        [LogSource(open_log(path, recover=recover)) for path in logs],
+        model,
+        window_s=window_s,
+        scales=sigmas_of(scales, "--scale"),
+        end_s=end_s,
+        **parse_settings(settings),
+    )
+    rows = found.to_dict("records")
+    if as_json:
+        print_json(rows)
+        return
+    columns = ["run", "case", "from (s)", "to (s)", "measurements", "rank", "eigenvalues", "weakest"]
+    shown = [
+        [
+            logs[row["run"]].name,
+            row["case"],
+            row["begin_s"],
+            row["end_s"],
+            row["measurements"],
+            f"{row['rank']} of {len(row['eigenvalues'])}",
+            ", ".join(f"{value:.3g}" for value in row["eigenvalues"]),
+            row["weakest"],
+        ]
+        for row in rows
+    ]
+    print_table(columns, shown)

@@ -1,0 +1,192 @@
+"""Compiles kernels ahead of their first use: short recordings are replayed, on all cores."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
+from itertools import product
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from pipeline.api.replays import replay
+from pipeline.output.terminal import print_json, print_table, say
+from pipeline.runs.executors import here, processes
+from pipeline.runs.experiment import load_scenario, shipped
+from recorders.errors import BadInput, choices
+from recorders.recording import Importer, Recorder, record_run
+from recorders.registry import available, load
+from replay.engine.compiling.cache import cache_folder, is_private, kept_files
+from replay.engine.compiling.compile import core_count, is_uncompiled
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.all_methods import METHODS, modelled
+from replay.inference.estimators import registered_models
+from replay.inference.model.binding import topics_of
+from replay.inference.model.model import Model
+from replay.inference.model.requirements import names_state
+
+USUAL = ("ekf", "ukf", "smoother:ekf")
+SHORT_S = (2.0, 12.0)  # the first that a scenario accepts
+Pair = tuple[str, str]
+
+
+class Precompiled(NamedTuple):
+    """One model by one method: the scenario whose log was replayed, how long that took, or why not."""
+
+    model: str
+    method: str
+    scenario: str
+    took_s: float
+    why_not: str = ""
+
+
+def precompile(
+    models: str | Iterable[str] | None = None,
+    methods: str | Iterable[str] | None = None,
+    *,
+    workers: int | None = None,
+) -> list[Precompiled]:
+    """Compile and keep what the first replay of models by methods would compile.
+
+    A kernel is made for the sensors that a log has. So the registered scenarios that a model fits are
+    recorded, for seconds, and replayed. A log with other sensors compiles its own kernels when it is
+    first replayed, and so does a model that no scenario fits, or that is not registered.
+
+    Args:
+        models: registered names (`models` has them), all by default.
+        methods: such as "smoother:ukf"; ekf, ukf and smoother:ekf by default. Where one of the two is
+            left out, methods that cannot estimate a model are left out too.
+        workers: processes, as many as there are cores by default; a script guards its own work with `if
+            __name__ == "__main__":`, as they import it.
+
+    Returns a row for every model, method and scenario; of scenarios with the same sensors, the first.
+    Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache where nothing
+    would be kept.
+    """
+    names = [models] if isinstance(models, str) else models
+    chosen = [methods] if isinstance(methods, str) else methods
+    if names is None:
+        pairs = _working(registered_models(), chosen or USUAL)
+    elif chosen is None:
+        pairs = _usual(names)
+    else:
+        pairs = list(product(names, chosen))
+    return precompile_pairs(pairs, workers=workers)
+
+
+def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> list[Precompiled]:
+    """The same for these pairs of a model and a method."""
+    pairs = list(dict.fromkeys(pairs))
+    for model, method in pairs:
+        modelled(load("models", model, Model), method)
+    _check_cache()
+    crew = here if (workers or core_count()) == 1 else processes(workers or core_count())
+    with crew() as team:
+        names = sorted({model for model, _ in pairs})
+        fitting = _all(team.executor, _fits, [(name, names) for name in _scenarios()])
+        scenarios: dict[tuple[str, Any], str] = {}
+        for scenario, fits in fitting:
+            for model, sensors in fits.items():
+                scenarios.setdefault((model, sensors), scenario)
+        asked = [
+            (scenario, model, method)
+            for model, method in pairs
+            for (own, _), scenario in scenarios.items()
+            if own == model
+        ]
+        made = _all(team.executor, _replayed, asked)
+    served = {model for model, _ in scenarios}
+    why = "no scenario has a log for it: its first replay compiles"
+    return [*made, *(Precompiled(*pair, "", 0.0, why) for pair in pairs if pair[0] not in served)]
+
+
+def show_precompiling(asked: Iterable[str], *, as_json: bool) -> None:
+    """Compile the pairs MODEL:METHOD, or usual methods of MODEL, or of all; print what was made."""
+    begun_s, before = perf_counter(), set(kept_files())
+    pairs = [pair for text in asked for pair in _pairs_of(text)]
+    made = precompile_pairs(pairs or _working(registered_models(), USUAL))
+    took_s, kernels = perf_counter() - begun_s, len(set(kept_files()) - before)
+    if as_json:
+        rows = [each._asdict() for each in made]
+        print_json({"folder": str(cache_folder()), "made": kernels, "took_s": took_s, "replays": rows})
+        return
+    table = [[*each[:3], each.why_not or f"{each.took_s:.1f} s"] for each in made]
+    print_table(["model", "method", "scenario", "took"], table)
+    say(f"{cache_folder()}: {kernels} new kernels in {took_s:.1f} s")
+
+
+def _pairs_of(text: str) -> list[Pair]:
+    model, _, method = text.partition(":")
+    return [(model, method)] if method else _usual([model])
+
+
+def _usual(models: Iterable[str]) -> list[Pair]:
+    return _working({name: load("models", name, Model) for name in models}, USUAL)
+
+
+def _working(models: dict[str, Model], methods: Iterable[str]) -> list[Pair]:
+    """The pairs that work together."""
+    kinds = {method: method.partition(":")[0] for method in methods}
+    for kind in kinds.values():
+        if kind not in METHODS:
+            raise BadInput(f"no method '{kind}'; {choices(kind, METHODS)}")
+    return [
+        (name, method)
+        for (name, model), (method, kind) in product(models.items(), kinds.items())
+        if not METHODS[kind].lacks(model)
+    ]
+
+
+def _check_cache() -> None:
+    if is_uncompiled():
+        raise BadInput("nothing is compiled with FUSELOG_UNCOMPILED=1; leave it out")
+    if not is_private(cache_folder() / "kernels"):
+        raise BadInput(
+            f"the cache {cache_folder()} is not this user's alone, and keeps nothing; set FUSELOG_CACHE "
+            "to a folder of your own"
+        )
+
+
+def _scenarios() -> list[str]:
+    """All that can be recorded."""
+    names = [*available("recorders"), *shipped("scenarios")]
+    return [
+        name
+        for name in names
+        if not isinstance(load("recorders", load_scenario(name)[0], Recorder), Importer)
+    ]
+
+
+def _all(executor: Executor, work: Callable[..., Any], asked: Iterable[tuple[Any, ...]]) -> list[Any]:
+    return [each.result() for each in [executor.submit(work, *given) for given in asked]]
+
+
+def _fits(scenario: str, models: Iterable[str]) -> tuple[str, dict[str, Any]]:
+    """Which of the models a scenario's log fits, and with which sensors each."""
+    topics, found = _recorded(scenario).topics, {}
+    for name in models:
+        model = load("models", name, Model)
+        places = [each for each in topics_of(model, topics) if names_state(each.prior, model)]
+        if model.by_name:  # its topics are those of other models too: the prior alone tells
+            places = [each for each in places if each.has_prior]
+        if places:
+            found[name] = tuple(sorted({tuple(own.topic for own, _ in each.sensors) for each in places}))
+    return scenario, found
+
+
+def _replayed(scenario: str, model: str, method: str) -> Precompiled:
+    begun_s = perf_counter()
+    try:
+        replay(_recorded(scenario), {"precompiled": modelled(load("models", model, Model), method)})
+    except BadInput as error:
+        return Precompiled(model, method, scenario, perf_counter() - begun_s, str(error))
+    return Precompiled(model, method, scenario, perf_counter() - begun_s)
+
+
+def _recorded(scenario: str) -> MemorySource:
+    """A short recording."""
+    recorder, values, _ = load_scenario(scenario)
+    if "duration_s" in load("recorders", recorder, Recorder).parameters.model_fields:
+        for duration_s in SHORT_S:
+            try:
+                return memory_source(*record_run(recorder, {**values, "duration_s": duration_s}, 0, 0))
+            except BadInput:
+                continue
+    return memory_source(*record_run(recorder, values, 0, 0))

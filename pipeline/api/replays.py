@@ -1,0 +1,345 @@
+"""A replay as a function: logs and estimators in, and all that can be asked of what they gave.
+
+The estimates lie in a scratch folder for as long as the replay is referred to: memory holds the metrics'
+sums, and what is asked for.
+"""
+
+import hashlib
+import json
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.api import api as door
+from pipeline.api.api import ResultFolder
+from pipeline.output.charts import draw
+from pipeline.output.outputs import TIMELINE, check_files, check_folder
+from pipeline.output.results import in_order, result_folder, write_outcome
+from pipeline.runs.coverage import coverage_table, sentences
+from pipeline.runs.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.initial_states import order_of, origins_of, span_of
+from pipeline.studies.toolkit.localization import error_charts, summarise, summary_table
+from recorders.atomic import scratch_folder
+from recorders.errors import BadInput, choices
+from recorders.log import RunMetadata, open_log, schemas
+from recorders.recording import Recording
+from replay.engine.replaying.estimator import Estimator
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.inference.model.model import Model
+from replay.judging.errors.evaluation import Errors, innovations_of
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import find_metrics
+from replay.judging.tables import error_table, joined
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Log = str | Path | LogSource | MemorySource | Recording
+Kind = str | Estimator[Any] | Mapping[str, Any]
+
+
+def replay(
+    logs: Log | Iterable[Log],
+    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    start_from: str | Path | Sequence[str | Path] = (),
+    start_sigma: Mapping[str, float] | None = None,
+    gap_limit_s: float = 0.2,
+    arrival_order: bool = False,
+    late: str | None = None,
+    metrics: str | Sequence[str] = (),
+) -> "Replay":
+    """Replay estimators over logs, and judge them where there is truth.
+
+    Args:
+        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        estimators: registered names, or labels of your own with what they stand for: an `Estimator`, as
+            `recursive`, `batch` and `modelled` make them, or settings, whose `kind` is a name or an
+            `Estimator`: `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
+        start_s: where the replayed span begins, in seconds since each run's epoch.
+        end_s: where it ends.
+        start_from: what filters begin with at `start_s`: "truth", or the estimates log of an earlier
+            replay for each log.
+        start_sigma: how well the truth is known, by component; by default as the log's prior has it.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        arrival_order: go by log time, as the messages arrived.
+        late: what is done about messages that then come late, by their stamps: "drop", "wait:0.5" (in
+            seconds), "rewind:0.5"; by default they count as measured when they arrived.
+        metrics: which ones; none stands for all.
+
+    Raises BadInput where no run can be replayed by one of the estimators.
+
+    >>> from pipeline.api.api import record
+    >>> done = replay(record("landmarks", duration_s=2.0), ["ekf", {"sure": {"kind": "ekf"}}])
+    >>> sorted(done.metrics["estimator"].unique())
+    ['ekf', 'sure']
+    """
+    for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
+        if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
+            raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
+    from_ = [start_from] if isinstance(start_from, str | Path) else start_from
+    order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
+    settings = settings_of(estimators)
+    wanted = [metrics] if isinstance(metrics, str) else list(metrics)
+    find_metrics(wanted)
+    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
+    origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
+    with ExitStack() as stack:
+        folder = stack.enter_context(scratch_folder("fuselog-replay"))
+        names = [f"run-{number:04d}.mcap" for number in range(len(sources))]
+        places = [(folder / name, folder / "logs" / name) for name in names]
+        done = replay_parts(
+            cut_in_parts(sources, places, origins),
+            settings,
+            gap_limit_s=gap_limit_s,
+            metrics=wanted,
+            order=order,
+            late=policy,
+        ).check()
+        estimates = [LogSource(open_log(path)) for path, _ in places]
+        made = Replay(sources, estimates, settings, done, gap_limit_s, arrival_order, late)
+        weakref.finalize(made, stack.pop_all().close)
+    return made
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Replay:
+    """What estimators made of logs.
+
+    Attributes:
+        logs: the runs.
+        estimates: for each of them a log of what was estimated, by topic.
+        settings: the estimators by label, as they were given.
+        done: the pass: its judge, all parameters, and how long each estimator worked.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        arrival_order, late: as they were given.
+    """
+
+    logs: Sequence[LogSource | MemorySource]
+    estimates: Sequence[LogSource]
+    settings: Settings
+    done: Pass
+    gap_limit_s: float
+    arrival_order: bool = False
+    late: str | None = None
+
+    @property
+    def judge(self) -> Judge:
+        """What the estimators are worth."""
+        return self.done.judge
+
+    def __repr__(self) -> str:
+        runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
+        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.unjudged]
+        return "\n".join(
+            [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
+        )
+
+    @cached_property
+    def metrics(self) -> pd.DataFrame:
+        """A row per metric, in the order of the estimators: estimator, quantity, case, value, low, high.
+
+        From `low` to `high` lie 95 % of the values of a consistent estimator; NaN where that is unknown.
+        """
+        metrics, bounds = in_order(self.judge.metrics, self.settings), self.judge.bounds
+        intervals = np.array([bounds.get(key, (np.nan, np.nan)) for key in metrics]).reshape(-1, 2)
+        return summary_table(metrics).assign(low=intervals[:, 0], high=intervals[:, 1])
+
+    @property
+    def runs(self) -> pd.DataFrame:
+        """A row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
+        return self.judge.runs_table
+
+    @property
+    def steps(self) -> pd.DataFrame:
+        """A row per estimator, case and step, over the runs: RMSE, mean NEES and its 95 % interval."""
+        return joined(self.judge.steps.values())
+
+    @property
+    def times(self) -> pd.DataFrame:
+        """A row per estimator, case, run and span of time."""
+        return self.judge.times
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """A row per estimate that has truth: error and sigma of every component, NEES."""
+        tables: list[pd.DataFrame] = []
+
+        def keep(errors: Errors) -> None:
+            tables.append(error_table(errors))
+
+        judge_logs(self.estimates, self.logs, {}, gap_limit_s=self.gap_limit_s, on_errors=keep)
+        return joined(tables)
+
+    @cached_property
+    def innovations(self) -> pd.DataFrame:
+        """A row per measurement that was predicted: its NIS, its components, whether it was let in."""
+        found = [
+            innovations_of(gather([log[topic]]), run)
+            for run, log in enumerate(self.estimates)
+            for topic, stated in log.topics.items()
+            if stated.schema_name == schemas.INNOVATION.full_name
+        ]
+        tables = [pd.DataFrame(each._asdict()).rename(columns={"squared": "nis"}) for each in found]
+        return joined(tables)
+
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for every run that an estimator could not follow to the end, or not at all."""
+        return self.judge.failures
+
+    @property
+    def losses(self) -> list[str]:
+        """A sentence for what was not estimated throughout, and for measurements that were not used."""
+        return [*self.judge.losses, *sentences(self.done.coverage)]
+
+    @property
+    def coverage(self) -> pd.DataFrame:
+        """What became of the logs' topics: messages, used, gated, skipped and why, by estimator."""
+        return coverage_table(self.done.coverage)
+
+    def figure(self, case: str | None = None) -> "Figure":
+        """RMSE and NEES over time, of the first case (`robot1`, say) where none is named.
+
+        Raises BadInput where there is no such case, or nothing was judged.
+        """
+        charts = error_charts(self.judge)
+        if not charts:
+            raise BadInput("nothing to draw: no estimate has a truth")
+        case = next(iter(charts)) if case is None else case
+        if case not in charts:
+            raise BadInput(f"nothing with the name '{case}' was judged; {choices(case, charts)}")
+        return draw(charts[case])
+
+    def view(self, run: int = 0, *, focus: str | None = None, save: str | Path | None = None) -> None:
+        """Show the timeline of a run: in the notebook, else in the viewer; or write it to an .rrd file.
+
+        Args:
+            run: which run.
+            focus: the case that is seen first, such as `robot3`.
+            save: the file to write; nothing is shown then.
+
+        Raises BadInput where there is no such run or case, no viewer, or the file cannot be written.
+        """
+        from replay.timeline import viewer
+
+        if not 0 <= run < len(self.logs):
+            raise BadInput(f"no run {run} to show; the runs are 0 to {len(self.logs) - 1}")
+        if save is not None:
+            check_files([(Path(save), TIMELINE)], {"log": self.paths})
+            self._draw(run, focus, Path(save))
+            return
+        with scratch_folder("fuselog-view") as folder:
+            rrd = folder / "timeline.rrd"
+            self._draw(run, focus, rrd)
+            show = viewer.view_inline if viewer.in_notebook() else viewer.view
+            show(rrd)
+
+    def _draw(self, run: int, focus: str | None, rrd: Path) -> None:
+        from replay.timeline.show import Drawing
+
+        log = self.logs[run]
+        identity = json.dumps([str(log.start_ns), self.settings], default=str)
+        with Drawing(log.whole(), identity=identity, focus=focus, save=rrd) as drawing:
+            judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write metrics, tables and figures as a result folder, for `fuselog report` and others.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        check_folder(place, {"input": self.paths})
+        settings = {
+            "title": f"replay of {self.logs[0].name}",
+            "logs": [log.name for log in self.logs],
+            "estimators": json.loads(json.dumps(self.settings, default=str)),
+            "parameters": self.done.parameters,
+            "gap_limit_s": self.gap_limit_s,
+        }
+        stated = {"arrival_order": self.arrival_order or None, "late": self.late}
+        settings |= {name: value for name, value in stated.items() if value is not None}
+        with result_folder(place) as part:
+            outcome = summarise(self.judge, self.done.coverage)
+            outcome.input_sha256 = self.input_sha256
+            return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that were replayed."""
+        return [log.log.path for log in self.logs if isinstance(log, LogSource)]
+
+    @property
+    def input_sha256(self) -> str:
+        """SHA-256 of what was replayed: of logs their files, of recordings their columns."""
+        digest = hashlib.sha256()
+        for log in self.logs:
+            if isinstance(log, MemorySource):
+                add_to_hash(digest, log)
+            else:
+                with log.log.path.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+        return digest.hexdigest()
+
+
+def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
+    """One log or several as sources; raises BadInput where there is none, or one is no log."""
+    found = [logs] if isinstance(logs, Log) else list(logs)
+    if not found:
+        raise BadInput("there are no logs to replay; give at least one")
+    return [_source(log) for log in found]
+
+
+def _source(log: Log) -> LogSource | MemorySource:
+    if isinstance(log, LogSource | MemorySource):
+        return log
+    if isinstance(log, Recording):
+        return memory_source(log, RunMetadata("recording", epoch_ns=log.epoch_ns, notes=dict(log.notes)))
+    if isinstance(log, str | Path):
+        return door.open(log)
+    raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
+
+
+def settings_of(
+    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+) -> dict[str, dict[str, Any]]:
+    """The settings of each estimator by its label; raises BadInput where they are none."""
+    listed = [estimators] if isinstance(estimators, str | Mapping) else list(estimators)
+    chosen: dict[str, dict[str, Any]] = {}
+    for each in listed:
+        if not isinstance(each, str | Mapping):
+            raise BadInput(
+                f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
+            )
+        if isinstance(each, Mapping) and "kind" in each:
+            raise BadInput(
+                f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
+                '{"mine": {...}}'
+            )
+        for label, what in ({each: {}} if isinstance(each, str) else each).items():
+            if label in chosen:
+                raise BadInput(f"estimator {label} is given twice; give the second another label")
+            chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
+            kind = chosen[label].get("kind", "")
+            if isinstance(kind, Model):
+                raise BadInput(
+                    f'estimator {label} is a model without a method; give modelled(model, "ekf")'
+                )
+            if not isinstance(kind, str | Estimator):
+                raise BadInput(
+                    f"estimator {label} is {type(kind).__name__}; make an estimator of it with "
+                    "recursive, batch or modelled"
+                )
+    if not chosen:
+        raise BadInput("there are no estimators to replay; give at least one")
+    return chosen

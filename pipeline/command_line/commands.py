@@ -1,0 +1,387 @@
+"""What the commands do: the work between the command line and the library.
+
+Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
+from pipeline.output.results import (
+    ErrorTables,
+    in_order,
+    plain,
+    result_folder,
+    split_metric,
+    write_outcome,
+)
+from pipeline.output.terminal import (
+    print_json,
+    print_metrics,
+    print_parameters,
+    print_pose_errors,
+    print_table,
+    progress,
+    say,
+    warn,
+)
+from pipeline.runs.coverage import sentences
+from pipeline.runs.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
+from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.initial_states import check_same_run, order_of, origins_of, span_of
+from pipeline.runs.settings import settings_of_estimators, sigmas_of
+from recorders.atomic import scratch_folder
+from recorders.errors import BadInput
+from recorders.log import Companions, Log, NotMcap, open_log
+from replay.engine.streams.sources import LogSource
+from replay.judging.errors.differences import FEWEST_RUNS
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import find_metrics
+
+
+def replay_logs(
+    logs: list[Path],
+    names: list[str],
+    *,
+    out: Path | None,
+    model: str | None,
+    every_s: float | None,
+    arrival_order: bool,
+    late: str | None,
+    start_s: float | None,
+    end_s: float | None,
+    origins: Sequence[str],
+    sigmas: Sequence[str],
+    save: Path | None,
+    connect: str | None,
+    foxglove: bool,
+    recover: bool,
+    gap_limit_s: float,
+    tells_parameters: bool,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
+    paths = _estimate_paths(logs, out)
+    timelines = [] if save is None else [(save, TIMELINE)]
+    inputs = {
+        "log": logs,
+        "start": [Path(origin) for origin in origins],
+        "settings": [settings_file] if settings_file else [],
+    }
+    check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
+    estimators = settings_of_estimators(names, settings, settings_file, model=model, every_s=every_s)
+    order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
+    opened = [LogSource(open_log(path, recover=recover)) for path in logs]
+    sources = [span_of(source, start_s, end_s, order) for source in opened]
+    starts = origins_of(sources, origins, sigmas_of(sigmas, "--start-sigma"), order, gap_limit_s)
+    estimates = list(zip(paths, logs, strict=True))
+    done = replay_parts(
+        cut_in_parts(sources, estimates, starts),
+        estimators,
+        gap_limit_s=gap_limit_s,
+        order=order,
+        late=policy,
+        save=save,
+        connect=connect,
+        companions=companions_if(foxglove),
+        progress=progress,
+    ).check()
+    _state_losses(source.log for source in sources)
+    if tells_parameters and not as_json:
+        print_parameters(done.parameters, done.stated)
+    told = {
+        "seconds": dict(done.seconds),
+        "parameters": done.parameters,
+        "parameters_of_log": done.stated,
+        "coverage": [row._asdict() for row in done.coverage],
+    }
+    unused = sentences(done.coverage)
+    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told, unused=unused)
+
+
+def companions_if(foxglove: bool) -> Companions | None:
+    """What makes the messages for Foxglove, where they are asked for; it takes long to import."""
+    if not foxglove:
+        return None
+    from pipeline.logs.foxglove import companions
+
+    return companions
+
+
+def _estimate_paths(logs: Sequence[Path], out: Path | None) -> list[Path]:
+    """Where the estimates of each log go: beside it, to the one file given, or into a folder.
+
+    Raises BadInput where two would be the same.
+    """
+    if out is not None and out.suffix.lower() == ".mcap":
+        if len(logs) > 1:
+            raise BadInput(f"--out {out}: {len(logs)} logs give as many estimates logs; give a folder")
+        return [out]
+    if out is not None and out.suffix and not out.is_dir():
+        raise BadInput(f"--out {out}: give a name that ends in .mcap, or a folder that exists")
+    paths = [(out or log.parent) / f"{log.stem}.estimates.mcap" for log in logs]
+    places = [path.resolve() for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            raise BadInput(
+                f"{path}: the estimates of two logs would have this name; replay the logs one by one"
+            )
+    return paths
+
+
+def _state_losses(logs: Iterable[Log]) -> None:
+    for log in logs:
+        if log.loss_statement:
+            warn(log.loss_statement)
+
+
+def evaluate_logs(
+    estimates: list[Path],
+    logs: list[Path],
+    *,
+    comparison: Mapping[str, Any],
+    out: Path | None,
+    metrics: Sequence[str],
+    errors: bool,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+) -> None:
+    """Judge estimates logs; the truth is in the logs given, else in those they were replayed from.
+
+    Where there are entries of a `Comparison`, positions are compared as trajectories too, and estimates
+    are judged in their alignment with the truth.
+    """
+    from pipeline.api.trajectories import ComparedLogs, compare_logs
+    from pipeline.studies.toolkit.localization import summarise, summary_table
+    from replay.judging.errors.trajectories import Comparison
+
+    if errors and out is None:
+        raise BadInput("--errors: errors are written into a result folder; give one with --out")
+    if logs and len(logs) != len(estimates):
+        raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
+    try:
+        opened = [open_log(path, recover=recover) for path in estimates]
+    except NotMcap as error:
+        raise BadInput(
+            f"{error}, or give with --truth the file that a trajectory is judged by"
+        ) from error
+    for each in opened:
+        if not any(topic.startswith("/estimates/") for topic in each.topics):
+            raise BadInput(f"{each.path}: has no estimates; give a log that fuselog replay wrote")
+    places = logs or [log_of_estimates(each) for each in opened]
+    if out is not None:
+        check_folder(out, {"input": [*estimates, *places]})
+    sources = [LogSource(open_log(path, recover=recover)) for path in places]
+    for each, source in zip(opened, sources, strict=True):
+        check_same_run(LogSource(each), source)
+    wanted = find_metrics(metrics)
+    estimators = stated_estimators(opened[0])
+    compared = ComparedLogs([LogSource(each) for each in opened], {})
+    if comparison:
+        if "time_offset_s" in comparison:
+            raise BadInput(
+                "--time-offset: is for trajectory files, since all streams of a log have one clock; "
+                "leave it out"
+            )
+        how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
+        compared = compare_logs([LogSource(each) for each in opened], sources, how)
+        if not compared.compared:
+            raise BadInput(
+                f"{estimates[0]}: has no estimated positions with truth that could be aligned; leave "
+                "out --align"
+            )
+    with result_folder(out) if out is not None else nullcontext() as folder:
+        with ErrorTables(folder) if folder and errors else nullcontext() as kept:
+            judge = judge_logs(
+                compared.estimates,
+                sources,
+                wanted,
+                gap_limit_s=gap_limit_s,
+                on_errors=kept.add if kept else None,
+            )
+        if not judge.tells:
+            raise BadInput(
+                f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
+                "give its log with --log"
+            )
+        if folder is not None:
+            settings = {
+                "title": f"estimates of {sources[0].name}",
+                "estimates": [str(path) for path in estimates],
+                "logs": [source.name for source in sources],
+                "estimators": estimators,
+                "gap_limit_s": gap_limit_s,
+                "metrics": list(metrics),
+                **comparison,
+            }
+            outcome = summarise(judge)
+            outcome.metrics.update(compared.metrics)
+            outcome.tables["summary"] = summary_table(outcome.metrics)
+            outcome.figures.update(compared.figures)
+            outcome.input_sha256 = hash_files([*estimates, *places])
+            write_outcome(folder, "evaluate", settings, outcome)
+    _state_losses([*opened, *(source.log for source in sources)])
+    written = [out] if out else []
+    _print_outcome(judge, estimators, as_json=as_json, written=written, more=compared.metrics)
+
+
+def evaluate_trajectory(
+    estimates: Sequence[Path],
+    truth: Path,
+    formats: Mapping[str, Any],
+    comparison: Mapping[str, Any],
+    *,
+    logs: Sequence[Path],
+    out: Path | None,
+    metrics: Sequence[str],
+    errors: bool,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+) -> None:
+    """Judge a trajectory file against another."""
+    from pipeline.api.trajectories import evaluate
+
+    if len(estimates) > 1:
+        raise BadInput(f"{estimates[1]}: one trajectory is judged at a time; leave out all but one")
+    if logs or metrics or errors or recover:
+        raise BadInput(
+            "--log, --metric, --errors and --recover: are for logs, --truth is for trajectory files; "
+            "leave out one of both"
+        )
+    done = evaluate(estimates[0], truth=truth, gap_limit_s=gap_limit_s, **formats, **comparison)
+    written = [] if out is None else [done.save(out).folder]
+    for sentence in done.notes:
+        warn(sentence)
+    if as_json:
+        print_json(
+            {
+                "metrics": done.metrics,
+                "alignment": done.alignment,
+                "time_offset_s": done.compared.time_offset_s,
+                "notes": done.notes,
+                "written": [str(path) for path in written],
+            }
+        )
+        return
+    print_pose_errors(done.metrics)
+    if done.compared.time_offset_s:
+        say(f"{done.compared.time_offset_s:.6f} s were added to the stamps of the estimate")
+    if done.comparison.align == "sim3":
+        say(f"the estimate was scaled by {done.alignment['scale']:.6f}")
+    for path in written:
+        say(str(path))
+
+
+def _print_outcome(
+    judge: Judge,
+    estimators: Iterable[str],
+    *,
+    as_json: bool,
+    written: Sequence[Path],
+    told: Mapping[str, Any] | None = None,
+    more: Mapping[str, float] | None = None,
+    unused: Sequence[str] = (),
+) -> None:
+    values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
+    failures = judge.failures
+    for sentence in [*judge.unjudged, *failures[:5]]:
+        warn(sentence)
+    if len(failures) > 5:
+        warn(f"{len(failures)} failures in all")
+    if as_json:
+        outcome = {
+            "metrics": values,
+            "bounds": judge.bounds,
+            "failures": failures,
+            "losses": [*judge.losses, *unused],
+            "written": [str(path) for path in written],
+        }
+        print_json(outcome | dict(told or {}))
+        return
+    runs = judge.runs_table if judge.runs >= FEWEST_RUNS else None  # of fewer it says nothing
+    print_metrics(values, judge.bounds, runs)
+    if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
+        say(
+            "nees: of one run; its interval is that of a single step, so that a NEES within it does not "
+            "show that a filter is consistent, only that it is not far from it; nis_per_component says "
+            "more"
+        )
+    for sentence in [*judge.losses, *unused]:
+        say(sentence)
+    if told:
+        print_table(("estimator", "time (s)"), list(told["seconds"].items()))
+    for path in written:
+        say(str(path))
+
+
+def view_path(
+    path: Path,
+    *,
+    screenshot: Path | None,
+    at_s: float | None,
+    start_s: float | None,
+    end_s: float | None,
+    focus: str | None,
+    save: Path | None,
+    connect: str | None,
+    gap_limit_s: float,
+    recover: bool,
+) -> None:
+    """Open what a path holds in the viewer, take its picture, or send its timeline elsewhere."""
+    from replay.timeline import viewer
+
+    rrd = path / "timeline.rrd" if path.is_dir() else path
+    outputs = [(save, TIMELINE), (screenshot, PICTURE)]
+    check_files([(out, kind) for out, kind in outputs if out is not None], {"input": [path, rrd]})
+    with scratch_folder("fuselog-view") as folder:
+        if rrd.suffix != ".rrd":
+            rrd = save or folder / "timeline.rrd"
+            span = (start_s, end_s)
+            _draw_log(path, rrd, connect, focus, span, gap_limit_s, recover=recover)
+        elif any(given is not None for given in (start_s, end_s, focus, save, connect)):
+            raise BadInput(
+                f"{rrd}: is a finished timeline; --start, --end, --focus, --save and --connect need a "
+                "log"
+            )
+        if screenshot is not None:
+            for complaint in viewer.screenshot(rrd, screenshot, at_s=at_s):
+                warn(complaint)
+        elif save is None and connect is None:
+            viewer.view(rrd)
+
+
+def _draw_log(
+    path: Path,
+    rrd: Path,
+    connect: str | None,
+    focus: str | None,
+    span: tuple[float | None, float | None],
+    gap_limit_s: float,
+    *,
+    recover: bool,
+) -> None:
+    """Draw a span of a log in seconds, or of an estimates log together with the log that it is of."""
+    from replay.timeline.show import Drawing
+
+    log = open_log(path, recover=recover)
+    estimates = source = LogSource(log)
+    is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
+    if is_estimates and log.run is not None and "log" in log.run.notes:
+        source = LogSource(open_log(log_of_estimates(log), recover=recover))
+    shown = span_of(source, *span, "publish_time")
+    identity = f"{path} {span}"
+    with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:
+        judged = [replace(estimates, start_ns=shown.start_ns, end_ns=shown.end_ns)]
+        judge = judge_logs(
+            judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
+        )
+    for sentence in judge.unjudged:
+        warn(sentence)
+    _state_losses([log, source.log])

@@ -1,0 +1,1 @@
+"""Logs as files: information, editing, and export for other tools; begin with `information`."""

@@ -1,0 +1,559 @@
+"""Log surgery: a log cut, constrained, several merged into one, topics and components renamed.
+
+Logs go through block by block, so that memory does not grow with them, into a new log that says in its
+metadata what was done. No log is changed.
+"""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.logs.constraints import ConstraintParameters, constraints_of
+from pipeline.output.outputs import CHANGED_BY, CHANGES, changed, check_files
+from pipeline.runs.initial_states import span_of
+from recorders.errors import BadInput, UnknownName, choices
+from recorders.log import Log, LogWriter, RunMetadata, Stream, open_log, read_blocks, read_empty, schemas
+from recorders.log.container.sealed import OWN_NAMES
+from recorders.log.schemas import SCHEMAS, message_class
+from recorders.parameters import build
+from replay.engine.streams.sources import LogSource
+
+Blocks = Iterator[list[Stream]]
+# The scenario of a log that does not name one, as estimates of such a log have it.
+UNKNOWN = "unknown"
+
+
+class Changed(NamedTuple):
+    """The log that was written, how many messages each topic has there, and what else is to be said."""
+
+    path: Path
+    messages: dict[str, int]
+    notes: list[str]
+
+
+def cut(
+    path: str | Path,
+    out: str | Path,
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    topics: Sequence[str] = (),
+    decimate: Mapping[str, int | str] | None = None,
+    recover: bool = False,
+) -> Changed:
+    """Write a part of a log: a span of time, some topics, fewer messages.
+
+    Stamps and the epoch stay, so that seconds of the run mean the same in both logs. Maps, priors and
+    what was said at the first stamp of the log stay whole, whatever the span.
+
+    Args:
+        path: the log, or estimates log.
+        out: the log to write.
+        start_s: leave out messages published before, in seconds since the run's epoch.
+        end_s: leave out messages published then or later.
+        topics: which, by names or patterns such as "/robot1/*"; none stands for all.
+        decimate: by topic or pattern, every how many stamps to keep one, as 10, or how many a second to
+            keep at most, as "5Hz"; messages of one stamp stay together.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where a name or pattern is of no topic, nothing is in the span, or something else is
+    in the place of the output.
+
+    >>> from pipeline.api.api import record, write
+    >>> write("run.mcap", record("landmarks", duration_s=2.0))
+    >>> topics = ["/robot1/odometry", "*/prior"]
+    >>> cut("run.mcap", "part.mcap", start_s=1, topics=topics, decimate={"*/odometry": 5}).messages
+    {'/robot1/prior': 1, '/robot1/odometry': 4}
+    """
+    log, target = open_log(path, recover=recover), Path(out)
+    check_files([(target, changed("cut"))], {"log": [log.path]})
+    notes = _losses(log)
+    source = span_of(LogSource(log), start_s, end_s, "publish_time")
+    chosen = _readable(log, _matched(log, topics), notes, asked=topics)
+    zero_ns = source.zero_ns("publish_time")
+    thinners: dict[str, _Thinner] = {}
+    for pattern, rate in (decimate or {}).items():
+        for topic in _matched(log, [pattern]):
+            thinners[topic] = _thinner(pattern, rate, zero_ns)
+    once = [] if source.start_ns is source.end_ns is None else _said_once(log, chosen)
+    if once:
+        notes.append(f"kept whole, whatever the span: {', '.join(once)}")
+    if start_s is not None and any(_is_prior(log, topic) for topic in once):
+        notes.append(
+            f"the prior is older than this part: replay it with --start {start_s:g} --start-from truth, "
+            "or from the estimates of an earlier replay"
+        )
+
+    def blocks() -> Blocks:
+        start_ns, end_ns = source.start_ns, source.end_ns
+        if start_ns is not None:
+            yield from _blocks(log, once, None, start_ns)
+        yield from _blocks(log, chosen, start_ns, end_ns)
+        if end_ns is not None:
+            yield from _blocks(log, once, end_ns, None)
+
+    thinned = (
+        [thinners[each.topic].thin(each) if each.topic in thinners else each for each in block]
+        for block in blocks()
+    )
+    asked = {
+        "from": None if start_s is None else f"{start_s:g} s",
+        "to": None if end_s is None else f"{end_s:g} s",
+        "topics": " ".join(topics) or None,
+        "decimated": " ".join(f"{name}={rate}" for name, rate in (decimate or {}).items()) or None,
+    }
+    done = " ".join(["cut", log.path.name, *(f"{key} {value}" for key, value in asked.items() if value)])
+    run = _told(_moved(log, target), "cut", done)
+    return _write(target, run, [read_empty(log, topic) for topic in chosen], thinned, notes)
+
+
+def merge(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    offsets_s: Mapping[str, float] | None = None,
+    recover: bool = False,
+) -> Changed:
+    """Write one log of several that have no topic in common.
+
+    Seconds count from the epoch of the first log. Equal stamps stay in the order of the logs.
+
+    Args:
+        paths: the logs.
+        out: the log to write.
+        offsets_s: by log, what to add to all of its stamps, where its clock differed from the others'.
+            The sensors' own clock readings stay as they are.
+        recover: read what is whole of logs that were cut off or damaged.
+
+    Raises BadInput where two logs have a topic in common, an offset is of no log or takes stamps out of
+    range, or something else is in the place of the output.
+
+    >>> from pipeline.api.api import record, write
+    >>> write("run.mcap", record("landmarks", duration_s=2.0))
+    >>> _ = relabel("run.mcap", "left.mcap", topics={"/": "/left/"})
+    >>> done = merge(["run.mcap", "left.mcap"], "both.mcap", offsets_s={"left.mcap": -0.5})
+    >>> done.messages["/left/robot1/odometry"] == done.messages["/robot1/odometry"]
+    True
+    """
+    target = Path(out)
+    if len(paths) < 2:
+        raise BadInput(
+            f"{', '.join(map(str, paths))}: one log has nothing to be merged with; give at least two"
+        )
+    logs = [open_log(path, recover=recover) for path in paths]
+    check_files([(target, changed("merge"))], {"log": [log.path for log in logs]})
+    offsets_ns = _offsets_ns(logs, offsets_s or {})
+    notes = [note for log in logs for note in _losses(log)]
+    chosen = [_readable(log, _ranked(log), notes) for log in logs]
+    holder: dict[str, Path] = {}
+    for log, names in zip(logs, chosen, strict=True):
+        common = [name for name in names if name in holder]
+        if common:
+            raise BadInput(
+                f"{log.path}: topic {common[0]} ({len(common)} in all) is in {holder[common[0]]} too; "
+                f"rename it in one first, such as: fuselog relabel {log.path} --topic /=/b/ -o NEW"
+            )
+        holder |= dict.fromkeys(names, log.path)
+    blocks = (
+        [_shifted(stream, offset_ns) for stream in block]
+        for log, names, offset_ns in zip(logs, chosen, offsets_ns, strict=True)
+        for block in _blocks(log, names)
+    )
+    empty = [read_empty(log, name) for log, names in zip(logs, chosen, strict=True) for name in names]
+    told = [
+        f"{log.path.name}{f' {offset_ns * 1e-9:+g} s' if offset_ns else ''}"
+        for log, offset_ns in zip(logs, offsets_ns, strict=True)
+    ]
+    run = _told(_joined(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
+    return _write(target, run, empty, blocks, notes)
+
+
+def relabel(
+    path: str | Path,
+    out: str | Path,
+    *,
+    topics: Mapping[str, str] | None = None,
+    components: Mapping[str, str] | None = None,
+    recover: bool = False,
+) -> Changed:
+    """Write a log with other names of topics and components.
+
+    What the log says elsewhere of a renamed topic, such as which truth an estimate is of, follows.
+
+    Args:
+        path: the log, or estimates log.
+        out: the log to write.
+        topics: new names by old ones; where both end in a slash, as "/robot1/": "/robot2/", of all
+            topics that begin so. The truth that estimates name need not be in their log.
+        components: new names by old ones, such as "x_m": "east_m", of every topic that has them.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where there is no such topic or component, two would have one name, or something else
+    is in the place of the output.
+    """
+    log, target = open_log(path, recover=recover), Path(out)
+    check_files([(target, changed("relabel"))], {"log": [log.path]})
+    if not topics and not components:
+        raise BadInput(f"{log.path}: nothing to rename; give a topic or a component")
+    names = _renamed_topics(log, topics or {})
+    _check_components(log, components or {})
+    notes = _losses(log)
+    chosen = _readable(log, _ranked(log), notes)
+
+    def renamed(stream: Stream) -> Stream:
+        metadata = {key: names.get(value, value) for key, value in stream.metadata.items()}
+        if "components" in metadata:
+            known = metadata["components"].split(",")
+            metadata["components"] = ",".join((components or {}).get(name, name) for name in known)
+        return replace(stream, topic=names.get(stream.topic, stream.topic), metadata=metadata)
+
+    blocks = ([renamed(stream) for stream in block] for block in _blocks(log, chosen))
+    pairs = [f"{old}={new}" for old, new in {**(topics or {}), **(components or {})}.items()]
+    run = _told(_moved(log, target), "relabel", f"relabelled {log.path.name} {' '.join(pairs)}")
+    return _write(target, run, [renamed(read_empty(log, topic)) for topic in chosen], blocks, notes)
+
+
+def constrain(
+    path: str | Path,
+    out: str | Path,
+    *,
+    unit: str | None = None,
+    settings: Mapping[str, object] | None = None,
+    recover: bool = False,
+) -> Changed:
+    """Write a log with what its inertial unit says of the body: that it stands, that it rolls on wheels.
+
+    The topics `standing` and `rolling` come beside the unit's own, see `pipeline.logs.constraints`.
+
+    Args:
+        path: the log.
+        out: the log to write.
+        unit: the topic of the inertial samples; the only one unless given.
+        settings: of `ConstraintParameters`, such as {"rolling_hz": 10}.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where it is not clear which unit is meant, the log has such a topic, nothing is asked
+    for, or something else is in the place of the output.
+    """
+    log, target = open_log(path, recover=recover), Path(out)
+    check_files([(target, changed("constrain"))], {"log": [log.path]})
+    parameters = build(ConstraintParameters, settings or {}, "constrain")
+    chosen_unit = _unit_of(log, unit)
+    added = constraints_of(LogSource(log).read([chosen_unit])[chosen_unit], parameters)
+    for stream in added:
+        if stream.topic in log.topics:
+            raise BadInput(
+                f"{log.path}: has a topic {stream.topic} already; rename it first with fuselog relabel"
+            )
+    notes = _losses(log)
+    for stream in added:
+        told, total = int(stream["value"].sum()), len(stream)
+        notes.append(f"{stream.topic}: holds at {told} of {total} stamps")
+    chosen = _readable(log, _ranked(log), notes)
+    empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
+    names = " ".join(stream.topic for stream in added)
+    run = _told(
+        _moved(log, target), "constrain", f"constrained {log.path.name} by {chosen_unit}: {names}"
+    )
+    return _write(target, run, empty, chain(_blocks(log, chosen), [added]), notes)
+
+
+def _unit_of(log: Log, unit: str | None) -> str:
+    """The topic of inertial samples that is meant; raises BadInput where it is not clear."""
+    kind = schemas.INERTIAL_SAMPLE.full_name
+    units = [name for name, topic in log.topics.items() if topic.schema_name == kind]
+    if not units:
+        raise BadInput(f"{log.path}: has no inertial unit, no topic of {kind}")
+    if unit is None and len(units) > 1:
+        raise BadInput(
+            f"{log.path}: has several inertial units; choose one with --unit: {', '.join(units)}"
+        )
+    if unit is not None and unit not in units:
+        raise UnknownName(f"{log.path}: no inertial unit {unit}; {choices(unit, units)}")
+    return unit or units[0]
+
+
+def _blocks(
+    log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+) -> Blocks:
+    """Blocks of a span, each with its streams in the order of `topics`, which settles ties."""
+    for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
+        yield [block[topic] for topic in topics if topic in block]
+
+
+def _write(
+    target: Path,
+    run: RunMetadata,
+    empty: Sequence[Stream],
+    blocks: Iterable[list[Stream]],
+    notes: list[str],
+) -> Changed:
+    """Write the log; topics without messages are in it, as they were."""
+    messages = Counter({stream.topic: 0 for stream in empty})
+    with LogWriter(target, run) as writer:
+        writer.write(empty)
+        for block in blocks:
+            writer.write(block)
+            messages.update({stream.topic: len(stream) for stream in block})
+    return Changed(target, dict(messages), notes)
+
+
+def _ranked(log: Log) -> list[str]:
+    """The topics in the order in which the log declares them: so its writer ordered equal stamps."""
+    return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
+
+
+def _matched(log: Log, patterns: Sequence[str]) -> list[str]:
+    """The topics that are named, or match a pattern; all where there are none."""
+    for pattern in patterns:
+        if not any(fnmatchcase(topic, pattern) for topic in log.topics):
+            raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
+    return [
+        topic
+        for topic in _ranked(log)
+        if not patterns or any(fnmatchcase(topic, pattern) for pattern in patterns)
+    ]
+
+
+def _losses(log: Log) -> list[str]:
+    """What is missing from a log, or is in it beside its topics and is not carried over."""
+    foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
+    losses = [log.loss_statement] if log.loss_statement else []
+    if log.companions:
+        losses.append(
+            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
+            "fuselog export LOG --to foxglove"
+        )
+    if foreign:
+        losses.append(
+            f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"
+        )
+    if attachments := log.container.attachments:
+        losses.append(
+            f"{log.path}: attachments, which fuselog does not read, are left out: "
+            f"{len(attachments)} ({', '.join(attachments)})"
+        )
+    return losses
+
+
+def _readable(log: Log, topics: Sequence[str], notes: list[str], asked: Sequence[str] = ()) -> list[str]:
+    """The topics that are columns; the messages and fields that are left out are noted.
+
+    Raises BadInput where a topic that is asked for by name, or every topic, is none.
+    """
+    chosen = []
+    for topic in topics:
+        stated = log.topics[topic]
+        try:
+            schema = read_empty(log, topic).schema
+        except BadInput as error:
+            if topic in asked:
+                raise
+            notes.append(f"{error}; its {stated.messages} messages are left out")
+            continue
+        chosen.append(topic)
+        described = log.container.schemas[log.container.channels[stated.channel_ids[0]].schema_id]
+        fields = message_class(described.data, described.name).DESCRIPTOR.fields
+        left_out = {field.name for field in fields} - {field.name for field in schema}
+        if left_out:
+            notes.append(
+                f"{log.path}: topic {topic}: fields that make no columns are left out: "
+                f"{', '.join(sorted(left_out))}"
+            )
+    if not chosen:
+        raise BadInput(
+            f"{log.path}: has no topic that fuselog reads; import it first, logs of ROS with: "
+            f"fuselog import ros {log.path}"
+        )
+    return chosen
+
+
+def _said_once(log: Log, topics: Sequence[str]) -> list[str]:
+    """Maps, priors, and topics all of whose messages have the first stamp of the log."""
+    first_ns, _ = LogSource(log).extent("publish_time")
+    early: Counter[str] = Counter()
+    for block in _blocks(log, topics, None, first_ns + 1):
+        early.update({stream.topic: len(stream) for stream in block})
+    return [
+        topic
+        for topic in topics
+        if (stated := log.topics[topic]).messages
+        and (
+            stated.schema_name == schemas.LANDMARK.full_name
+            or _is_prior(log, topic)
+            or stated.messages == early[topic]
+        )
+    ]
+
+
+def _is_prior(log: Log, topic: str) -> bool:
+    schema = log.topics[topic].schema_name
+    return schema == schemas.GAUSSIAN_ESTIMATE.full_name and not topic.startswith("/estimates/")
+
+
+@dataclass
+class _Thinner:
+    """Keeps the first stamp of every interval: so many stamps, or so much time.
+
+    `stamps` counts those that came before, `last` is the interval of the latest of them.
+    """
+
+    every: int = 0
+    rate_hz: float = 0.0
+    zero_ns: int = 0
+    stamps: int = 0
+    last: int | None = None
+
+    def thin(self, stream: Stream) -> Stream:
+        """What stays of the next block of the topic, which is not empty."""
+        times_ns, row = np.unique(stream.publish_time_ns, return_inverse=True)
+        if self.every:
+            interval = (self.stamps + np.arange(len(times_ns))) // self.every
+        else:  # stamps are rounded to nanoseconds
+            interval = np.floor((times_ns - self.zero_ns + 1) * (self.rate_hz * 1e-9)).astype(np.int64)
+        is_first = np.append(self.last is None or interval[0] != self.last, np.diff(interval) != 0)
+        self.stamps += len(times_ns)
+        self.last = int(interval[-1])
+        return stream.take(is_first[row])
+
+
+def _thinner(topic: str, rate: int | str, zero_ns: int) -> _Thinner:
+    """What thins a topic as `rate` says: 10 for every tenth stamp, "5Hz" for five a second."""
+    text = str(rate)
+    try:
+        if text.lower().endswith("hz"):
+            rate_hz = float(text[:-2])
+            if 0 < rate_hz < math.inf:
+                return _Thinner(rate_hz=rate_hz, zero_ns=zero_ns)
+        elif int(text) > 0:
+            return _Thinner(every=int(text))
+    except ValueError:
+        pass
+    raise BadInput(
+        f"decimate {topic}={text}: expected a whole number, such as 10 for every tenth stamp, or a "
+        "rate, such as 5Hz"
+    )
+
+
+def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int]:
+    """What to add to the stamps of each log; raises BadInput where they would leave their range."""
+    paths = [log.path for log in logs]
+    for path, offset_s in offsets_s.items():
+        if Path(path) not in paths:
+            raise UnknownName(f"no log {path} to merge; {choices(path, list(map(str, paths)))}")
+        if not abs(offset_s) <= 1e9:
+            raise BadInput(f"offset of {path}: is {offset_s}; give seconds, such as 0.5")
+    by_path = {Path(path): round(offset_s * 1e9) for path, offset_s in offsets_s.items()}
+    found = [by_path.get(path, 0) for path in paths]
+    for log, offset_ns in zip(logs, found, strict=True):
+        source = LogSource(log)
+        stamps_ns = [*source.extent("publish_time"), *source.extent("log_time")]
+        if min(stamps_ns) + offset_ns < 0 or max(stamps_ns) + offset_ns >= 2**63:
+            raise BadInput(
+                f"{log.path}: an offset of {offset_ns * 1e-9:g} s takes its stamps out of the years "
+                "1970 to 2262; give a smaller one"
+            )
+    return found
+
+
+def _shifted(stream: Stream, offset_ns: int) -> Stream:
+    """The stream by another clock: its stamps, and what its messages say of times by the log's clock."""
+    if not offset_ns:
+        return stream
+    is_ours = stream.schema.full_name in SCHEMAS
+    moved = {
+        field.name: stream.columns[field.name] + offset_ns
+        for field in stream.schema
+        if is_ours and field.kind == "time_ns" and field.name != "sensor_time_ns"
+    }
+    return replace(
+        stream,
+        publish_time_ns=stream.publish_time_ns + offset_ns,
+        log_time_ns=stream.log_time_ns + offset_ns,
+        columns={**stream.columns, **moved},
+    )
+
+
+def _renamed_topics(log: Log, topics: Mapping[str, str]) -> dict[str, str]:
+    """New names by old ones, of topics and of those that metadata names; those that stay are absent."""
+    stated = {value for topic in log.topics.values() for value in topic.metadata.values()}
+    known = [
+        *log.topics,
+        *sorted(value for value in stated - log.topics.keys() if value.startswith("/")),
+    ]
+    names: dict[str, str] = {}
+    for old, new in topics.items():
+        if not new.startswith("/") or not new.isprintable() or old.endswith("/") != new.endswith("/"):
+            raise BadInput(
+                f"relabel {old}={new}: expected a topic for a topic, as /old=/new, or a beginning for a "
+                "beginning, as /robot1/=/robot2/"
+            )
+        found = [name for name in known if name == old or (old.endswith("/") and name.startswith(old))]
+        if not found:
+            raise UnknownName(f"{log.path}: no topic {old}; {choices(old, known)}")
+        names |= {name: new + name.removeprefix(old) for name in found}
+    for name, count in Counter(names.get(topic, topic) for topic in log.topics).items():
+        if count > 1:
+            raise BadInput(f"{log.path}: {count} topics would be {name}; give each a name of its own")
+    return names
+
+
+def _check_components(log: Log, components: Mapping[str, str]) -> None:
+    """Raise BadInput where no topic has a component, or one would have two of a name."""
+    stated = {
+        topic: found["components"].split(",")
+        for topic, found in ((name, each.metadata) for name, each in log.topics.items())
+        if "components" in found
+    }
+    known = list(dict.fromkeys(name for names in stated.values() for name in names))
+    for old, new in components.items():
+        if old not in known:
+            raise UnknownName(f"{log.path}: no component '{old}'; {choices(old, known)}")
+        if not new.isprintable() or not new.strip() or "," in new:
+            raise BadInput(f"relabel {old}={new}: expected a name, such as x_m, without a comma")
+    for topic, names in stated.items():
+        after = [components.get(name, name) for name in names]
+        twice = [name for name in after if after.count(name) > 1]
+        if twice and after != names:
+            raise BadInput(
+                f"{log.path}: topic {topic} would have two components {twice[0]}; give another name"
+            )
+
+
+def _moved(log: Log, target: Path) -> RunMetadata:
+    """The log's run, with the place of the log that estimates are of as it is seen from the target."""
+    run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
+    if "log" not in run.notes:
+        return run
+    place = os.path.relpath((log.path.parent / run.notes["log"]).resolve(), target.resolve().parent)
+    return replace(run, notes={**run.notes, "log": place})
+
+
+def _joined(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
+    """What the logs say of their run if they are of one, else only their notes, all of them."""
+    runs = [_moved(log, target) for log in logs]
+    notes: dict[str, str] = {}
+    for log, run in zip(logs, runs, strict=True):
+        for subject, fact in run.notes.items():
+            if subject == CHANGED_BY:
+                continue
+            is_new = notes.get(subject, fact) == fact
+            notes[subject if is_new else f"{subject} ({log.path.name})"] = fact
+    first, *others = (replace(run, notes=notes) for run in runs)
+    if all(other == first for other in others) and not any(offsets_ns):
+        return first
+    return RunMetadata(UNKNOWN, epoch_ns=max(0, first.epoch_ns + offsets_ns[0]), notes=notes)
+
+
+def _told(run: RunMetadata, command: str, done: str) -> RunMetadata:
+    """The run, with what a command did to its log, after what was done before."""
+    before = [run.notes[CHANGES]] if CHANGES in run.notes else []
+    return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

@@ -1,0 +1,234 @@
+"""Logs exported for other tools: estimates and truths as trajectories, any stream as a table.
+
+A log is read once, block by block, so that memory does not grow with it, but for tracks, which are told
+frame by frame. No file is ever replaced.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+from urllib.parse import quote
+
+from pipeline.logs.mot import mot_files
+from pipeline.output.outputs import Kind, check_files, check_folder
+from recorders.atomic import whole_file, whole_folder
+from recorders.errors import BadInput, UnknownName, choices, some_of
+from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
+from recorders.trajectories import Trajectory, kitti_lines, tum_lines
+from replay.judging.errors.trajectories import trajectory_of
+
+To = Literal["tum", "kitti", "mot", "csv", "parquet", "foxglove"]
+SUFFIXES: dict[To, str] = {
+    "tum": ".txt",
+    "kitti": ".txt",
+    "mot": ".txt",
+    "csv": ".csv",
+    "parquet": ".parquet",
+    "foxglove": ".mcap",
+}
+TRAJECTORIES: dict[str, tuple[str, Callable[[Trajectory], list[str]]]] = {
+    "tum": ("# timestamp tx ty tz qx qy qz qw\n", tum_lines),
+    "kitti": ("", kitti_lines),
+}
+
+Write = Callable[[Stream], None]
+
+
+class Exported(NamedTuple):
+    """The files that were written, with the topics in them, and sentences on what is not in them."""
+
+    files: dict[str, Path]
+    notes: list[str]
+
+
+def export(
+    path: str | Path,
+    *,
+    to: To,
+    out: str | Path | None = None,
+    topics: Sequence[str] = (),
+    recover: bool = False,
+) -> Exported:
+    """Export topics of a log: trajectories, tracks, tables or what Foxglove shows.
+
+    Args:
+        path: the log, or estimates log.
+        to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
+            position; "mot" has a file of each tracker's tracks and one of all truths, see
+            `pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what its
+            viewers can show, see `pipeline.logs.foxglove`.
+        out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
+            "foxglove", the file.
+        topics: which; none stands for all that fit.
+        recover: read what is whole of a log that was cut off or damaged.
+
+    Raises BadInput where a topic is not there or does not fit, or the place is taken.
+    """
+    if to not in get_args(To):
+        raise BadInput(f"no format '{to}' to export to; {choices(to, get_args(To))}")
+    log = open_log(path, recover=recover)
+    notes = [log.loss_statement] if log.loss_statement else []
+    if to == "mot":
+        return _export_frames(log, topics, Path(out or f"{log.path.stem}-mot"), notes)
+    chosen = _chosen(log, to, topics, notes)
+    if to == "foxglove":
+        return _export_companions(log, chosen, Path(out or f"{log.path.stem}-foxglove.mcap"), notes)
+    names = {topic: _file_name(topic, to) for topic in chosen}
+    for topic, name in names.items():
+        if list(names.values()).count(name) > 1:
+            raise BadInput(f"{path}: two topics would be the file {name}; export {topic} by --topic")
+    if len(topics) == 1:
+        (topic,) = chosen
+        place = Path(out or f"{log.path.stem}-{names[topic]}")
+        check_files([(place, _new(to))], {"log": [log.path]})
+        with whole_file(place) as part:
+            _write(log, to, {topic: part}, notes)
+        return Exported({topic: place}, notes)
+    place = Path(out or f"{log.path.stem}-{to}")
+    check_folder(place, {"log": [log.path]})
+    with whole_folder(place, _refuse) as part:
+        _write(log, to, {topic: part / name for topic, name in names.items()}, notes)
+    return Exported({topic: place / name for topic, name in names.items()}, notes)
+
+
+def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[str]:
+    """The topics to export; what does not fit is noted, or refused where it was asked for."""
+    chosen = []
+    for topic in dict.fromkeys(topics or log.topics):
+        if topic not in log.topics:
+            raise UnknownName(f"{log.path}: no topic {topic}; {choices(topic, log.topics)}")
+        try:
+            empty = read_empty(log, topic)
+            if to in TRAJECTORIES and not _is_state(log, topic):
+                raise BadInput(
+                    f"{log.path}: topic {topic}: is neither an estimate nor a truth; export it as csv"
+                )
+            if to in TRAJECTORIES and trajectory_of(empty) is None:
+                raise BadInput(f"{log.path}: topic {topic}: states no position; export it as csv")
+        except BadInput as error:
+            if topics:
+                raise
+            if to not in TRAJECTORIES:
+                notes.append(str(error))
+            continue
+        chosen.append(topic)
+    if not chosen:
+        what = "estimates or truth with a position" if to in TRAJECTORIES else "streams of columns"
+        raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
+    return chosen
+
+
+def _export_companions(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """One log of the companions of all topics that have some."""
+    from pipeline.logs.foxglove import companions  # which takes long to import
+
+    check_files([(place, _new("foxglove"))], {"log": [log.path]})
+    written = dict.fromkeys(topics, 0)
+    with LogWriter(place) as writer:
+        for block in read_blocks(log, topics):
+            for topic, stream in block.items():
+                written[topic] += writer.write_companions(companions(stream))
+        if not any(written.values()):
+            raise BadInput(f"{log.path}: has nothing that Foxglove can show; export it as csv")
+    without = [topic for topic, messages in written.items() if messages == 0]
+    if without:
+        notes.append(f"Foxglove has no message for, left out: {some_of(without)}")
+    return Exported({topic: place for topic, messages in written.items() if messages}, notes)
+
+
+def _export_frames(log: Log, topics: Sequence[str], place: Path, notes: list[str]) -> Exported:
+    """A folder of tracks and truths, frame by frame."""
+    files = mot_files(log, topics)
+    names = {name: f"{quote(name, safe=' ')}{SUFFIXES['mot']}" for name in files}
+    check_folder(place, {"log": [log.path]})
+    with whole_folder(place, _refuse) as part:
+        for name, (_, lines) in files.items():
+            text = "".join(f"{line}\n" for line in lines)
+            (part / names[name]).write_text(text, encoding="utf-8", newline="\n")
+    exported = {topic: place / names[name] for name, (of, _) in files.items() for topic in of}
+    return Exported(exported, notes)
+
+
+def _new(to: To) -> Kind:
+    """A file that is not there yet."""
+    return Kind(SUFFIXES[to], f"a new {to} file", lambda _: False)
+
+
+def _is_state(log: Log, topic: str) -> bool:
+    """Whether a topic holds estimates or a truth; a prior is neither."""
+    schema = log.topics[topic].schema_name
+    is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
+    return is_estimate or schema == schemas.TRUTH_STATE.full_name
+
+
+def _file_name(topic: str, to: To) -> str:
+    return quote(topic.strip("/").replace("/", "-"), safe=" ") + SUFFIXES[to]
+
+
+def _refuse(place: Path) -> None:
+    raise BadInput(f"{place}: exists, and fuselog export replaces no file; give another --out")
+
+
+def _write(log: Log, to: To, files: dict[str, Path], notes: list[str]) -> None:
+    """Write every topic to its file."""
+    with ExitStack() as stack:
+        write = {
+            topic: stack.enter_context(
+                _trajectory_file(path, to, notes) if to in TRAJECTORIES else _table_file(path, to)
+            )
+            for topic, path in files.items()
+        }
+        for block in read_blocks(log, list(files)):
+            for topic, stream in block.items():
+                write[topic](stream)
+        for topic in files:
+            write[topic](read_empty(log, topic))
+
+
+@contextmanager
+def _trajectory_file(path: Path, to: To, notes: list[str]) -> Iterator[Write]:
+    """A text file of poses; what they lack is noted."""
+    header, lines_of = TRAJECTORIES[to]
+    dropped: dict[str, int] = {}
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(header)
+
+        def write(stream: Stream) -> None:
+            trajectory = trajectory_of(stream)
+            assert trajectory is not None
+            if stream.topic not in dropped and trajectory.rotation is None:
+                notes.append(f"{stream.topic}: states no orientation; the identity stands for it")
+            dropped[stream.topic] = dropped.get(stream.topic, 0) + len(stream) - len(trajectory)
+            file.writelines(f"{line}\n" for line in lines_of(trajectory))
+
+        yield write
+    notes += [
+        f"{topic}: {count} poses are not finite; left out" for topic, count in dropped.items() if count
+    ]
+
+
+@contextmanager
+def _table_file(path: Path, to: To) -> Iterator[Write]:
+    """A file of rows, whose columns are those of the first stream that is written."""
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    make: Callable[..., Any] = pyarrow.csv.CSVWriter if to == "csv" else pyarrow.parquet.ParquetWriter
+    with path.open("wb") as file, ExitStack() as stack:
+        begun: list[tuple[Any, list[str]]] = []
+
+        def write(stream: Stream) -> None:
+            table = stream.arrow()
+            if not begun:
+                begun.append((stack.enter_context(make(file, table.schema)), table.column_names))
+            writer, columns = begun[0]
+            if len(table) and table.column_names != columns:
+                raise BadInput(
+                    f"topic {stream.topic}: has vectors of several lengths, which no table can have; "
+                    "leave the topic out with --topic"
+                )
+            if len(table):
+                writer.write_table(table)
+
+        yield write

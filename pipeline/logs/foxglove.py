@@ -1,0 +1,284 @@
+"""Companions: a log's streams as messages of Foxglove, so that its viewers show a log without fuselog.
+
+They are for viewers alone: no replay reads them, and no command counts them among a log's streams. The
+definitions are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+from scipy.spatial.transform import Rotation
+
+from recorders.log import Companion, Stream, schemas
+from replay.engine.streams.measurements import PLANE, covariances_of
+from replay.judging.errors.evaluation import Floats
+from replay.judging.errors.trajectories import trajectory_of
+from replay.timeline.drawing.canvas import PALETTE, TRUTH
+from replay.timeline.drawing.plane import ellipses
+
+# The log's own frame has no name; viewers want one.
+WORLD = "map"
+POINT_M = 0.3
+LABEL_PX = 12.0
+LINE_PX = 2.0
+# A track that is told of no more stays for so long.
+TRACK_S = 60
+
+Made = Iterator[tuple[str, Message, int]]
+
+
+def companions(stream: Stream) -> Iterator[Companion]:
+    """The companions of a stream, or of a block of it: none of a prior, or where there is no message.
+
+    Poses, fixes, truths and estimates with a position become PoseInFrame and, with an orientation,
+    FrameTransforms; ellipses of 95 %, tracks and landmarks SceneUpdate; particles and detections
+    PosesInFrame; geodetic fixes LocationFix. The topic is `/foxglove`, the stream's, and what it is.
+    """
+    make = _MAKERS.get(stream.schema.full_name)
+    is_stated = stream.topic.startswith("/estimates/")
+    is_prior = stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name and not is_stated
+    if make is None or is_prior or len(stream) == 0:
+        return
+    for leaf, message, row in make(stream):
+        yield Companion(
+            f"/foxglove{stream.topic}/{leaf}",
+            stream.topic,
+            message,
+            int(stream.log_time_ns[row]),
+            int(stream.publish_time_ns[row]),
+        )
+
+
+def _states(stream: Stream) -> Made:
+    """Truths and estimates: their poses, and what they are unsure of."""
+    field = "mean" if "mean" in stream.columns else "state"
+    rows = np.flatnonzero(np.isfinite(stream[field]).all(axis=1))
+    known = stream.take(rows)
+    trajectory = trajectory_of(known)
+    if trajectory is None:
+        return
+    quaternions = None
+    if trajectory.rotation is not None:
+        quaternions = Rotation.from_matrix(trajectory.rotation).as_quat(scalar_first=True)
+    yield from _poses(known, rows, trajectory.position_m, quaternions)
+    if "covariance" in stream.columns and set(PLANE) <= set(stream.components):
+        outlines = _outlines(known)
+        for row, number in enumerate(rows.tolist()):
+            if np.isfinite(outlines[row]).all():
+                scene = SceneUpdate()
+                entity = _add_entity(scene, known, row, stream.topic)
+                _add_outline(entity, outlines[row], trajectory.position_m[row, 2], _colour(stream))
+                yield "ellipse", scene, number
+
+
+def _fixes(stream: Stream) -> Made:
+    """Positions, turned by the course where there is one."""
+    places, quaternions = _padded(stream["position_m"]), None
+    if "course_rad" in stream.columns:
+        heading_rad = 0.5 * np.pi - np.nan_to_num(stream["course_rad"])
+        quaternions = Rotation.from_euler("z", heading_rad[:, None]).as_quat(scalar_first=True)
+    for row, pose in enumerate(_in_frame(stream, places, quaternions)):
+        yield "pose", pose, row
+
+
+def _stated_poses(stream: Stream) -> Made:
+    yield from _poses(stream, np.arange(len(stream)), stream["position_m"], stream["quaternion"])
+
+
+def _poses(
+    stream: Stream, rows: np.ndarray[Any, np.dtype[np.int64]], places: Floats, quaternions: Floats | None
+) -> Made:
+    """Poses, and with an orientation the transforms that they are."""
+    for row, pose in enumerate(_in_frame(stream, places, quaternions)):
+        yield "pose", pose, int(rows[row])
+        if quaternions is not None:
+            transforms = FrameTransforms()
+            turned = transforms.transforms.add(
+                parent_frame_id=pose.frame_id, child_frame_id=_child_of(stream)
+            )
+            turned.timestamp.CopyFrom(pose.timestamp)
+            _set_vector(turned.translation, places[row])
+            turned.rotation.CopyFrom(pose.pose.orientation)
+            yield "transforms", transforms, int(rows[row])
+
+
+def _in_frame(stream: Stream, places: Floats, quaternions: Floats | None) -> Iterator[PoseInFrame]:
+    """A pose for each row of places (n, 3) and quaternions (n, 4); the identity without them."""
+    for row, place in enumerate(places):
+        pose = PoseInFrame(frame_id=_frame_of(stream))
+        pose.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
+        _set_pose(pose.pose, place, None if quaternions is None else quaternions[row])
+        yield pose
+
+
+def _location_fixes(stream: Stream) -> Made:
+    for row in range(len(stream)):
+        fix = LocationFix(
+            frame_id=_frame_of(stream),
+            latitude=stream["latitude_deg"][row],
+            longitude=stream["longitude_deg"][row],
+            altitude=stream["altitude_m"][row],
+        )
+        fix.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
+        stated = stream["covariance_m2"][row] if "covariance_m2" in stream.columns else np.empty(0)
+        covariance = np.zeros((3, 3))
+        size = round(len(stated) ** 0.5)
+        covariance[:size, :size] = stated.reshape(size, size)
+        is_known = size > 0 and bool(np.isfinite(covariance).all())
+        fix.position_covariance_type = LocationFix.KNOWN if is_known else LocationFix.UNKNOWN
+        if is_known:
+            fix.position_covariance.extend(covariance.ravel().tolist())
+        yield "location", fix, row
+
+
+def _landmarks(stream: Stream) -> Made:
+    """Spheres with their numbers, which stay."""
+    scene = SceneUpdate()
+    for row, place in enumerate(_padded(stream["position_m"])):
+        number = int(stream["landmark_id"][row])
+        entity = _add_entity(scene, stream, row, str(number))
+        _add_point(entity, place, str(number), TRUTH)
+    yield "scene", scene, 0
+
+
+def _tracks(stream: Stream) -> Made:
+    """All tracks of a stamp: a sphere with the number, and the ellipse."""
+    if not set(PLANE) <= set(stream.components):
+        return
+    outlines = _outlines(stream)
+    columns = [stream.components.index(name) for name in PLANE]
+    places = _padded(stream["mean"][:, columns])
+    for rows in _by_stamp(stream):
+        scene = SceneUpdate()
+        for row in rows:
+            number = int(stream["track_id"][row])
+            entity = _add_entity(scene, stream, row, str(number))
+            entity.lifetime.FromSeconds(TRACK_S)
+            colour = PALETTE[number % len(PALETTE)]
+            _add_point(entity, places[row], str(number), colour)
+            if np.isfinite(outlines[row]).all():
+                _add_outline(entity, outlines[row], 0.0, colour)
+        yield "scene", scene, rows[0]
+
+
+def _particles(stream: Stream) -> Made:
+    if set(PLANE) <= set(stream.components):
+        columns = [stream.components.index(name) for name in PLANE]
+        yield from _scans(stream, _padded(stream["mean"][:, columns]))
+
+
+def _detections(stream: Stream) -> Made:
+    yield from _scans(stream, _padded(stream["position_m"]))
+
+
+def _scans(stream: Stream, places: Floats) -> Made:
+    """All places (n, 3) of a stamp."""
+    for rows in _by_stamp(stream):
+        poses = PosesInFrame(frame_id=_frame_of(stream))
+        poses.timestamp.FromNanoseconds(int(stream.publish_time_ns[rows[0]]))
+        for row in rows:
+            _set_pose(poses.poses.add(), places[row], None)
+        yield "poses", poses, rows[0]
+
+
+def _by_stamp(stream: Stream) -> Iterator[list[int]]:
+    """The rows of each stamp, sorted by time as they are."""
+    stamps = stream.publish_time_ns
+    for _, rows in groupby(range(len(stream)), lambda row: stamps[row]):
+        yield list(rows)
+
+
+def _outlines(stream: Stream) -> Floats:
+    """The ellipses (n, vertices, 2) of the plane that hold the states with 95 %."""
+    columns = [stream.components.index(name) for name in PLANE]
+    return ellipses(stream["mean"][:, columns], covariances_of(stream, PLANE))
+
+
+def _add_entity(scene: Any, stream: Stream, row: int, name: str) -> Any:
+    entity = scene.entities.add(frame_id=_frame_of(stream), id=name)
+    entity.timestamp.FromNanoseconds(int(stream.publish_time_ns[row]))
+    return entity
+
+
+def _add_outline(entity: Any, outline: Floats, height_m: float, colour: Sequence[int]) -> None:
+    line = entity.lines.add(type=LinePrimitive.LINE_LOOP, thickness=LINE_PX, scale_invariant=True)
+    _set_pose(line.pose, np.zeros(3), None)
+    _set_colour(line.color, colour)
+    for x, y in outline[:-1].tolist():
+        line.points.add(x=x, y=y, z=height_m)
+
+
+def _add_point(entity: Any, place: Floats, label: str, colour: Sequence[int]) -> None:
+    sphere = entity.spheres.add()
+    _set_pose(sphere.pose, place, None)
+    _set_vector(sphere.size, np.full(3, POINT_M))
+    _set_colour(sphere.color, colour)
+    text = entity.texts.add(text=label, billboard=True, font_size=LABEL_PX, scale_invariant=True)
+    _set_pose(text.pose, place + np.array([0.0, 0.0, POINT_M]), None)
+    _set_colour(text.color, colour)
+
+
+def _set_pose(pose: Any, place: Floats, quaternion: Floats | None) -> None:
+    """A position, and a quaternion with w first."""
+    _set_vector(pose.position, place)
+    w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
+    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = x, y, z, w
+
+
+def _set_vector(vector: Any, values: Floats) -> None:
+    vector.x, vector.y, vector.z = values.tolist()
+
+
+def _set_colour(colour: Any, values: Sequence[int]) -> None:
+    colour.r, colour.g, colour.b = (value / 255 for value in values)
+    colour.a = 1.0
+
+
+def _colour(stream: Stream) -> Sequence[int]:
+    return PALETTE[crc32(stream.topic.encode()) % len(PALETTE)]
+
+
+def _padded(places: Floats) -> Floats:
+    """Places (n, 1 to 3) in space: what they lack is zero."""
+    padded = np.zeros((len(places), 3))
+    padded[:, : places.shape[1]] = places[:, :3]
+    return padded
+
+
+def _frame_of(stream: Stream) -> str:
+    """The frame that a stream states; what a sensor detects is in that of its case."""
+    is_seen = stream.schema.full_name == schemas.DETECTION.full_name
+    return stream.metadata.get("frame_id") or (_case_of(stream) if is_seen else WORLD)
+
+
+def _child_of(stream: Stream) -> str:
+    return stream.metadata.get("child_frame_id") or _case_of(stream)
+
+
+def _case_of(stream: Stream) -> str:
+    """What a topic is of, as the name of a frame: its name without the last part."""
+    return stream.topic.strip("/").rpartition("/")[0] or stream.topic.strip("/")
+
+
+_MAKERS: dict[str, Callable[[Stream], Made]] = {
+    schemas.TRUTH_STATE.full_name: _states,
+    schemas.GAUSSIAN_ESTIMATE.full_name: _states,
+    schemas.POSE.full_name: _stated_poses,
+    schemas.POSITION_FIX.full_name: _fixes,
+    schemas.COURSE_FIX.full_name: _fixes,
+    schemas.GEODETIC_FIX.full_name: _location_fixes,
+    schemas.LANDMARK.full_name: _landmarks,
+    schemas.TRACK_ESTIMATE.full_name: _tracks,
+    schemas.DENSITY_ESTIMATE.full_name: _particles,
+    schemas.DETECTION.full_name: _detections,
+}

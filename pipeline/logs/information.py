@@ -1,0 +1,212 @@
+"""What a log holds, and what the cache holds, for a person and for machines."""
+
+import json
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.output.terminal import print_json, print_table, say, warn
+from recorders.errors import BadInput
+from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
+from recorders.parameters import describe
+from recorders.recording import Recorder
+from recorders.registry import load
+from replay.engine.compiling.cache import cache_folder, kept_files
+from replay.engine.replaying.estimator import Bound
+from replay.inference.all_methods import METHODS
+from replay.inference.estimators import bind_model, combined, registered_models
+from replay.inference.model.binding import topics_of
+from replay.inference.model.model import Model
+from replay.inference.model.requirements import OWN_MODEL, names_state, nearest, nearest_parts
+
+
+def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
+    """Print what a log holds: the run, how long it is, its topics; of other data, how to import them."""
+    from recorders.importers.ros.files.bags import looks_like_bag
+
+    if looks_like_bag(path):
+        _show_bag(path, as_json=as_json)
+        return
+    try:
+        log = open_log(path, recover=recover)
+    except BadInput as error:
+        if not (path.is_dir() or isinstance(error, NotMcap)):
+            raise
+        command = f"fuselog import table {shlex.quote(str(path))}"
+        raise BadInput(f"{error}; tables, such as CSV, become a log with: {command}") from error
+    if as_json:
+        print_json(_as_json(log))
+        return
+    first_ns, last_ns = read_span(log, "log_time")
+    duration_s = (last_ns - first_ns) * 1e-9
+    begin = datetime.fromtimestamp(first_ns * 1e-9, UTC)
+    span = f"{duration_s:.6g} s from {begin:%Y-%m-%d %H:%M:%S} UTC" if last_ns else "no messages"
+    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {span}")
+    if log.run:
+        _say_run(log.run)
+    rows = [
+        [topic.name, topic.schema_name, topic.messages, _rate(topic.messages, duration_s)]
+        for topic in log.topics.values()
+    ]
+    print_table(["topic", "schema", "messages", "per second"], rows)
+    if log.companions:
+        count = sum(topic.messages for topic in log.companions.values())
+        say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
+    if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
+        _say_how_to_import(path)
+    elif log.topics:
+        _say_what_fits(path, log, is_all=is_all)
+    if log.loss_statement:
+        warn(log.loss_statement)
+
+
+class Fitting(NamedTuple):
+    """Whether a model fits a log: the topics that it would use, the methods, or what is missing."""
+
+    topics: list[str]
+    methods: list[str]
+    lacks: list[str]
+
+
+def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
+    """How every registered model fits a log, by name."""
+    return {name: _fitting(model, topics) for name, model in registered_models().items()}
+
+
+def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
+    found = topics_of(model, topics)
+    if not any(names_state(each.prior, model) for each in found):
+        parts = nearest_parts(model, topics)
+        return Fitting([], [], [part.words.replace(".../", "") for part in parts if not part.is_here])
+    bound: dict[str, list[Bound]] = {}
+    lacks: list[str] = []
+    for name, method in METHODS.items():
+        if not method.lacks(model):
+            try:
+                parameters = combined(model, method)()
+                bound[name] = bind_model(name, topics, parameters, model=model, method=method)
+            except BadInput as error:
+                lacks.append(str(error).removeprefix(f"estimator {name}: "))
+    used = (topic for each in bound.values() for one in each for topic in (*one.whole, *one.streams))
+    return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
+
+
+def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
+    """Print which models fit the log and how, or that none does; with `is_all` what others lack."""
+    fittings = fitting_of(log.topics)
+    fit = {name: each for name, each in fittings.items() if each.methods}
+    others = {name: each for name, each in fittings.items() if name not in fit}
+    if fit:
+        say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
+    else:
+        say(f"No registered model fits it: {nearest(registered_models(), log.topics)}; {OWN_MODEL}")
+    for name, each in fit.items():
+        say(f"  {name}: -e {' '.join(each.methods)}; from {', '.join(each.topics)}")
+    if fit and others and not is_all:
+        say(f"  {', '.join(others)}: do not fit; --all says what they need")
+    for name, each in others.items() if is_all else ():
+        say(f"  {name}: needs {'; '.join(each.lacks)}")
+
+
+def _show_bag(path: Path, *, as_json: bool) -> None:
+    """Print what a bag of ROS holds that is no MCAP file."""
+    from recorders.importers.ros.files.bags import open_bag
+
+    with open_bag(path) as bag:
+        rows = [[each.topic, each.type_name, each.messages] for each in bag.connections]
+        losses = bag.losses
+    if as_json:
+        topics = [dict(zip(("topic", "schema", "messages"), row, strict=True)) for row in rows]
+        print_json({"path": str(path), "topics": topics, "lost": losses})
+        return
+    print_table(["topic", "schema", "messages"], rows)
+    _say_how_to_import(path)
+    for loss in losses:
+        warn(loss)
+
+
+def _say_how_to_import(path: Path) -> None:
+    say(f"This is a log of ROS; to replay it: fuselog import ros {shlex.quote(str(path))} -o NAME.mcap")
+
+
+def show_cache(*, clear: bool, as_json: bool) -> None:
+    """Print how much each folder of the cache holds; where it is cleared, how much that was."""
+    place = cache_folder()
+    kept = set(kept_files())
+    found: dict[str, dict[str, int]] = {}
+    for path in sorted(kept):
+        size = found.setdefault(path.parent.name, {"files": 0, "bytes": 0})
+        size["files"] += 1
+        size["bytes"] += path.stat().st_size
+        if clear:
+            path.unlink()
+    others = sum(path.is_file() for path in place.rglob("*") if path not in kept)
+    if as_json:
+        print_json({"folder": str(place), "cleared": clear, "holds": found, "others": others})
+        return
+    say(f"{place}: {'cleared' if clear else 'holds'} {len(kept)} files")
+    if found:
+        rows = [[name, size["files"], size["bytes"] / 1e6] for name, size in found.items()]
+        print_table(["", "files", "MB"], rows)
+    if others:
+        say(f"{others} other files are left: fuselog did not write them, or they were changed since")
+
+
+def _as_json(log: Log) -> dict[str, Any]:
+    first_ns, last_ns = read_span(log, "log_time")
+    topics = [
+        {
+            "topic": topic.name,
+            "schema": topic.schema_name,
+            "messages": topic.messages,
+            "metadata": dict(topic.metadata),
+        }
+        for topic in log.topics.values()
+    ]
+    return {
+        "path": str(log.path),
+        "first_log_time_ns": first_ns,
+        "last_log_time_ns": last_ns,
+        "run": asdict(log.run) if log.run else None,
+        "topics": topics,
+        "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
+        "lost": log.loss_statement,
+    }
+
+
+def _rate(messages: int, duration_s: float) -> float | None:
+    return messages / duration_s if messages > 1 and duration_s > 0 else None
+
+
+def _say_run(run: RunMetadata) -> None:
+    seed = "imported" if run.seed is None else f"seed {run.seed}, run {run.run}"
+    say(f"{run.scenario}, {seed}")
+    for name, value in _changed(run).items():
+        say(f"  {name} = {json.dumps(value)}")
+    for subject, fact in run.notes.items():
+        say(f"{subject}: {fact}")
+
+
+def _changed(run: RunMetadata) -> dict[str, Any]:
+    """The parameters that are not the recorder's defaults; all where the recorder is not here."""
+    try:
+        described = describe(load("recorders", run.scenario, Recorder).parameters)
+    except BadInput:
+        return run.parameters
+    defaults = {each.name: each.default for each in described}
+    values = dict(_flat(run.parameters))
+    return {name: value for name, value in values.items() if defaults.get(name) != value}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Mapping[str, Any]:
+    """Nested values by their full names."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, Mapping) and value:
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat

@@ -1,0 +1,4 @@
+"""What commands leave behind: files, result folders, tables, charts, reports.
+
+Begin with `results`.
+"""

@@ -1,0 +1,197 @@
+"""What a command may write over. No command changes or deletes a file that fuselog did not write for it.
+
+A file that exists is replaced only where it is what the same command writes there, and says so itself.
+An output is never an input, another output or a symbolic link, by whatever names they are given; what is
+judged is the place that will be written.
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.output.results import RESULT_FILE, read_result
+from recorders.atomic import settled
+from recorders.errors import BadInput
+from recorders.log import RunMetadata, open_log
+
+# The notes of a log's run that tell how it was cut, merged or relabelled, and which command did so last.
+CHANGES, CHANGED_BY = "changes", "changed by"
+
+
+class Kind(NamedTuple):
+    """A kind of file that a command writes: its suffix, what it is, and how it is known."""
+
+    suffix: str
+    what: str
+    is_written: Callable[[Path], bool]
+
+
+def check_files(outputs: Sequence[tuple[Path, Kind]], inputs: Mapping[str, Iterable[Path]]) -> None:
+    """Raise BadInput where a command may not write one of its outputs.
+
+    Args:
+        outputs: the files to write.
+        inputs: the files that are read, by what they are to the user: `{"log": [...]}`.
+    """
+    taken = {_identity(path): f"{role} {path}" for role, paths in inputs.items() for path in paths}
+    for named, kind in outputs:
+        path = settled(named)
+        if path.suffix.lower() != kind.suffix:
+            raise BadInput(f"{path}: this is to be {kind.what}; give a name that ends in {kind.suffix}")
+        _refuse_link(path)
+        if _identity(path) in taken:
+            raise BadInput(f"{path}: would replace the {taken[_identity(path)]}; give another name")
+        if _is_of_result(path):
+            raise BadInput(f"{path}: is part of the result in that folder; give another name")
+        if path.exists() and not (path.is_file() and kind.is_written(path)):
+            raise BadInput(
+                f"{path}: exists and is not {kind.what}; give another name, or remove the file yourself"
+            )
+        taken[_identity(path)] = f"output {path}"
+
+
+def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
+    """Raise BadInput where a folder that is to be replaced is a link, a root or holds an input."""
+    folder = settled(folder)
+    if not folder.name:
+        raise BadInput(f"{folder}: is the root of a file system; give a folder in it with --out")
+    _refuse_link(folder)
+    for role, paths in inputs.items():
+        for path in paths:
+            place = Path(os.path.realpath(path))
+            if _identity(folder) in map(_identity, (place, *place.parents)):
+                raise BadInput(f"{folder}: the {role} {path} is in it; give another folder with --out")
+
+
+def check_outputs(
+    folder: Path | None, timeline: Path | None, inputs: Mapping[str, Iterable[Path]]
+) -> None:
+    """Raise BadInput where a command may not write its result folder or its timeline, if it does."""
+    if timeline is not None:
+        check_files([(timeline, TIMELINE)], inputs)
+    if folder is not None:
+        check_folder(folder, {**inputs, "output": list(filter(None, [timeline]))})
+
+
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():
+        raise BadInput(f"{path}: is a symbolic link; give the path that it leads to, or another name")
+
+
+def _is_of_result(path: Path) -> bool:
+    """Whether a result folder lists a file as its own."""
+    place = Path(os.path.realpath(path))
+    for folder in place.parents:
+        if (folder / RESULT_FILE).is_file():
+            with suppress(BadInput):
+                return place.relative_to(folder).as_posix() in read_result(folder).files
+    return False
+
+
+def _identity(path: Path) -> Hashable:
+    """Equal for two names of one file, also where that does not exist yet."""
+    try:
+        state = path.stat()
+    except OSError:
+        return os.path.realpath(path.parent), path.name
+    return state.st_dev, state.st_ino
+
+
+def _run_of(path: Path, *, is_changed: bool = False) -> RunMetadata | None:
+    """What run a log is of, if fuselog wrote it: as the run gave it, or changed since."""
+    with suppress(BadInput):
+        run = open_log(path).run if _is_log(path) else None
+        return run if run is not None and (CHANGES in run.notes) == is_changed else None
+    return None
+
+
+def _is_log(path: Path) -> bool:
+    """Whether fuselog wrote a log, which is whole."""
+    from mcap.reader import make_reader
+
+    from recorders.log.container.writing import LIBRARY
+
+    try:
+        open_log(path)
+        with path.open("rb") as file:
+            return make_reader(file).get_header().library == LIBRARY
+    except (BadInput, OSError):
+        return False
+
+
+def _is_estimates(run: RunMetadata) -> bool:
+    return {"log", "estimators"} <= run.notes.keys()
+
+
+def _is_recorded(path: Path) -> bool:
+    run = _run_of(path)
+    return run is not None and run.seed is not None and not _is_estimates(run)
+
+
+def _holds_estimates(path: Path) -> bool:
+    run = _run_of(path)
+    return run is not None and _is_estimates(run)
+
+
+def changed(command: str) -> Kind:
+    """The log that one of the commands on logs made of others."""
+
+    def is_changed(path: Path) -> bool:
+        run = _run_of(path, is_changed=True)
+        return run is not None and run.notes.get(CHANGED_BY) == command
+
+    return Kind(".mcap", f"a log that fuselog {command} wrote", is_changed)
+
+
+def imported(source: str) -> Kind:
+    """The log of an importer."""
+
+    def is_imported(path: Path) -> bool:
+        run = _run_of(path)
+        return run is not None and run.seed is None and run.scenario == source and not _is_estimates(run)
+
+    return Kind(".mcap", f"a log that fuselog imported from {source} data", is_imported)
+
+
+def _is_timeline(path: Path) -> bool:
+    from rerun.chunk import RrdReader
+
+    from replay.timeline.sinks import rerun_path
+
+    with warnings.catch_warnings(action="ignore"):  # of what is cut off
+        try:
+            stores = RrdReader(rerun_path(path)).recordings()
+        except (BadInput, OSError, RuntimeError, ValueError):
+            return False
+    return bool(stores) and all(store.application_id.startswith("fuselog") for store in stores)
+
+
+def _is_picture(path: Path) -> bool:
+    from PIL import Image
+
+    from replay.timeline.viewer import SOFTWARE
+
+    try:
+        with Image.open(path) as image:
+            return image.info.get("Software") == SOFTWARE
+    except (OSError, SyntaxError, ValueError):
+        return False
+
+
+def _is_report(path: Path) -> bool:
+    from pipeline.output.report import is_report
+
+    return is_report(path)
+
+
+# A mapping is for editing: none is replaced.
+MAPPING = Kind(".toml", "a mapping to be made", lambda _: False)
+LOG = Kind(".mcap", "a log that fuselog wrote", _is_log)
+RECORDED = Kind(".mcap", "a log that fuselog recorded", _is_recorded)
+ESTIMATES = Kind(".mcap", "an estimates log of fuselog", _holds_estimates)
+TIMELINE = Kind(".rrd", "a timeline of fuselog", _is_timeline)
+PICTURE = Kind(".png", "a picture that fuselog took", _is_picture)
+REPORT = Kind(".html", "a report of fuselog", _is_report)

@@ -1,0 +1,379 @@
+"""What an experiment yields, and its folder: tables, figures, claims, result.json.
+
+A result folder is built beside its place and moved there when it is whole. result.json lists what is in
+it, so that nothing else is ever replaced with it.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from urllib.parse import quote
+
+from pipeline.output.charts import Chart, draw
+from pipeline.output.claims import Claim, decided
+from recorders.atomic import whole_folder
+from recorders.errors import BadInput, check_format
+from recorders.parameters import Parameters, build
+from recorders.parsing import parse_json
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from replay.judging.errors.evaluation import Errors
+
+RESULT_FILE = "result.json"
+# Longer tables are no reading matter: they are Parquet alone.
+CSV_ROWS = 20_000
+# Raised when result.json changes in a way that its readers must know; one without it is of the first.
+FORMAT = 1
+# Where every single error is, in a result's folder.
+ERRORS = Path("tables", "errors")
+# The table of runs, in a result's folder.
+RUNS = Path("tables", "runs.parquet")
+Bounds = tuple[float, float]
+MetricValue = float | list[float] | list[float | None] | None
+
+
+@dataclass
+class Outcome:
+    """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
+
+    `bounds` are where a metric lies with 95 % if all is well. A figure is a chart, or a picture of
+    another kind. `input_sha256` is a hash of the data that went in, `parameters` are those of all
+    estimators, defaults included.
+    """
+
+    metrics: dict[str, MetricValue] = field(default_factory=dict)
+    claims: list[Claim] = field(default_factory=list)
+    tables: dict[str, "pd.DataFrame"] = field(default_factory=dict)
+    figures: dict[str, "Chart | Figure"] = field(default_factory=dict)
+    input_sha256: str = ""
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
+    bounds: dict[str, Bounds] = field(default_factory=dict)
+
+
+class Result(Parameters):
+    """What result.json says.
+
+    `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
+    without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
+    lies with 95 % if all is well.
+    """
+
+    format: int = FORMAT
+    experiment: str
+    fuselog: str
+    settings: dict[str, Any]
+    input_sha256: str
+    metrics: dict[str, MetricValue]
+    claims: list[Claim]
+    files: dict[str, str | None] = {}
+    bounds: dict[str, Bounds] = {}
+
+    @property
+    def contents(self) -> list[str]:
+        """The folders and files at the top of the result's folder."""
+        return [*dict.fromkeys(Path(name).parts[0] for name in self.files)]
+
+
+def split_metric(key: str) -> tuple[str, str, str]:
+    """Estimator, quantity and case of a metric key `estimator.quantity_unit[.case]`.
+
+    A key without a dot is a quantity of what has no estimator: a trajectory from a file.
+    """
+    if "." not in key:
+        return "", key, ""
+    estimator, _, rest = key.partition(".")
+    quantity, _, case = rest.partition(".")
+    return estimator, quantity, case
+
+
+def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
+    """The metrics of these estimators first and in their order, those of others as they were."""
+    place = {label: index for index, label in enumerate(estimators)}
+    keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
+    return {key: metrics[key] for key in keys}
+
+
+class Measured(NamedTuple):
+    """A metric's value or what is said of it, and where it lies with 95 % if all is well."""
+
+    value: MetricValue | str = None
+    bounds: Bounds | None = None
+
+    @property
+    def place(self) -> Literal["below", "within", "above", ""]:
+        """Where the value lies; nowhere where there is none, or no bounds."""
+        if self.bounds is None or not isinstance(self.value, int | float):
+            return ""
+        low, high = self.bounds
+        return "below" if self.value < low else "above" if self.value > high else "within"
+
+
+@dataclass(frozen=True)
+class MetricTable:
+    """The metrics of one case, by quantity and then by estimator; all estimators in one order."""
+
+    case: str
+    estimators: list[str]
+    quantities: dict[str, dict[str, Measured]]
+
+
+def read_table(path: Path) -> "pd.DataFrame":
+    """A table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
+    import pandas as pd
+
+    with path.open("rb") as file:
+        return pd.read_parquet(file)
+
+
+def metric_tables(
+    metrics: Mapping[str, MetricValue],
+    bounds: Mapping[str, Bounds],
+    runs: "pd.DataFrame | None" = None,
+) -> list[MetricTable]:
+    """The metrics by case; with a table of runs also the interval of the mean NEES over them."""
+    over_runs = {} if runs is None else _nees_over_runs(runs)
+    estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
+    cases: dict[str, dict[str, dict[str, Measured]]] = {}
+    for key, value in metrics.items():
+        estimator, quantity, case = split_metric(key)
+        measured = Measured(value, bounds.get(key))
+        quantities = cases.setdefault(case, {})
+        quantities.setdefault(quantity, {})[estimator] = measured
+        if quantity == "nees" and (estimator, case) in over_runs:
+            said = Measured(over_runs[estimator, case])
+            quantities.setdefault("nees_mean_over_runs", {})[estimator] = said
+    return [MetricTable(case, estimators, quantities) for case, quantities in sorted(cases.items())]
+
+
+def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
+    """The mean of the runs' NEES with its 95 % interval, by estimator and case.
+
+    Runs are independent, so that the interval is Student's; fewer than `FEWEST_RUNS` have none. A study
+    may have a table of runs without NEES.
+    """
+    from scipy.stats import sem, t
+
+    from replay.judging.errors.differences import FEWEST_RUNS
+
+    if not {"estimator", "case", "nees"} <= {*runs}:
+        return {}
+    said = {}
+    for (estimator, case), rows in runs.groupby(["estimator", "case"]):
+        nees = rows["nees"].dropna()
+        if len(nees) >= FEWEST_RUNS:
+            mean = float(nees.mean())
+            low, high = t.interval(0.95, len(nees) - 1, loc=mean, scale=sem(nees))
+            components = rows.filter(regex="^rmse_").notna().any().sum()
+            said[str(estimator), str(case)] = (
+                f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
+            )
+    return said
+
+
+def result_folder(folder: Path) -> AbstractContextManager[Path]:
+    """A folder to fill, beside its place; it replaces an earlier result there when all went well.
+
+    Raises BadInput where something else than a result of ours is in the place, where another process
+    is filling it, or where it cannot be written.
+    """
+    return whole_folder(folder, lambda found: _require_ours(found, folder))
+
+
+def _require_ours(found: Path, place: Path) -> None:
+    """Raise BadInput unless a folder holds a result of ours, as it was written, and nothing else."""
+    try:
+        result = read_result(found)
+    except BadInput:
+        raise BadInput(
+            f"{place}: exists and is not a result of fuselog; give another folder with --out"
+        ) from None
+    if _sealed(result) != result:
+        raise BadInput(
+            f"{place / RESULT_FILE}: was changed since fuselog wrote it, or an older version wrote it; "
+            "give another --out"
+        )
+    expected = {Path(name): digest for name, digest in result.files.items()}
+    parents = {parent for name in expected for parent in name.parents}
+    for path in sorted(found.rglob("*")):
+        name = path.relative_to(found)
+        if path.is_symlink() or not (path.is_file() if name in expected else name in parents):
+            what = "was not written by fuselog"
+        elif (
+            name in expected
+            and name != Path(RESULT_FILE)
+            and expected[name] not in (None, hash_of(path))
+        ):
+            what = "was changed since fuselog wrote it"
+        else:
+            continue
+        raise BadInput(f"{place / name}: {what}; move it away, or give another folder with --out")
+
+
+def _sealed(result: Result) -> Result:
+    """The result with the SHA-256 of its own text among its files."""
+    files = {name: digest for name, digest in result.files.items() if name != RESULT_FILE}
+    bare = result.model_copy(update={"files": files})
+    digest = hashlib.sha256(_text(bare).encode()).hexdigest()
+    return result.model_copy(update={"files": {**files, RESULT_FILE: digest}})
+
+
+def _text(result: Result) -> str:
+    return json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
+
+
+def hash_of(path: Path) -> str:
+    """The SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class ErrorTables:
+    """Every error of every estimate, on request: a Parquet file per estimator and case.
+
+    They are written block by block, as they come; use it as a context.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / ERRORS
+        self._stack = ExitStack()
+        self._writers: dict[tuple[str, str], Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.close()
+
+    def add(self, errors: "Errors") -> None:
+        """Write a block; see `error_table`."""
+        import pyarrow
+        import pyarrow.parquet
+
+        from replay.judging.tables import error_table
+
+        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
+        what = errors.estimator, errors.case
+        if what not in self._writers:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
+            file = self._stack.enter_context(path.open("wb"))
+            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
+            self._writers[what] = self._stack.enter_context(writer)
+        if len(table):
+            self._writers[what].write_table(table)
+
+
+def join_tables(parts: Sequence[Path], place: Path) -> None:
+    """One Parquet file of the rows of several, in their order."""
+    import pyarrow.parquet
+
+    files = [pyarrow.parquet.ParquetFile(part) for part in parts]
+    with pyarrow.parquet.ParquetWriter(place, files[0].schema_arrow) as writer:
+        for file in files:
+            for group in range(file.num_row_groups):
+                writer.write_table(file.read_row_group(group))
+
+
+def write_outcome(
+    folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
+) -> Result:
+    """Write tables (Parquet, short ones CSV too), figures (SVG; charts as JSON too) and result.json.
+
+    Returns what result.json says.
+    """
+    # here, since lists and --help need none of it
+    import matplotlib as mpl
+    import pyarrow
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    for name, table in outcome.tables.items():
+        (folder / "tables").mkdir(exist_ok=True)
+        columns = pyarrow.Table.from_pandas(table, preserve_index=False)
+        with (folder / "tables" / f"{name}.parquet").open("wb") as file:
+            pyarrow.parquet.write_table(columns, file)
+        if len(table) <= CSV_ROWS:
+            with (folder / "tables" / f"{name}.csv").open("wb") as file:
+                pyarrow.csv.write_csv(columns, file)
+    for name, figure in outcome.figures.items():
+        (folder / "figures").mkdir(exist_ok=True)
+        path = folder / "figures" / f"{quote(name, safe=' ')}.svg"  # topics have slashes
+        if isinstance(figure, Chart):
+            path.with_suffix(".json").write_text(figure.model_dump_json() + "\n", encoding="utf-8")
+            figure = draw(figure)
+        with mpl.rc_context({"svg.hashsalt": "fuselog"}):
+            _show_names_as_they_are(figure)
+            figure.savefig(path, metadata={"Date": None})
+    written = sorted(path for path in folder.rglob("*") if path.is_file())
+    result = _sealed(
+        Result(
+            experiment=experiment,
+            fuselog=version("fuselog"),
+            settings=dict(settings),
+            input_sha256=outcome.input_sha256,
+            metrics=in_order(plain(outcome.metrics), settings.get("estimators", ())),
+            bounds={key: bounds for key, bounds in outcome.bounds.items() if key in outcome.metrics},
+            claims=[decided(claim) for claim in outcome.claims],
+            files={
+                path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
+                for path in written
+            },
+        )
+    )
+    (folder / RESULT_FILE).write_text(_text(result), encoding="utf-8")
+    return result
+
+
+def _show_names_as_they_are(figure: "Figure") -> None:
+    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
+    from matplotlib.ticker import FixedFormatter, FuncFormatter
+
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
+    texts = [text for legend in legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts.append(axes.title)
+        for axis in (axes.xaxis, axes.yaxis):
+            texts.append(axis.label)
+            if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
+                texts += axis.get_ticklabels()
+    for text in texts:
+        text.set_parse_math(False)
+
+
+def read_result(folder: Path) -> Result:
+    """What result.json of a result folder says.
+
+    Raises BadInput where it is missing, damaged or of another format.
+    """
+    path = folder / RESULT_FILE
+    try:
+        values = parse_json(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise BadInput(f"{folder}: has no {RESULT_FILE}; give a folder that fuselog run wrote") from None
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
+    if not isinstance(values, dict):
+        raise BadInput(f"{path}: is not a result of fuselog run; run the experiment again")
+    check_format(path, values.get("format", 1), FORMAT)
+    return build(Result, values, str(path))
+
+
+def plain(metrics: Mapping[str, MetricValue]) -> dict[str, MetricValue]:
+    """Metrics as JSON has them: NaN and infinity become null."""
+    return {
+        key: [_number(entry) for entry in value] if isinstance(value, list) else _number(value)
+        for key, value in metrics.items()
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None

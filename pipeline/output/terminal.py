@@ -1,0 +1,183 @@
+"""What the terminal shows: progress bars and tables. Standard output is for results alone.
+
+Texts may come from a log or a file's name: what could steer a terminal is shown, not obeyed.
+"""
+
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.output.claims import Claim
+from pipeline.output.results import Bounds, Measured, MetricValue, metric_tables
+from recorders.errors import printable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def _console(*, stderr: bool) -> Console:
+    """Plain text, wide where no terminal breaks it."""
+    console = Console(stderr=stderr, highlight=False, markup=False, emoji=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = 1000
+    return console
+
+
+out = _console(stderr=False)
+err = _console(stderr=True)
+
+
+def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:
+    """Pass items through with a progress bar on standard error; none where nobody watches.
+
+    The title is asked again after every item, as it may say how the work goes.
+    """
+    if not err.is_terminal:
+        yield from items
+        return
+    from rich.progress import MofNCompleteColumn, Progress  # which take long to import
+
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task(str(title), total=total)
+        for item in items:
+            yield item
+            bar.update(task, advance=1, description=str(title))
+
+
+@contextmanager
+def status() -> Iterator[Callable[[str], None]]:
+    """What shows how work goes, in one line on standard error; nothing where nobody watches."""
+    with err.status("", spinner="line") if err.is_terminal else nullcontext() as line:
+
+        def show(text: str) -> None:
+            if line is not None:
+                line.update(printable(text))
+
+        yield show
+
+
+def say(text: str) -> None:
+    """A line on standard output; the terminal breaks it, not we, so that paths stay whole."""
+    out.print(printable(text), soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """A line on standard error."""
+    err.print(printable(f"fuselog: {text}"), soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on standard output, whole or not at all: what is no finite number is null."""
+    sys.stdout.write(json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> None:
+    """A table; columns of numbers are set right, long texts are broken into lines."""
+    body = [list(row) for row in rows]
+    table = Table(
+        title=printable(title) or None,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+    )
+    for index, column in enumerate(columns):
+        numeric = bool(body) and all(isinstance(row[index], int | float | None) for row in body)
+        table.add_column(printable(column), justify="right" if numeric else "left", overflow="fold")
+    for row in body:
+        table.add_row(*(printable(format_value(value)) for value in row))
+    out.print(table)
+
+
+def format_value(value: object) -> str:
+    """Four significant digits for floats, nothing for None, the range of many numbers, or text."""
+    if isinstance(value, list):
+        known = [each for each in value if each is not None]
+        if any(isinstance(each, dict) for each in known):
+            return f"{len(value)} tables"
+        if any(isinstance(each, list) for each in known):
+            return ", ".join(map(format_value, value))
+        if len(known) > 4 and all(isinstance(each, int | float) for each in known):
+            return f"{format_value(min(known))} to {format_value(max(known))}"
+        return " ".join(map(format_value, value))
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def print_metrics(
+    metrics: Mapping[str, MetricValue],
+    bounds: Mapping[str, Bounds],
+    runs: "pd.DataFrame | None" = None,
+) -> None:
+    """Metrics as tables: one per case, a row per quantity, a column per estimator.
+
+    A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
+    of runs there is also the mean NEES over them, see `metric_tables`.
+    """
+    for table in metric_tables(metrics, bounds, runs):
+        rows = []
+        for quantity, values in table.quantities.items():
+            cells = [values.get(estimator, Measured()) for estimator in table.estimators]
+            rows.append([quantity, *map(_with_bounds, cells)])
+        print_table(["", *table.estimators], rows, table.case)
+
+
+def _with_bounds(measured: Measured) -> object:
+    if not measured.bounds or not measured.place:
+        return measured.value
+    low, high = map(format_value, measured.bounds)
+    return f"{format_value(measured.value)} ({low} to {high})"
+
+
+def print_pose_errors(metrics: Mapping[str, float]) -> None:
+    """APE and RPE: a row each, a column per statistic; then how many poses and pairs they are of."""
+    rows: dict[str, dict[str, float]] = {}
+    counts = []
+    for key, value in metrics.items():
+        found = re.fullmatch(r"(ape|rpe)_(translation|rotation)_(\w+)_(m|deg)", key)
+        if found is None:
+            counts.append(f"{value:.0f} {key.replace('_', ' ')}")
+            continue
+        error, of, statistic, unit = found.groups()
+        rows.setdefault(f"{error.upper()} {of} ({unit})", {})[statistic] = value
+    names = next(iter(rows.values()))
+    print_table(["", *names], [[row, *values.values()] for row, values in rows.items()])
+    say(", ".join(counts))
+
+
+def print_parameters(
+    parameters: Mapping[str, Mapping[str, object]], stated: Mapping[str, Mapping[str, str]] | None = None
+) -> None:
+    """The parameters of estimators by label: a row each, a column per estimator.
+
+    Those that a log's channels state come last, with the topic of the channel.
+    """
+    names = dict.fromkeys(name for values in parameters.values() for name in values)
+    rows = [[name, *(values.get(name) for values in parameters.values())] for name in names]
+    print_table(["parameter", *parameters], rows)
+    if stated and any(stated.values()):
+        print_parameters({f"{label}, from the log": values for label, values in stated.items()})
+
+
+def print_claims(claims: Sequence[Claim]) -> None:
+    """Claims, each with what the paper says and what we found."""
+    for claim in claims:
+        say(f"{claim.verdict}: {claim.claim}")
+        say(f"  paper: {claim.paper}; ours: {claim.ours}" + (f"; {claim.why}" if claim.why else ""))

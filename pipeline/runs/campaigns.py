@@ -1,0 +1,295 @@
+"""Campaigns: an experiment cut into cells, worked off in any order, merged in the cells' own.
+
+A cell is a part of the runs. What it gives depends on its description and on the code alone, so that it
+may be worked off anywhere, and once is enough: finished cells are kept until all are done, and the same
+command goes on from there after it was stopped; see `pipeline.runs.checkpoints`.
+"""
+
+import hashlib
+import json
+import logging
+import pickle
+import shutil
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from pipeline.runs.checkpoints import Kept
+from pipeline.runs.ensemble import KEPT_BYTES, Pass, parts_of, require_memory
+from pipeline.runs.executors import Crew, Team, here, states_of, version_of_code
+from pipeline.runs.experiment import Experiment, Logs, Record, Setting, load_scenario
+from pipeline.runs.runner import Runner
+from recorders.errors import BadInput
+from recorders.parameters import merge
+
+# A cell whose workers died so often is given up.
+ATTEMPTS = 3
+_LOG = logging.getLogger("fuselog")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The runs from `first` to `end` of an experiment.
+
+    Attributes:
+        experiment: all of it; nothing that decides lies in another file, but for its logs.
+        first, end: the runs.
+        logs: of how many of them the logs are kept.
+        draws: whether the timeline of the first is drawn.
+        errors: whether every single error is kept.
+        place: where the experiment's result will be.
+    """
+
+    experiment: Experiment
+    first: int
+    end: int
+    logs: int
+    draws: bool
+    errors: bool
+    place: Path
+
+    @property
+    def runs(self) -> int:
+        """How many there are."""
+        return self.end - self.first
+
+    @property
+    def files(self) -> list[Path]:
+        """The logs that it reads."""
+        return self.experiment.files[self.first : self.end]
+
+    @cached_property
+    def key(self) -> str:
+        """A hash of what decides about the result: this description, the data, and the code."""
+        experiment = self.experiment.model_dump(mode="json", by_alias=True)
+        runs = [self.first, self.end, self.logs, self.draws, self.errors]
+        said = [experiment, states_of(self.files), runs, str(self.place), version_of_code()]
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+    def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
+        """Record or open the runs, replay and judge them; files go to the folder."""
+        if setting is None:
+            logs = self.first + self.logs
+            setting = Setting(folder, self.place, logs=logs, draws=self.draws, errors=self.errors)
+        return Runner(self.experiment, setting).judge(slice(self.first, self.end))
+
+    def packed(self, folder: Path) -> bytes:
+        """The same as bytes, which any process can take; BadInput where a metric stands against that."""
+        shutil.rmtree(folder, ignore_errors=True)  # of a worker that was killed
+        if self.draws or self.logs or self.errors:
+            folder.mkdir()
+        done = self.work_off(folder)
+        try:
+            return pickle.dumps(done)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise BadInput(
+                f"what a metric keeps cannot be sent to another process ({error}); keep numbers, arrays "
+                "and classes of a module"
+            ) from error
+
+
+class Sent(NamedTuple):
+    """A cell for a machine with other files: logs go there, and what is written comes back, as bytes.
+
+    Attributes:
+        cell: what there is to do.
+        logs: those of the cell that the machine does not see, by their paths without links.
+    """
+
+    cell: Cell
+    logs: Sequence[tuple[Path, bytes]]
+
+    def packed(self) -> tuple[bytes, dict[str, bytes]]:
+        """What `Cell.packed` gives, and the files that it writes, by their paths in its folder."""
+        with TemporaryDirectory() as scratch:
+            root, folder = Path(scratch).resolve() / "root", Path(scratch) / "files"
+            try:
+                left = self._unpacked(root).packed(folder)
+            except BadInput as error:
+                raise BadInput(str(error).replace(str(root), "")) from error
+            written = (path for path in folder.rglob("*") if path.is_file())
+            return left, {path.relative_to(folder).as_posix(): path.read_bytes() for path in written}
+
+    def _unpacked(self, root: Path) -> Cell:
+        """The cell with its logs, and its result's place, in a folder as if that were the root."""
+        if not self.logs:
+            return self.cell
+
+        def below(path: Path) -> Path:
+            return root / path.relative_to(path.anchor)
+
+        experiment, files = self.cell.experiment, list(map(str, self.cell.experiment.files))
+        for number, (path, content) in enumerate(self.logs, self.cell.first):
+            files[number] = str(below(path))
+            below(path).parent.mkdir(parents=True, exist_ok=True)
+            below(path).write_bytes(content)
+        moved = experiment.model_copy(update={"logs": Logs(files=files)})
+        return replace(self.cell, experiment=moved, place=below(self.cell.place))
+
+
+@dataclass
+class Pace:
+    """How a campaign goes, as its progress shows it.
+
+    Attributes:
+        runs: of all cells.
+        done: those of the cells that are merged.
+        worked_off: those of them that no earlier campaign had kept.
+        workers: how many work at once.
+    """
+
+    runs: int
+    done: int = 0
+    worked_off: int = 0
+    workers: int = 0
+    _begun_s: float = field(default_factory=perf_counter)
+
+    def __str__(self) -> str:
+        rate = self.worked_off / (perf_counter() - self._begun_s)
+        workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
+        return f"replaying: {self.done} of {self.runs} runs, {rate:.0f} runs/s, {workers}; cells"
+
+
+def judge(experiment: Experiment, setting: Setting) -> Pass:
+    """Replay and judge all runs of an experiment, cell by cell; its files go to the setting's folder.
+
+    Raises BadInput where there is an estimator that can follow no run, or workers die again and again.
+    """
+    cells = cells_of(experiment, setting)
+    if len(cells) == 1 or setting.kept is None:  # nothing to share, and nothing to go on with
+        return cells[0].work_off(setting.folder, setting).check()
+    (done,) = _merged([cells], setting)
+    setting.kept.hand_over([cell.key for cell in cells], setting.folder)
+    return done
+
+
+def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[Pass]:
+    """What replaying and judging leaves of each experiment, in their order; see `judge`.
+
+    Files stay where cells are kept.
+    """
+    return _merged([cells_of(experiment, setting) for experiment in experiments], setting)
+
+
+def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]:
+    """What each part of the cells leaves, merged in their order."""
+    assert setting.kept is not None
+    cells = list(chain.from_iterable(parts))
+    pace = Pace(sum(cell.runs for cell in cells))
+    results = work_off(cells, setting.crew or here, setting.kept, pace)
+    told = iter(setting.progress(results, pace, len(cells)))
+    for part in parts:
+        whole = next(told)
+        hashes = hashlib.sha256(whole.input_sha256.encode())
+        for done in islice(told, len(part) - 1):
+            hashes.update(done.input_sha256.encode())
+            whole.merge(done)
+        if len(part) > 1:
+            whole.input_sha256 = hashes.hexdigest()
+        yield whole.check()
+    for _ in told:  # there are no more: progress and team come to their ends
+        pass
+
+
+def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
+    """The cells: a cut that only the number of runs decides."""
+    require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
+    if experiment.record:
+        recorder, values, _ = load_scenario(experiment.record.scenario)
+        parameters = merge(values, experiment.record.parameters)
+        record = Record(scenario=recorder, parameters=parameters)
+        experiment = experiment.model_copy(update={"record": record})
+    cells, place = [], setting.place.resolve()
+    for now in parts_of(experiment.runs):
+        logs = min(max(setting.logs - now.start, 0), now.stop - now.start)
+        draws = setting.draws and now.start == 0
+        cells.append(Cell(experiment, now.start, now.stop, logs, draws, setting.errors, place))
+    return cells
+
+
+def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Iterator[Pass]:
+    """What cells leave, in their order; those that are kept are not worked off again.
+
+    Memory holds what is handed out and what comes in. Raises BadInput where the workers of a cell died
+    again and again.
+    """
+    kept.begin()
+    keys = [cell.key for cell in cells]
+    waiting = deque(number for number, key in enumerate(keys) if not kept.has(key))
+    if len(waiting) < len(cells):
+        done = len(cells) - len(waiting)
+        _LOG.warning(
+            "%s: has %d of %d cells already; computing the others", kept.folder, done, len(cells)
+        )
+    died: Counter[int] = Counter()
+    following = 0
+    while following < len(cells):
+        with crew() as team:
+            pace.workers = team.workers
+            begin = _beginner(team, [cells[number] for number in waiting], kept)
+            pending: dict[Future[Any], int] = {}
+            lost: BaseException | None = None
+            while following < len(cells) and lost is None:
+                while waiting and len(pending) < team.workers:
+                    number = waiting.popleft()
+                    pending[begin(cells[number])] = number
+                left = kept.read(keys[following])
+                if left is not None:
+                    pace.done += cells[following].runs
+                    yield left
+                    following += 1
+                    continue
+                if following not in waiting and following not in pending.values():
+                    died[following] += 1
+                    if died[following] >= ATTEMPTS:
+                        raise BadInput(
+                            f"{kept.folder}: what is kept there is changed by others, or by the disk; "
+                            "give another --out"
+                        )
+                    waiting.appendleft(following)
+                    continue
+                for future in wait(pending, return_when=FIRST_COMPLETED).done:
+                    try:
+                        error = future.exception()
+                    except CancelledError:  # by a scheduler that is not there any more
+                        error = BrokenExecutor("the scheduler has ended")
+                    if isinstance(error, (*team.lost, BrokenExecutor)):
+                        lost = error
+                        continue
+                    number = pending.pop(future)
+                    pace.worked_off += cells[number].runs
+                    if team.sees is None:
+                        kept.write(keys[number], future.result())
+                    else:
+                        kept.write(keys[number], *future.result())
+            if lost is not None:  # and with it all others of some executors
+                died.update(pending.values())
+                waiting.extendleft(sorted(pending.values(), reverse=True))
+                number, times = died.most_common(1)[0]
+                if times >= ATTEMPTS:
+                    cell = cells[number]
+                    raise BadInput(
+                        f"runs {cell.first} to {cell.end - 1}: the process that computed them died "
+                        f"{times} times ({lost}); try fewer workers, or --workers 1 to see why"
+                    )
+
+
+def _beginner(team: Team, cells: Sequence[Cell], kept: Kept) -> Callable[[Cell], Future[Any]]:
+    """What hands a cell to the team; logs that its workers do not see go with it."""
+    sees, submit = team.sees, team.executor.submit
+    if sees is None:
+        return lambda cell: submit(cell.packed, kept.place_of(cell.key))
+    carries = not sees([file for cell in cells for file in cell.files])
+
+    def send(cell: Cell) -> Future[Any]:
+        paths = [file.resolve() for file in cell.files] if carries else []
+        return submit(Sent(cell, [(path, path.read_bytes()) for path in paths]).packed)
+
+    return send

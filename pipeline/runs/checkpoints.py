@@ -1,0 +1,204 @@
+"""What a campaign that is not finished has done so far, in a folder beside its result.
+
+    OUT.unfinished/
+        fuselog.lock    held by the process that works on the campaign
+        KEY.bin         what a cell left, checked; KEY is a hash of its description and of the code
+        KEY/            the files of that cell: logs and estimates of the first runs, the timeline
+
+What a cell left begins with its key, and states the SHA-256 of each of its files: whatever is not what
+that cell wrote is computed again. The folder may lie where others write, as in one that a team shares;
+it is this user's alone, and so is each file that is read.
+
+It is there when the campaign begins, and goes when the result is in place, or where nothing is kept.
+"""
+
+import logging
+import os
+import pickle
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filelock import FileLock, Timeout
+
+from pipeline.output.results import ERRORS, hash_of, join_tables
+from recorders.atomic import parents_of, settled
+from recorders.errors import BadInput
+from replay.engine.compiling.cache import is_own, read_own, write_checked
+
+_LOCK, _SUFFIX = "fuselog.lock", ".bin"
+_KEY = re.compile(r"[0-9a-f]{64}")
+_LEFTOVER = re.compile(r"\.[0-9a-f]{64}\.bin\.[^.]+\.part")  # where a cell was being written
+_LOG = logging.getLogger("fuselog")
+
+
+class Kept:
+    """The folder, whose lock is held."""
+
+    def __init__(self, folder: Path, lock: FileLock) -> None:
+        self.folder = folder
+        self._lock = lock
+
+    def begin(self) -> None:
+        """Make the folder, if it is not there, and lock it.
+
+        Raises BadInput where another process holds it, or it holds what is not ours.
+        """
+        if self._lock.is_locked:
+            return
+        is_new = not self.folder.exists()
+        try:
+            self.folder.mkdir(mode=0o700, exist_ok=True)
+            self._lock.acquire()
+        except Timeout:
+            raise BadInput(
+                f"{self.folder}: another fuselog command is working on it; wait for it, or give "
+                "another --out"
+            ) from None
+        except OSError as error:
+            if is_new:
+                self._remove()
+            raise BadInput(f"{self.folder}: cannot be written ({error.strerror or error})") from error
+        foreign = [each.name for each in self.folder.iterdir() if not _is_ours(each)]
+        what = f"holds {foreign[0]}, which fuselog did not write" if foreign else ""
+        if not is_own(self.folder.stat()):
+            what = "another user owns it, or others may write to it"
+        if what:
+            self._lock.release()
+            raise BadInput(f"{self.folder}: {what}; move it away, or give another --out")
+        for path in self.folder.iterdir():
+            if _LEFTOVER.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def place_of(self, key: str) -> Path:
+        """Where the files of a cell go."""
+        return self.folder / key
+
+    def has(self, key: str) -> bool:
+        """Whether a cell is done, with all its files."""
+        return self._left(key) is not None
+
+    def read(self, key: str) -> Any:
+        """What a cell left; None where it is not done."""
+        left = self._left(key)
+        return None if left is None else pickle.loads(left.pickled)
+
+    def write(self, key: str, left: bytes, written: Mapping[str, bytes] | None = None) -> None:
+        """Keep what a cell left, pickled, and what it wrote where that is not in its place already."""
+        place = self.place_of(key)
+        if written is not None:
+            shutil.rmtree(place, ignore_errors=True)  # of a driver that was killed
+        for name, content in (written or {}).items():
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_bytes(content)
+        files = sorted(path for path in place.rglob("*") if path.is_file())
+        hashes = {path.relative_to(place).as_posix(): hash_of(path) for path in files}
+        content = key.encode() + pickle.dumps(_Left(left, hashes))
+        write_checked(self.folder / f"{key}{_SUFFIX}", content, "a cell")
+
+    def hand_over(self, keys: Sequence[str], folder: Path) -> None:
+        """Put the files of all cells, in their order, into a folder; tables of errors are joined.
+
+        Raises BadInput where they are not those that the cells wrote: somebody changed them meanwhile.
+        """
+        tables: dict[Path, list[Path]] = {}
+        for key in keys:
+            left = self._left(key)
+            if left is None:
+                raise BadInput(f"{self.place_of(key)}: was changed meanwhile; run the command again")
+            for name in map(Path, left.files):
+                path = self.place_of(key) / name
+                if name.is_relative_to(ERRORS):
+                    tables.setdefault(name, []).append(path)
+                    continue
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                _copy(path, folder / name)
+        for name, parts in tables.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            join_tables(parts, folder / name)
+
+    def end(self, *, is_done: bool) -> None:
+        """Let go of the folder; it stays where there is something to go on with."""
+        if is_done and self.folder.is_dir():
+            with suppress(BadInput):  # of what others hold, or have put there
+                self.begin()  # cells of an earlier command that came to no end
+        if not self._lock.is_locked:
+            return
+        done = sum(1 for path in self.folder.iterdir() if path.suffix == _SUFFIX)
+        if done and not is_done:
+            self._lock.release()
+            _LOG.warning(
+                "%s: keeps %d finished cells; the same command continues with the others",
+                self.folder,
+                done,
+            )
+            return
+        for path in self.folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.suffix == _SUFFIX:
+                path.unlink(missing_ok=True)
+        self._remove()
+
+    def _remove(self) -> None:
+        """Let go of the folder and remove it, where nothing but the lock is in it."""
+        self._lock.release()
+        with suppress(OSError):
+            (self.folder / _LOCK).unlink(missing_ok=True)
+            self.folder.rmdir()
+
+    def _left(self, key: str) -> "_Left | None":
+        """What this very cell left, if its files are those that it wrote."""
+        content = read_own(self.folder / f"{key}{_SUFFIX}")
+        if content is None or not content.startswith(key.encode()):
+            return None
+        left: _Left = pickle.loads(content.removeprefix(key.encode()))  # only this user can write it
+        place = self.place_of(key)
+        try:
+            whole = all(hash_of(place / name) == digest for name, digest in left.files.items())
+        except OSError:
+            return None
+        return left if whole else None
+
+
+class _Left(NamedTuple):
+    """What a cell left, pickled, and the SHA-256 of its files by their paths in its folder."""
+
+    pickled: bytes
+    files: dict[str, str]
+
+
+@contextmanager
+def kept_cells(place: Path) -> Iterator[Kept]:
+    """The kept cells of the campaign whose result goes to a place; they go when all went well."""
+    place = settled(place)
+    folder = place.with_name(f"{place.name}.unfinished")
+    kept = Kept(folder, FileLock(folder / _LOCK, timeout=0))
+    with parents_of(place):
+        try:
+            yield kept
+        except BaseException:
+            kept.end(is_done=False)
+            raise
+        kept.end(is_done=True)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a member of the folder is what this module puts there."""
+    if path.is_symlink():
+        return False
+    is_cell = _KEY.fullmatch(path.stem) is not None
+    if path.is_dir():
+        return (is_cell and not path.suffix) or _LEFTOVER.fullmatch(path.name) is not None
+    return path.name == _LOCK or (is_cell and path.suffix == _SUFFIX)
+
+
+def _copy(path: Path, place: Path) -> None:
+    """The file in another place of the disk, without its bytes where the disk can do that."""
+    try:
+        os.link(path, place)
+    except OSError:
+        shutil.copyfile(path, place)

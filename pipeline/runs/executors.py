@@ -1,0 +1,255 @@
+"""Who works off the cells of a campaign: this process, others on this machine, a Dask cluster."""
+
+import hashlib
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import cache, partial
+from importlib import resources
+from importlib.metadata import entry_points, version
+from importlib.util import find_spec
+from multiprocessing import active_children, get_context, parent_process
+from pathlib import Path
+from threading import Thread
+from typing import Any, NamedTuple
+
+from threadpoolctl import threadpool_limits
+
+from recorders.errors import BadInput
+from replay.engine.compiling.compile import use_cores
+
+# With fewer runs, processes take longer to begin than they save.
+PAYING_RUNS = 1000
+PACKAGES = ("recorders", "replay", "pipeline")
+
+
+class Team(NamedTuple):
+    """Workers that are there.
+
+    Attributes:
+        executor: hands work to them.
+        workers: how many work at once.
+        sees: of workers that may be on other machines, whether all of them see these files as this
+            process does; None on this machine, where they may write files too.
+        lost: what a future raises whose worker died.
+    """
+
+    executor: Executor
+    workers: int
+    sees: Callable[[Sequence[Path]], bool] | None = None
+    lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
+
+
+# Begins a team, and ends it.
+Crew = Callable[[], AbstractContextManager[Team]]
+
+
+def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
+    """Who works on so many runs: whom the options ask for, else processes on all cores if that pays.
+
+    Raises BadInput where both options are given.
+    """
+    if scheduler is not None and workers is not None:
+        raise BadInput(
+            f"--workers {workers} --scheduler {scheduler}: a scheduler has its own workers; give one "
+            "of the two options"
+        )
+    if scheduler is not None:
+        return dask(scheduler)
+    if workers is None:
+        workers = os.cpu_count() or 1 if runs >= PAYING_RUNS else 1
+    return here if workers == 1 else processes(workers)
+
+
+def of_executor(executor: Executor) -> Crew:
+    """An executor that is there; it is given as much work at a time as there are cores."""
+
+    @contextmanager
+    def begin() -> Iterator[Team]:
+        yield Team(executor, os.cpu_count() or 1)
+
+    return begin
+
+
+class Here(Executor):
+    """Does the work when it is submitted, in the calling thread."""
+
+    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """What the work gave, or raised if it is no interrupt."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(work(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def here() -> Iterator[Team]:
+    """Nobody but the calling process, whose replay uses all cores."""
+    yield Team(Here(), 1)
+
+
+@contextmanager
+def threads() -> Iterator[Team]:
+    """Threads of the calling process, one for each core: for work whose kernels run side by side."""
+    count = os.cpu_count() or 1
+    with ThreadPoolExecutor(count) as pool:
+        yield Team(pool, count)
+
+
+def processes(count: int) -> Crew:
+    """So many processes on this machine, each on one core; they end with this one, however that ends."""
+
+    @contextmanager
+    def begin() -> Iterator[Team]:
+        others = set(active_children())
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
+        try:
+            yield Team(pool, count)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in set(active_children()) - others:
+                worker.terminate()
+            raise
+        pool.shutdown()
+
+    return begin
+
+
+def _begin_worker() -> None:
+    """One core for each worker; an interrupt is the parent's to deal with, and its end theirs too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_cores(1)
+    threadpool_limits(1)
+    parent = parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=follow, daemon=True).start()
+
+
+def dask(scheduler: str) -> Crew:
+    """The workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
+
+    `local:N` begins N on this machine, which no other can reach. Raises BadInput when they are to begin
+    where no scheduler answers, its workers have other code than this process, or Dask is missing.
+    """
+
+    @contextmanager
+    def begin() -> Iterator[Team]:
+        try:
+            from dask import config
+            from distributed import Client, KilledWorker
+        except ImportError:
+            mend = "pip install 'fuselog[dask]'"
+            raise BadInput(f"--scheduler {scheduler}: Dask is not installed; {mend}") from None
+        for name in [each for each in logging.root.manager.loggerDict if each.startswith("distributed")]:
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is raised as well
+        with ExitStack() as stack:
+            address = scheduler
+            if scheduler.startswith("local:"):
+                address = stack.enter_context(_local_cluster(scheduler))
+            try:
+                client = stack.enter_context(Client(address, timeout=10))
+            except (OSError, ValueError) as error:
+                raise BadInput(
+                    f"--scheduler {scheduler}: no scheduler answers there ({error}); start one, or "
+                    "give another address"
+                ) from None
+            _check_code(scheduler, client)
+            workers = sum(client.nthreads().values())
+            sees = None if scheduler.startswith("local:") else partial(_all_see, client)
+            stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
+            yield Team(client.get_executor(pure=False), workers, sees, (KilledWorker,))
+
+    return begin
+
+
+def _local_cluster(scheduler: str) -> Any:
+    """Workers on this machine alone, of one thread each."""
+    from distributed import LocalCluster
+
+    count = scheduler.removeprefix("local:")
+    if not count.isdecimal() or int(count) < 1:
+        raise BadInput(f"--scheduler {scheduler}: give local:N with a number of workers N from 1 on")
+    return LocalCluster(
+        n_workers=int(count),
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+
+
+def _check_code(scheduler: str, client: Any) -> None:
+    """Raise BadInput unless there are workers, all with the code of this process."""
+    try:
+        there = client.run(version_of_code)
+    except ImportError as error:
+        raise BadInput(
+            f"--scheduler {scheduler}: its workers lack fuselog ({error}); install it there"
+        ) from error
+    if not there:
+        raise BadInput(f"--scheduler {scheduler}: has no workers; start some")
+    for worker, found in there.items():
+        if found != version_of_code():
+            raise BadInput(
+                f"--scheduler {scheduler}: worker {worker} has another version of the code; install "
+                "the same there"
+            )
+
+
+def _all_see(client: Any, files: Sequence[Path]) -> bool:
+    """Whether all workers see files as this process does."""
+    own = states_of(files)
+    return not files or all(found == own for found in client.run(states_of, files).values())
+
+
+def states_of(files: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Size and time of the last change of files; None of one that is not seen."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            state = file.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((state.st_size, state.st_mtime_ns))
+    return found
+
+
+@cache
+def version_of_code() -> str:
+    """A hash of all that cells go through: our code, that of plug-ins, the versions of libraries."""
+    digest = hashlib.sha256()
+    for package in PACKAGES:
+        with resources.as_file(resources.files(package)) as folder:
+            _add_sources(digest, folder)
+    groups = [group for group in entry_points().groups if group.startswith("fuselog.")]
+    entries = [entry for group in groups for entry in entry_points(group=group)]
+    modules = {entry.module.partition(".")[0] for entry in entries} - {*PACKAGES}
+    for spec in filter(None, map(find_spec, sorted(modules))):
+        for place in spec.submodule_search_locations or ():
+            _add_sources(digest, Path(place))
+        if spec.origin and not spec.submodule_search_locations:
+            digest.update(Path(spec.origin).read_bytes())
+    digest.update(" ".join(version(name) for name in ("numpy", "scipy", "llvmlite", "numba")).encode())
+    return digest.hexdigest()
+
+
+def _add_sources(digest: "hashlib._Hash", folder: Path) -> None:
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())

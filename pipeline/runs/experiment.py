@@ -1,0 +1,364 @@
+"""Experiments: scenario (or real data, or logs) x estimators x metrics, one TOML file each."""
+
+import os
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Self
+
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+
+from pipeline.output.results import Outcome, Result, result_folder, write_outcome
+from pipeline.runs.checkpoints import Kept, kept_cells
+from pipeline.runs.ensemble import Progress, no_progress
+from pipeline.runs.executors import Crew
+from pipeline.runs.settings import parameters_by_label
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters, build, describe, merge
+from recorders.parsing import read_toml
+from recorders.recording import Recorder
+from recorders.registry import available, foreign_code, load
+from replay.engine.replaying.estimator import configure
+from replay.engine.replaying.late import parse_late
+from replay.judging.metrics.measuring import find_metrics
+
+SHIPPED = resources.files("fuselog_data")
+
+
+class Record(Parameters):
+    """What to simulate: a scenario by name or TOML file, and what differs from its defaults."""
+
+    scenario: str
+    parameters: dict[str, Any] = {}
+
+
+class Import(Parameters):
+    """What to import; the data's place comes from --data."""
+
+    source: str
+    parameters: dict[str, Any] = {}
+
+
+class Logs(Parameters):
+    """Logs to replay, one run each: files or patterns such as `drive-*.mcap`.
+
+    They count from the folder of the experiment's file; estimates that lie beside the logs are left out.
+    """
+
+    files: list[str] = []
+
+
+class Experiment(Parameters):
+    """One experiment as its TOML file says it.
+
+    The runs are recorded from a scenario, imported, or logs that are there. `estimators` maps a label to
+    parameters; a parameter `kind` names the estimator where the label is not its name. `metrics` are all
+    registered ones where none is named. `arrival_order` and `late` are as in `fuselog replay`. `options`
+    are the study's own.
+    """
+
+    title: str
+    study: str = "localization"
+    seed: Annotated[int, Field(ge=0)] = 0
+    runs: PositiveInt = 1
+    record: Record | None = None
+    import_: Import | None = Field(None, alias="import")
+    logs: Logs | None = None
+    estimators: dict[str, dict[str, Any]] = {}
+    metrics: list[str] = []
+    gap_limit_s: NonNegativeFloat = 0.2
+    arrival_order: bool | None = None
+    late: str | None = None
+    options: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        if sum(each is not None for each in (self.import_, self.record, self.logs)) > 1:
+            raise ValueError("give exactly one of [record], [import] and [logs]")
+        if (self.import_ or self.logs) and (self.runs, self.seed) != (1, 0):
+            raise ValueError(
+                "data that are imported or given as logs have no seed, and as many runs as there are; "
+                "leave out seed and runs"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_an_order(self) -> Self:
+        if self.late is not None:
+            parse_late(self.late, arrival_order=bool(self.arrival_order))
+        if self.arrival_order and self.study != "localization":
+            raise ValueError(
+                f"study {self.study} replays in the order of the stamps; leave out arrival_order and "
+                "late"
+            )
+        return self
+
+    @property
+    def files(self) -> list[Path]:
+        """The logs that are replayed."""
+        return [Path(file) for file in self.logs.files] if self.logs else []
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where and how an experiment runs.
+
+    Attributes:
+        folder: what is written goes there.
+        place: where the folder will be when it is whole.
+        data: what is imported.
+        logs: of how many runs the logs are kept.
+        draws: whether the first run's timeline is drawn.
+        errors: whether every single error is kept too.
+        options: of the study's own type.
+        progress: is told how it goes.
+        crew: who works off the cells of a campaign; by default this process.
+        kept: where finished cells are kept until all are.
+    """
+
+    folder: Path
+    place: Path
+    data: Path | None = None
+    logs: int = 20
+    draws: bool = True
+    errors: bool = False
+    options: Any = None
+    progress: Progress = no_progress
+    crew: Crew | None = None
+    kept: Kept | None = None
+
+
+@dataclass(frozen=True)
+class Study:
+    """A registered study does an experiment's work.
+
+    `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
+    replays by `pipeline.runs.campaigns` alone, `is_campaign` says so: others may work on parts of the
+    runs.
+    """
+
+    summary: str
+    run: Callable[[Experiment, Setting], Outcome]
+    options: type[Parameters] = Parameters
+    is_campaign: bool = False
+
+
+def shipped(kind: str) -> dict[str, Path]:
+    """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
+    with resources.as_file(SHIPPED / kind) as folder:
+        return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+class Stated(NamedTuple):
+    """What an experiment is before settings go over it.
+
+    Attributes:
+        name: what it is called.
+        source: what it was read from, as messages name it.
+        values: its entries.
+        folder: what its files count from.
+    """
+
+    name: str
+    source: str
+    values: Mapping[str, Any]
+    folder: Path
+
+    @property
+    def labels(self) -> Collection[str]:
+        """The labels of its estimators."""
+        return self.with_settings({}, {}).estimators
+
+    def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
+        """The experiment with settings and then `over` over it; see `load_experiment`."""
+        where = f"experiment {self.source}"
+        own = _settings_of_experiment(build(Experiment, self.values, where), settings)
+        experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        if experiment.logs is None:
+            return experiment
+        files = _found(experiment.logs.files, self.folder, where)
+        return experiment.model_copy(update={"logs": Logs(files=files)})
+
+
+def load_experiment(
+    name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
+) -> tuple[str, Experiment]:
+    """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
+
+    A setting goes to the entry of the experiment or to the estimator that its first word names, else to
+    the scenario's or importer's parameters, else to all estimators that have such a parameter:
+    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`.
+    """
+    stated = read_experiment(name)
+    return stated.name, stated.with_settings(settings, over)
+
+
+def read_experiment(name: str) -> Stated:
+    """An experiment by its shipped name or its TOML file, without settings."""
+    known = shipped("experiments")
+    if not name.endswith(".toml") and name not in known:
+        raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = known.get(name, Path(name))
+    return Stated(path.stem, name, read_toml(path), path.parent)
+
+
+def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
+    """The experiment that replays logs through estimators as they are.
+
+    Raises BadInput where no estimator is named.
+    """
+    if not labels:
+        raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
+    title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"
+    values = {
+        "title": title,
+        "logs": {"files": [str(log) for log in logs]},
+        "estimators": {label: {} for label in labels},
+    }
+    return Stated(title, str(logs[0]), values, Path())
+
+
+def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
+    """The files that patterns stand for, each once; raises BadInput where one stands for none."""
+    files: dict[str, None] = {}
+    for pattern in patterns:
+        place = Path(os.path.normpath(folder / pattern))
+        root = Path(place.anchor)
+        found = [place] if place.is_file() else sorted(root.glob(str(place.relative_to(root))))
+        logs = [str(each) for each in found if len(found) == 1 or not each.match("*.estimates.mcap")]
+        if not logs:
+            raise BadInput(
+                f"{where}: no log has the name {place}; give files, or patterns such as *.mcap"
+            )
+        files |= dict.fromkeys(logs)
+    return list(files)
+
+
+def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings where they belong; raises BadInput where one belongs nowhere."""
+    entries = {each.alias or name for name, each in Experiment.model_fields.items()}
+    part, names = _parameters_of_source(experiment)
+    own = parameters_by_label(experiment.estimators) if settings else {}
+    placed: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in entries:
+            place: dict[str, Any] = {key: value}
+        elif key in experiment.estimators:
+            place = {"estimators": {key: value}}
+        elif key in names:
+            place = {part: {"parameters": {key: value}}}
+        elif takers := [label for label, known in own.items() if key in known]:
+            of_all = {"estimators": {label: {key: value} for label in takers}}
+            placed = merge(of_all, placed)  # what is set for one estimator counts more
+            continue
+        else:
+            known = sorted(names.union(entries, own, *own.values()))
+            raise BadInput(
+                f"--set {key}: no such entry of the experiment, parameter of what it records, "
+                f"estimator or parameter of its estimators; {choices(key, known)}"
+            )
+        placed = merge(placed, place)
+    return placed
+
+
+def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
+    """Which part of an experiment says where its data come from, and the parameters that this has."""
+    if experiment.import_:
+        part, recorder = "import", experiment.import_.source
+    elif experiment.record:
+        part, recorder = "record", load_scenario(experiment.record.scenario)[0]
+    else:
+        return "", set()
+    described = describe(load("recorders", recorder, Recorder).parameters)
+    return part, {each.name.partition(".")[0] for each in described}
+
+
+def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
+    """A scenario by its registered name, its shipped file or a TOML file: recorder, parameters, label.
+
+    A scenario file has `recorder` and a table `parameters`.
+    """
+    files, recorders = shipped("scenarios"), available("recorders")
+    if name in recorders:
+        return name, {}, name
+    if not name.endswith(".toml") and name not in files:
+        known = [*recorders, *files]
+        raise BadInput(f"no scenario '{name}', nor is it a .toml file; {choices(name, known)}")
+    path = files.get(name, Path(name))
+    values = read_toml(path)
+    recorder, parameters = values.get("recorder"), values.get("parameters", {})
+    if not isinstance(recorder, str) or not isinstance(parameters, dict):
+        raise BadInput(
+            f'{path}: a scenario file needs recorder = "NAME" and a [parameters] table; add them'
+        )
+    return recorder, parameters, path.stem
+
+
+def require_campaign(experiment: Experiment, mend: str) -> None:
+    """Raise BadInput where an experiment's study replays all runs together, in one process."""
+    study: Study = load("studies", experiment.study, Study)
+    if not study.is_campaign:
+        raise BadInput(
+            f"experiment '{experiment.title}': its study, {experiment.study}, replays all runs "
+            f"together, in one process; {mend}"
+        )
+
+
+def run_experiment(
+    name: str,
+    experiment: Experiment,
+    folder: Path,
+    *,
+    data: Path | None = None,
+    logs: int = 20,
+    errors: bool = False,
+    crew: Crew | None = None,
+    progress: Progress = no_progress,
+) -> Result:
+    """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
+    if experiment.import_ and data is None:
+        raise BadInput(f"experiment {name} needs real data: give its folder with --data")
+    if data is not None and experiment.record:
+        raise BadInput(f"experiment {name} imports nothing; leave out --data")
+    if experiment.logs is not None:
+        if data is not None:
+            place = str(data / "*.mcap") if data.is_dir() else str(data)
+            files = _found([place], Path(), f"experiment {name}, --data {data}")
+            experiment = experiment.model_copy(update={"logs": Logs(files=files)})
+        if not experiment.files:
+            raise BadInput(f"experiment {name} replays logs: name them in [logs], or with --data")
+        experiment = experiment.model_copy(update={"runs": len(experiment.files)})
+    study: Study = load("studies", experiment.study, Study)
+    options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
+    find_metrics(experiment.metrics)
+    with (
+        kept_cells(folder) as kept,
+        result_folder(folder) as part,
+        foreign_code(f"study {experiment.study}"),
+        warnings.catch_warnings(),
+    ):
+        # of runs that all failed there is no mean: a null in the results, not a warning
+        warnings.filterwarnings("ignore", "Mean of empty slice|All-NaN", RuntimeWarning)
+        setting = Setting(
+            folder=part,
+            place=folder,
+            data=data,
+            logs=logs,
+            errors=errors,
+            options=options,
+            progress=progress,
+            crew=crew,
+            kept=kept,
+        )
+        outcome = study.run(experiment, setting)
+        settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
+        if data is not None:
+            settings["data"] = str(data)
+        settings["parameters"] = outcome.parameters or {
+            label: parameters.model_dump(mode="json", exclude_none=True)
+            for label, (_, parameters) in configured.items()
+        }
+        return write_outcome(part, name, settings, outcome)

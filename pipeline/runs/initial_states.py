@@ -1,0 +1,279 @@
+"""Where a replay starts that does not begin at the log's own prior.
+
+An estimator with a prior begins there. Where the replayed span begins later, that prior is of another
+time, and the state must come from elsewhere: from the truth, or from what an earlier replay estimated.
+The estimator is handed a prior made of that, and need not know.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput, choices
+from recorders.log import Clock, Stream, make_stream, open_log, schemas
+from replay.engine.replaying.estimator import Bound
+from replay.engine.replaying.late import Late, parse_late
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.engine.vectors.components import match_components, match_tangent, stated_components
+from replay.engine.vectors.tangent import tangent_components, truth_at
+from replay.judging.errors.evaluation import split_topic
+
+Floats = NDArray[np.float64]
+# A run's prior at a time in ns, from an estimator's label and the log's own prior.
+Origin = Callable[[str, Stream, int], Stream]
+Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
+
+
+def order_of(
+    *, arrival_order: bool, late: str | None, origins: Sequence[str | Path] = ()
+) -> tuple[Clock, Late | None]:
+    """The clock that orders a replay, and what is done about late messages.
+
+    Raises BadInput where `late` is none of the ways, or makes no sense with the others.
+    """
+    found = None if late is None else parse_late(late, arrival_order=arrival_order)
+    if found is not None and origins:
+        raise BadInput(
+            f"--late {late} --start-from {origins[0]}: a span in the order of arrival does not begin "
+            "at one "
+            "stamp, at which a state could be known; leave out one of the two"
+        )
+    return "log_time" if arrival_order else "publish_time", found
+
+
+def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:
+    """The part of a run between two times in seconds, by the clock that orders the replay.
+
+    Raises BadInput where there is nothing in it.
+    """
+    if start_s is not None and end_s is not None and start_s >= end_s:
+        raise BadInput(f"--start {start_s:g} --end {end_s:g}: the end must be after the start")
+    if start_s is None and end_s is None:
+        return source
+    zero_ns = source.zero_ns(order)
+    start_ns, end_ns = (
+        None if time_s is None else zero_ns + round(time_s * 1e9) for time_s in (start_s, end_s)
+    )
+    first_ns, last_ns = source.extent(order)
+    if (start_ns is not None and start_ns > last_ns) or (end_ns is not None and end_ns < first_ns):
+        first_s, last_s = ((time_ns - zero_ns) * 1e-9 for time_ns in (first_ns, last_ns))
+        raise BadInput(
+            f"{source.name}: has no messages in this span; the log goes from {first_s:g} to {last_s:g} s"
+        )
+    return replace(source, start_ns=start_ns, end_ns=end_ns)
+
+
+def origins_of(
+    sources: Sequence[Source],
+    origins: Sequence[str | Path],
+    sigmas: Mapping[str, float],
+    order: Clock,
+    gap_limit_s: float,
+) -> list[Origin]:
+    """What each run starts from; none where that is not stated.
+
+    Args:
+        sources: the runs.
+        origins: "truth", or the estimates log of an earlier replay of each run.
+        sigmas: standard deviations by component, for the truth; see `from_truth`.
+        order: the clock of the replay.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Raises BadInput where the replay begins with the runs, or an estimates log is of another run.
+    """
+    if origins and sources[0].start_ns is None:
+        raise BadInput(f"--start-from {origins[0]}: needs a time; give --start too")
+    if sigmas and tuple(origins) != ("truth",):
+        name, sigma = next(iter(sigmas.items()))
+        raise BadInput(f"--start-sigma {name}={sigma:g}: is for --start-from truth")
+    if not origins:
+        return []
+    if tuple(origins) == ("truth",):
+        return [from_truth(source, order, gap_limit_s, sigmas) for source in sources]
+    if len(origins) != len(sources):
+        raise BadInput(
+            f"{len(sources)} logs and {len(origins)} --start-from; give truth, or one estimates log each"
+        )
+    opened = [LogSource(open_log(origin)) for origin in origins]
+    for estimates, source in zip(opened, sources, strict=True):
+        check_same_run(estimates, source)
+    return [from_estimates(estimates) for estimates in opened]
+
+
+def check_same_run(estimates: Source, source: Source) -> None:
+    """Raise BadInput where estimates are of another run than the log's."""
+    of, run = estimates.run, source.run
+    if of and run and replace(of, notes={}) != replace(run, notes={}):
+        raise BadInput(
+            f"{estimates.name}: these are estimates of {of.scenario}, seed {of.seed}, run {of.run}; "
+            f"{source.name} is {run.scenario}, seed {run.seed}, run {run.run}, or has other parameters"
+        )
+
+
+def start_from(
+    bound: Bound, sources: Sequence[Source], origins: Sequence[Origin], order: Clock
+) -> Bound:
+    """The estimator, begun from each run's origin where that run's span begins after its prior.
+
+    Raises BadInput where an origin has no state for a prior at the beginning of the span, or the log no
+    prior that it stands for.
+    """
+    label = bound.name.partition("/")[0]
+    for topic in bound.priors.keys() - sources[0].topics.keys():
+        raise BadInput(
+            f"{sources[0].name}: estimator {label} has no prior in this log ({topic}) that the "
+            "state could replace; leave out --start-from: it begins at the first measurements of the "
+            "span"
+        )
+    priors = {
+        topic: gather(
+            [
+                _prior(source, source.read([topic])[topic], origin, label, order)
+                for source, origin in zip(sources, origins, strict=True)
+            ]
+        )
+        for topic in bound.priors
+    }
+    return replace(bound, given=priors)
+
+
+def _prior(source: Source, prior: Stream, origin: Origin, label: str, order: Clock) -> Stream:
+    is_late = source.start_ns is not None and len(prior) and prior.times(order)[0] < source.start_ns
+    return origin(label, prior, source.start_ns) if is_late and source.start_ns else prior
+
+
+def from_truth(source: Source, order: Clock, gap_limit_s: float, sigmas: Mapping[str, float]) -> Origin:
+    """Start a run from its truth.
+
+    The covariance is that of the log's prior; `sigmas` are standard deviations of some of its components
+    in their place, which are then correlated with nothing.
+    """
+    return partial(_true_state, source, order, gap_limit_s, sigmas)
+
+
+def from_estimates(estimates: Source) -> Origin:
+    """Start a run from mean and covariance that an earlier replay of it estimated last before.
+
+    It is the estimate of the same label, else the only one that has the prior's components.
+    """
+    return partial(_estimated_state, estimates)
+
+
+def _true_state(
+    source: Source,
+    order: Clock,
+    gap_limit_s: float,
+    sigmas: Mapping[str, float],
+    label: str,  # noqa: ARG001
+    prior: Stream,
+    start_ns: int,
+) -> Stream:
+    topic = f"{prior.topic.rpartition('/')[0]}/truth"
+    if topic not in source.topics:
+        raise BadInput(f"{source.name}: no topic {topic} to start from; give --start-from ESTIMATES")
+    truth = source.read([topic])[topic]
+    where = f"{source.name}: topic {topic}, to start from"
+    components = _components(prior, source.name)
+    columns = match_components(truth.metadata, components, where)
+    rows = np.argsort(truth.times(order), kind="stable") if len(truth) else np.empty(0, np.int64)
+    timed = replace(
+        truth,
+        publish_time_ns=truth.times(order)[rows],
+        columns={"state": truth["state"][rows].reshape(len(rows), -1)[:, columns]},
+    )
+    mean = truth_at(timed, np.array([start_ns]), list(components.values()), gap_limit_s)
+    if not np.isfinite(mean).all():
+        raise BadInput(
+            f"{where}: is not known within {gap_limit_s:g} s of the start; give another --start, a "
+            "longer --gap-limit or --start-from ESTIMATES"
+        )
+    covariance = _with_sigmas(prior, components, sigmas)
+    return _made(prior, start_ns, mean, covariance)
+
+
+def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[str, float]) -> Floats:
+    """The covariance (t, t) of a prior with some of its components' standard deviations replaced."""
+    names = [name for name, _ in tangent_components(list(components), list(components.values()))]
+    covariance = prior["covariance"][0].reshape(len(names), len(names)).copy()
+    for name, sigma in sigmas.items():
+        if name not in names:
+            raise BadInput(
+                f"--start-sigma {name}: {prior.topic} has no such component; {choices(name, names)}"
+            )
+        own = names.index(name)
+        covariance[own, :] = covariance[:, own] = 0.0
+        covariance[own, own] = sigma**2
+    return covariance
+
+
+def _estimated_state(estimates: Source, label: str, prior: Stream, start_ns: int) -> Stream:
+    components = _components(prior, estimates.name)
+    topic = _estimate_topic(estimates, label, prior, components)
+    stream = estimates.read([topic])[topic]
+    where = f"{estimates.name}: topic {topic}, to start from"
+    columns = match_components(stream.metadata, components, where)
+    tangent = match_tangent(stream.metadata, components, where)
+    times_ns = stream.publish_time_ns
+    # what has the stamp of the start is replayed, and must not be in the prior already
+    before = int(np.searchsorted(times_ns, start_ns, side="left"))
+    if before == 0:
+        raise BadInput(f"{where}: has no estimate before the start; give a later --start")
+    last_ns = int(times_ns[before - 1])
+    is_over = before == len(stream)
+    if is_over and start_ns - last_ns > np.diff(times_ns).max(initial=0):
+        raise BadInput(
+            f"{where}: ends {(start_ns - last_ns) * 1e-9:g} s before the start; give an earlier --start"
+        )
+    mean, covariance = stream["mean"][before - 1], stream["covariance"][before - 1]
+    size = round(len(covariance) ** 0.5)
+    block = covariance.reshape(size, size)[np.ix_(tangent, tangent)]
+    return _made(prior, last_ns, mean[None, columns], block)
+
+
+def _estimate_topic(estimates: Source, label: str, prior: Stream, components: Mapping[str, Any]) -> str:
+    """The estimate to begin a prior from: of the same thing, with all its components."""
+    case = prior.topic.rpartition("/")[0].removeprefix("/")
+    found = [
+        name
+        for name, topic in estimates.topics.items()
+        if name.startswith("/estimates/")
+        and topic.schema_name == schemas.GAUSSIAN_ESTIMATE.full_name
+        and split_topic(name)[1] == case
+        and components.keys() <= set(topic.metadata.get("components", "").split(","))
+    ]
+    own = [name for name in found if split_topic(name)[0] == label] or found
+    if len(own) != 1:
+        listed = f"has several: {', '.join(own)}" if own else f"has {', '.join(estimates.topics)}"
+        raise BadInput(
+            f"{estimates.name}: one estimate of {', '.join(components)} is needed to start {label} from "
+            f"instead of {prior.topic}; the log {listed}"
+        )
+    return own[0]
+
+
+def _components(prior: Stream, name: str) -> dict[str, Any]:
+    """Names and kinds of a prior's components; raises BadInput where it names none."""
+    found = stated_components(prior.metadata, {}, f"{name}: topic {prior.topic}")
+    if not found:
+        raise BadInput(
+            f"{name}: topic {prior.topic} names no components, so that no state can replace it; "
+            "state them in the channel's metadata"
+        )
+    return found
+
+
+def _made(prior: Stream, time_ns: int, mean: Floats, covariance: Floats) -> Stream:
+    return make_stream(
+        prior.topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        [time_ns],
+        metadata=prior.metadata,
+        mean=mean,
+        covariance=covariance.reshape(1, -1),
+    )

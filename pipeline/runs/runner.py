@@ -1,0 +1,200 @@
+"""What every study does: obtain runs, replay and judge them, keep the first logs, draw the first run.
+
+A study keeps what is its own: cases, claims, tables, figures.
+"""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.output.results import ErrorTables
+from pipeline.runs.ensemble import (
+    Part,
+    Pass,
+    Replayed,
+    Settings,
+    estimates_metadata,
+    hash_files,
+    hash_streams,
+    record_ensemble,
+    replay_ensemble,
+    replay_parts,
+)
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.initial_states import order_of
+from recorders.errors import BadInput
+from recorders.log import LogWriter, RunMetadata, open_log
+from recorders.parameters import merge
+from recorders.recording import import_run
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.sources import LogSource, MemorySource, Source, is_sensed, memory_source
+from replay.judging.judge import Judge
+
+
+@dataclass(frozen=True)
+class Runner:
+    """The runs of an experiment, in its setting."""
+
+    experiment: Experiment
+    setting: Setting
+
+    def obtain(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        seed: int | None = None,
+        first_run: int = 0,
+        runs: int | None = None,
+    ) -> list[MemorySource]:
+        """Runs in memory: simulated, imported, or those of the logs.
+
+        Args:
+            parameters: what differs in those of the scenario.
+            seed: another than the experiment's.
+            first_run: the number of the first run.
+            runs: how many, by default those of the experiment.
+
+        Raises BadInput where the experiment does not say what to record or to import.
+        """
+        experiment, setting = self.experiment, self.setting
+        if experiment.import_ and setting.data:
+            source = experiment.import_
+            return [memory_source(*import_run(source.source, setting.data, source.parameters))]
+        if experiment.logs:
+            files = experiment.files[first_run:][:runs]
+            return [_in_memory(LogSource(open_log(file))) for file in files]
+        if not experiment.record:
+            raise BadInput(
+                f"experiment '{experiment.title}': has no data; give one of the tables [record], "
+                "[import] and [logs]"
+            )
+        recorder, values, _ = load_scenario(experiment.record.scenario)
+        return record_ensemble(
+            recorder,
+            merge(merge(values, experiment.record.parameters), parameters or {}),
+            experiment.seed if seed is None else seed,
+            experiment.runs if runs is None else runs,
+            setting.progress,
+            first_run=first_run,
+            all_runs=experiment.runs,
+        )
+
+    def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:
+        """What the experiment's estimators, or others, make of runs; all in memory."""
+        return replay_ensemble(
+            sources,
+            self.experiment.estimators if estimators is None else estimators,
+            gap_limit_s=self.experiment.gap_limit_s,
+            progress=self.setting.progress,
+        )
+
+    def keep(
+        self,
+        sources: Sequence[MemorySource],
+        outputs: Mapping[str, Ragged],
+        folder: str = "",
+        *,
+        drawn: str | None = "",
+    ) -> None:
+        """Write logs and estimates of the first runs to a folder, and the first timeline to another.
+
+        `drawn` is None where no timeline is wanted. The other runs can be recorded again from the seed.
+        """
+        count = min(self.setting.logs, len(sources))
+        for run in self.setting.progress(range(count), "writing logs", count):
+            log, estimates = self._places(folder, run)
+            _write_log(sources[run], log)
+            metadata = estimates_metadata(sources[run], self.experiment.estimators, estimates, log)
+            with LogWriter(estimates, metadata) as writer:
+                writer.write([ragged.of_run(run) for ragged in outputs.values()])
+        if drawn is not None:
+            self.draw(sources, outputs, drawn)
+
+    def draw(
+        self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
+    ) -> None:
+        """Draw the first run into a folder."""
+        from replay.timeline.show import show
+
+        place = self.setting.folder / folder
+        place.mkdir(parents=True, exist_ok=True)
+        of_run = {topic: gather([rows.of_run(0)]) for topic, rows in outputs.items()}
+        judged = Judge(sources[:1], {}, gap_limit_s=self.experiment.gap_limit_s).add(of_run)
+        show(sources[0], of_run, judged.errors, save=place / "timeline.rrd")
+
+    def run(self) -> Replayed:
+        """All of it: the experiment's runs, replayed in memory, and the first ones kept."""
+        replayed = self.replay(self.obtain())
+        self.keep(replayed.sources, replayed.outputs)
+        return replayed
+
+    def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
+        """The same for every case, given by name and what differs in the scenario's parameters.
+
+        What is kept goes to a folder of the case, but the first case's timeline is the experiment's.
+        """
+        for number, (name, differing) in enumerate(cases.items()):
+            replayed = self.replay(self.obtain(differing))
+            self.keep(replayed.sources, replayed.outputs, name, drawn=name if number else "")
+            yield name, replayed
+
+    def judge(self, now: slice) -> Pass:
+        """Some of the runs in one streamed pass; the first ones' logs and timeline go to the folder."""
+        experiment, setting = self.experiment, self.setting
+        order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
+        places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
+        sources: Sequence[Source]
+        if experiment.logs:
+            files = experiment.files[now]
+            sources = [LogSource(open_log(file)) for file in files]
+            input_sha256 = hash_files(files)
+            estimates = [
+                (path, self._as_seen_from(path, file))
+                for (_, path), file in zip(places, files, strict=False)
+            ]
+        else:
+            recorded = self.obtain(first_run=now.start, runs=now.stop - now.start)
+            for source, (log, _) in zip(recorded, places, strict=False):
+                _write_log(source, log)
+            sources, estimates = recorded, [(path, log) for log, path in places]
+            input_sha256 = hash_streams(recorded)
+        part = Part(sources, now.start, len(sources) == experiment.runs, estimates)
+        with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
+            done = replay_parts(
+                [part],
+                experiment.estimators,
+                gap_limit_s=experiment.gap_limit_s,
+                metrics=experiment.metrics,
+                order=order,
+                late=late,
+                save=setting.folder / "timeline.rrd" if setting.draws else None,
+                on_errors=errors.add if errors else None,
+                progress=setting.progress,
+            )
+        done.input_sha256 = input_sha256
+        return done
+
+    def _as_seen_from(self, path: Path, log: Path) -> Path:
+        """Where a log seems to be from a file of the folder, so that it is there when that has moved."""
+        there = self.setting.place / path.relative_to(self.setting.folder)
+        return path.parent / os.path.relpath(log.resolve(), there.resolve().parent)
+
+    def _places(self, folder: str, run: int) -> tuple[Path, Path]:
+        """Where a run's log and its estimates go."""
+        name, place = f"run-{run:04d}.mcap", self.setting.folder / folder
+        return place / "logs" / name, place / "estimates" / name
+
+
+def _in_memory(source: LogSource) -> MemorySource:
+    """A log's streams, but for estimates and what is no columns."""
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    topics = [topic for topic in source.topics if is_sensed(source, topic)]
+    return MemorySource(source.read(topics), run, source.name)
+
+
+def _write_log(source: MemorySource, path: Path) -> None:
+    with LogWriter(path, source.run) as writer:
+        writer.write(source.streams.values())

@@ -1,0 +1,87 @@
+"""Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from recorders.errors import BadInput, choices
+from recorders.parameters import merge, parse_settings
+from recorders.parsing import read_toml
+from replay.engine.replaying.estimator import Estimator, find_estimator
+
+# Parameters of estimators that have an option of their own.
+OPTIONS = {"model": "--model", "every_s": "--every"}
+
+
+def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label, from the tables of a TOML file; none without a file.
+
+    Raises BadInput where the file has settings of another estimator.
+    """
+    tables = {} if path is None else read_toml(path)
+    for label, table in tables.items():
+        if label not in labels or not isinstance(table, dict):
+            raise BadInput(
+                f"{path}: has settings of {label}, which is not replayed; a settings file has a table "
+                "for each estimator "
+                f"that is replayed: {', '.join(labels)}"
+            )
+    return tables
+
+
+def settings_of_estimators(
+    labels: Sequence[str], texts: Sequence[str], file: Path | None, **options: Any
+) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label: those of a settings file, KEY=VALUE over them, then options.
+
+    `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter; so do
+    options that are not None. Raises BadInput where none has.
+    """
+    base = read_settings(file, labels)
+    given = {key: value for key, value in options.items() if value is not None}
+    settings = parse_settings(texts) | given
+    chosen: dict[str, dict[str, Any]] = {}
+    for label in labels:
+        own = settings.get(label, {})
+        if not isinstance(own, dict):
+            raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
+        chosen[label] = dict(own)
+    known = parameters_by_label({label: {**base.get(label, {}), **chosen[label]} for label in labels})
+    for key in [each for each in settings if each not in chosen]:
+        takers = [label for label in chosen if key in known[label]]
+        if not takers and key in OPTIONS:
+            raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
+        if not takers:
+            names = sorted(set(chosen).union(*known.values()))
+            raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
+        for label in takers:
+            chosen[label].setdefault(key, settings[key])
+    return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
+
+
+def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
+    """The names of the parameters that estimators have, from their settings by label.
+
+    Raises BadInput where there is no such estimator.
+    """
+    names: dict[str, set[str]] = {}
+    for label, settings in estimators.items():
+        kind = settings.get("kind", label)
+        estimator = kind if isinstance(kind, Estimator) else find_estimator(str(kind))[0]
+        names[label] = set(estimator.parameters.model_fields)
+    return names
+
+
+def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
+    """Standard deviations by component, from COMPONENT=SIGMA as an option gives them."""
+    sigmas: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            sigmas[name] = float(value)
+        except ValueError:
+            sigmas[name] = math.nan
+        if not 0 < sigmas[name] < math.inf:
+            raise BadInput(f"{option} {text}: expected COMPONENT=SIGMA with a positive number")
+    return sigmas

@@ -1,0 +1,279 @@
+"""Sweeps: an experiment at many points of its parameters, a grid or samples."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.output.charts import Axis, Chart, Panel, band, curve
+from pipeline.output.results import (
+    MetricValue,
+    Outcome,
+    Result,
+    result_folder,
+    split_metric,
+    write_outcome,
+)
+from pipeline.runs.campaigns import judge_all
+from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.ensemble import Progress, no_progress
+from pipeline.runs.executors import Crew
+from pipeline.runs.experiment import Experiment, Setting
+from recorders.errors import BadInput
+from recorders.parameters import merge, parse_settings
+from replay.engine.replaying.estimator import configure
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import metric_key
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Sampling = Literal["sobol", "random"]
+MOST_POINTS = 100_000
+# Where the middle of the runs lies: nine in ten of them.
+LOW, HIGH = 0.05, 0.95
+# What is drawn, of what a result has; the rest is in the table.
+DRAWN = ("position_rmse_m", "orientation_rmse_deg", "nees", "position_nees", "nis_per_component")
+
+
+class Over(NamedTuple):
+    """A parameter that is swept.
+
+    Attributes:
+        key: as `--set` has it.
+        taken: the values that it takes on a grid.
+        ends: of a range, from which samples are drawn too; None of a list.
+        is_log: whether the range is even in the logarithm.
+    """
+
+    key: str
+    taken: tuple[Any, ...]
+    ends: tuple[float, float] | None = None
+    is_log: bool = False
+
+
+def parse_over(text: str) -> Over:
+    """`KEY=LOW:HIGH:N`, evenly, `KEY=LOW:HIGH:logN` in the logarithm, or a list `KEY=VALUE,VALUE,...`.
+
+    Raises BadInput for anything else.
+
+    >>> parse_over("ekf.sigma_range_m=0.1:10:log3").taken
+    (0.1, 1.0, 10.0)
+    >>> parse_over("robots=1,2,4").taken
+    (1, 2, 4)
+    """
+    key, _, stated = text.partition("=")
+    parts = stated.split(":")
+    if len(parts) == 3:
+        return _range(text, key, parts)
+    return over_of(key, [_value(text, key, each) for each in stated.split(",")])
+
+
+def over_of(key: str, values: Sequence[Any]) -> Over:
+    """A list of values; drawn in the logarithm where they are even in that. BadInput for one twice."""
+    if len({*map(str, values)}) < len(values) or not values:
+        raise BadInput(f"sweep over {key}: give at least one value, and each once")
+    numbers = [each for each in values if isinstance(each, int | float) and each > 0]
+    steps = np.diff(np.log(numbers)) if len(numbers) == len(values) > 2 else np.zeros(0)
+    is_log = len(steps) > 0 and bool(np.allclose(steps, steps[0]))
+    return Over(key, tuple(values), is_log=is_log)
+
+
+def _range(text: str, key: str, parts: Sequence[str]) -> Over:
+    low, high = (_value(text, key, each) for each in parts[:2])
+    count = parts[2].removeprefix("log")
+    is_log = count != parts[2]
+    numbers = all(isinstance(each, int | float) and math.isfinite(each) for each in (low, high))
+    if not numbers or not count.isdecimal() or int(count) < 2 or not low < high or (is_log and low <= 0):
+        raise BadInput(
+            f"--over {text}: give KEY=LOW:HIGH:N with LOW below HIGH and N from 2 on, or logN and LOW "
+            "above 0, or a list of values"
+        )
+    space = np.geomspace if is_log else np.linspace
+    values = tuple(float(f"{each:.12g}") for each in space(low, high, int(count)))
+    return Over(key, values, (float(low), float(high)), is_log)
+
+
+def _value(text: str, key: str, stated: str) -> Any:
+    if not key or not stated:
+        raise BadInput(f"--over {text}: expected KEY=LOW:HIGH:N, KEY=LOW:HIGH:logN or KEY=VALUE,VALUE")
+    found: Any = parse_settings([f"value={stated}"])["value"]
+    return found
+
+
+def points_of(
+    over: Sequence[Over], samples: int | None = None, sampling: Sampling = "sobol", seed: int = 0
+) -> list[dict[str, Any]]:
+    """The points: of the grid, the last parameter changing fastest, or so many samples of the ranges.
+
+    Of a list, a sample takes one. Raises BadInput where there is nothing to sweep, or too much.
+    """
+    keys = [each.key for each in over]
+    if not over or len(set(keys)) < len(keys):
+        raise BadInput("a sweep needs at least one parameter, and each once; give --over KEY=LOW:HIGH:N")
+    count = math.prod(len(each.taken) for each in over) if samples is None else samples
+    if count > MOST_POINTS:
+        raise BadInput(f"the sweep has {count} points; the most are {MOST_POINTS}; give fewer values")
+    if samples is None:
+        return [
+            dict(zip(keys, point, strict=True))
+            for point in itertools.product(*(each.taken for each in over))
+        ]
+    rng = np.random.default_rng(seed)
+    if sampling == "sobol":
+        from scipy.stats import qmc  # which takes long to import
+
+        sampler = qmc.Sobol(len(over), rng=rng)
+        uniform = sampler.random_base2(math.ceil(math.log2(samples)))[:samples]
+    else:
+        uniform = rng.random((samples, len(over)))
+    return [
+        {each.key: _at(each, float(share)) for each, share in zip(over, row, strict=True)}
+        for row in uniform
+    ]
+
+
+def _at(over: Over, share: float) -> Any:
+    """The value at a share, from 0 to 1, of a range or a list."""
+    if over.ends is None:
+        return over.taken[min(int(share * len(over.taken)), len(over.taken) - 1)]
+    low, high = over.ends
+    return low * (high / low) ** share if over.is_log else low + share * (high - low)
+
+
+def nested(point: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by keys such as `ekf.sigma_range_m` as tables in tables.
+
+    >>> nested({"ekf.sigma_range_m": 0.1, "robots": 2})
+    {'ekf': {'sigma_range_m': 0.1}, 'robots': 2}
+    """
+    tables: dict[str, Any] = {}
+    for key, value in point.items():
+        for name in reversed(key.split(".")):
+            value = {name: value}
+        tables = merge(tables, value)
+    return tables
+
+
+def run_sweep(
+    name: str,
+    over: Sequence[Over],
+    points: Sequence[Mapping[str, Any]],
+    experiments: Sequence[Experiment],
+    folder: Path,
+    *,
+    crew: Crew | None = None,
+    progress: Progress = no_progress,
+) -> Result:
+    """Replay and judge an experiment at every point into a folder; returns result.json.
+
+    Its metrics are lists, a number for each point; the table has them in long form. Raises BadInput
+    where an experiment is of a study that does more than judge, or cannot be run.
+    """
+    for experiment in experiments:
+        if experiment.study != "localization":
+            raise BadInput(
+                f"{name}: its study, {experiment.study}, makes more than metrics of single runs; run "
+                "the points one by one"
+            )
+        for label, values in experiment.estimators.items():
+            configure(label, values)
+    with kept_cells(folder) as kept, result_folder(folder) as part:
+        setting = Setting(part, folder, logs=0, draws=False, progress=progress, crew=crew, kept=kept)
+        outcome = Outcome()
+        tables = []
+        for number, done in enumerate(judge_all(experiments, setting)):
+            tables.append(point_table(number, points[number], done.judge))
+            outcome.parameters = outcome.parameters or done.parameters
+        table = pd.concat(tables, ignore_index=True)
+        outcome.tables["sweep"] = table
+        outcome.metrics.update(metrics_of(table, len(points)))
+        outcome.figures.update(figures_of(table, over))
+        settings = experiments[0].model_dump(mode="json", by_alias=True, exclude_none=True)
+        settings["sweep"] = [dict(point) for point in points]
+        return write_outcome(part, name, settings, outcome)
+
+
+def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
+    """A row per metric: its value over all runs, and between what nine in ten runs lie."""
+    runs = judge.runs_table
+    rows = []
+    for key, value in judge.metrics.items():
+        estimator, quantity, case = split_metric(key)
+        low = high = math.nan
+        if quantity in runs:
+            is_own = (runs["estimator"] == estimator) & (runs["case"] == case)
+            low, high = runs.loc[is_own, quantity].quantile([LOW, HIGH])
+        said = {"estimator": estimator, "quantity": quantity, "case": case}
+        rows.append({"point": number, **point, **said, "value": value, "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
+    """Every metric as a list, by point; null where a point has none."""
+    found: dict[str, MetricValue] = {}
+    for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
+        values = dict(zip(rows["point"], rows["value"], strict=True))
+        found[metric_key(*map(str, names))] = [values.get(number, math.nan) for number in range(points)]
+    return found
+
+
+def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
+    """Of each quantity and case a heat map over two numbers, else curves over every parameter."""
+    numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
+    grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
+    figures: dict[str, Chart | Figure] = {}
+    drawn = table[table["quantity"].isin(DRAWN)]
+    for (quantity, case), rows in drawn.groupby(["quantity", "case"]):
+        name = "-".join(filter(None, (str(quantity), str(case))))
+        changes = rows.groupby("estimator")["value"].transform(np.ptp) > 0
+        shown = rows[changes] if changes.any() else rows  # what is the same everywhere is no picture
+        is_map = len(over) == 2 and numbers and grid
+        figures[name] = heat_maps(shown, over, name) if is_map else curves(shown, over, name)
+    return figures
+
+
+def curves(rows: pd.DataFrame, over: Sequence[Over], name: str) -> Chart:
+    """The quantity over each parameter; where others are swept too, the mean over them."""
+    panels = []
+    for each in over:
+        panel = Panel(x=Axis(label=each.key, log=each.is_log), y=Axis(label=name))
+        for label, own in rows.groupby("estimator", sort=False):
+            means = own.groupby(each.key)[["value", "low", "high"]].mean()
+            places = means.index.to_numpy()
+            panel.series.append(curve(str(label), places, means["value"], "line+markers"))
+            if means["low"].notna().any():
+                panel.bands.append(band(str(label), places, means["low"], means["high"]))
+        panels.append(panel)
+    shared = ", means over the others" if len(over) > 1 else ""
+    return Chart(title=f"{name}{shared}; bands: nine in ten runs", panels=panels)
+
+
+def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
+    """The quantity over two parameters, a map for each estimator; a cross where an error is least."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    labels = list(rows["estimator"].unique())
+    figure = Figure(figsize=(4.6 * len(labels), 4.2), layout="constrained")
+    positive = rows["value"][rows["value"] > 0]
+    scale = LogNorm(positive.min(), positive.max()) if len(positive.unique()) > 1 else None
+    y, x = over
+    for place, label in enumerate(labels):
+        own = rows[rows["estimator"] == label].pivot_table("value", y.key, x.key)
+        axes = figure.add_subplot(1, len(labels), place + 1)
+        picture = axes.imshow(own.to_numpy(), norm=scale, origin="lower", aspect="auto")
+        if "rmse" in name:
+            line, column = np.unravel_index(np.nanargmin(own.to_numpy()), own.shape)
+            axes.plot(column, line, "x", color="white", markersize=10)
+        for axis, places in ((axes.xaxis, own.columns), (axes.yaxis, own.index)):
+            shown = range(0, len(places), -(-len(places) // 9))
+            axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
+        axes.tick_params(axis="x", rotation=45)  # nine numbers side by side
+        axes.set(xlabel=x.key, ylabel=y.key, title=label)
+    figure.colorbar(picture, ax=figure.axes, label=name)
+    return figure

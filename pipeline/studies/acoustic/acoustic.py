@@ -1,0 +1,172 @@
+"""The study of shooter localization: figures 3-23 of Osborne et al. 2014 with numbers."""
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import skew
+
+from pipeline.output.results import Outcome
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.studies.acoustic.cases import (
+    AcousticOptions,
+    Case,
+    Maps,
+    area_ratios,
+    range_errors_m,
+    run_case,
+)
+from pipeline.studies.acoustic.claims import claims
+from pipeline.studies.acoustic.figures import figures
+from pipeline.studies.toolkit.repetitions import require_spread
+from replay.judging.consistency.consistency import component_error_squared, ellipse_area
+from replay.judging.errors.evaluation import chi_square_interval
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: AcousticOptions = setting.options
+    require_spread(experiment.runs)
+    pairs = [
+        (number, multiplier)
+        for number in range(1, len(options.scenarios) + 1)
+        for multiplier in options.multipliers
+    ]
+    cases = [
+        run_case(experiment, setting, *pair)
+        for pair in setting.progress(pairs, "scenarios and noises", len(pairs))
+    ]
+    outcome = Outcome(claims=claims(cases, options), figures=figures(cases, options, experiment.runs))
+    outcome.tables = {
+        "sweep": _table_of_sweep(cases, experiment.runs),
+        "components": _table_of_components(cases),
+        "ellipses": _table_of_ellipses(cases),
+        "range-errors": _table_of_range_errors(cases),
+        "maps": _table_of_maps(options.maps),
+    }
+    for number in range(1, len(options.scenarios) + 1):
+        outcome.metrics |= _metrics([case for case in cases if case.number == number])
+    hashes = "".join(case.input_sha256 for case in cases)
+    outcome.input_sha256 = hashlib.sha256(hashes.encode()).hexdigest()
+    return outcome
+
+
+def _table_of_sweep(cases: list[Case], runs: int) -> pd.DataFrame:
+    """Figures 15-21: NEES, RMSE, CRLB and stray solutions of every mode by noise."""
+    low, high = chi_square_interval(2, runs)
+    rows = [
+        (
+            case.number,
+            case.multiplier,
+            label,
+            mode.mean_nees,
+            float(np.nanmedian(mode.nees)),
+            low,
+            high,
+            mode.rmse_m,
+            mode.bound_m,
+            mode.far_per_1000,
+            mode.converged,
+        )
+        for case in cases
+        for label, mode in case.modes.items()
+    ]
+    columns = [
+        "scenario",
+        "multiplier",
+        "mode",
+        "nees",
+        "median_nees",
+        "nees_low",
+        "nees_high",
+        "rmse_m",
+        "bound_m",
+    ]
+    return pd.DataFrame(rows, columns=[*columns, "far_per_1000", "converged_share"])
+
+
+def _nominal(cases: list[Case]) -> list[Case]:
+    return [case for case in cases if case.multiplier == 1.0]
+
+
+def _table_of_components(cases: list[Case]) -> pd.DataFrame:
+    """Every parameter at the paper's noise: RMSE against sigma_CRLB, mean error, NEES of its own."""
+    parts = []
+    for case in _nominal(cases):
+        for label, mode in case.modes.items():
+            error = mode.error.reshape(-1, len(mode.components))
+            sigma = np.sqrt(np.diagonal(mode.bound))
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "scenario": case.number,
+                        "mode": label,
+                        "component": mode.components,
+                        "rmse": mode.rmse,
+                        "sigma": sigma,
+                        "mean_error": np.nanmean(error, axis=0),
+                        "mean_error_bound": 2.0 * sigma / np.sqrt(len(error)),
+                        "nees": np.nanmean(component_error_squared(error, mode.bound), axis=0),
+                    }
+                )
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _table_of_ellipses(cases: list[Case]) -> pd.DataFrame:
+    """Figures 6-14: areas of the 95 % ellipses of the CRLB and of the estimates."""
+    rows = [
+        (case.number, label, mode.area_m2, float(ellipse_area(mode.covariance)), mode.bound_m)
+        for case in _nominal(cases)
+        for label, mode in case.modes.items()
+    ]
+    columns = ["scenario", "mode", "bound_area_m2", "estimates_area_m2", "bound_m"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _table_of_range_errors(cases: list[Case]) -> pd.DataFrame:
+    """Figures 3-5: how the local range estimates are distributed."""
+    rows = [
+        (case.number, sensor, error.mean(), error.std(), sigma, skew(error))
+        for case in _nominal(cases)
+        for sensor, (error, sigma) in range_errors_m(case).items()
+    ]
+    columns = ["scenario", "sensor", "mean_m", "deviation_m", "sigma_r_m", "skew"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _table_of_maps(maps: Maps) -> pd.DataFrame:
+    """Figures 22 and 23: how much smaller the ellipse is than that of bearings only."""
+    parts = []
+    for label, aim in maps.aims.items():
+        x, y, ratio = area_ratios(maps, label, aim)
+        grid_x, grid_y = np.meshgrid(x, y)
+        columns = {"x_m": grid_x.ravel(), "y_m": grid_y.ravel(), "ratio": ratio.ravel()}
+        parts.append(pd.DataFrame({"mode": label, "aim_x_m": aim[0], "aim_y_m": aim[1], **columns}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _metrics(cases: list[Case]) -> dict[str, Any]:
+    """Of one scenario: at the paper's noise, and lists over all noises."""
+    values: dict[str, Any] = {}
+    name = f"scenario-{cases[0].number}"
+    for case in _nominal(cases):
+        for label, mode in case.modes.items():
+            values |= {
+                f"{label}.nees.{name}": mode.mean_nees,
+                f"{label}.position_rmse_m.{name}": mode.rmse_m,
+                f"{label}.position_bound_m.{name}": mode.bound_m,
+                f"{label}.ellipse_area_m2.{name}": mode.area_m2,
+                f"{label}.far_per_1000.{name}": mode.far_per_1000,
+                f"{label}.converged_share.{name}": mode.converged,
+            }
+    for label in cases[0].modes:
+        swept = [case.modes[label] for case in cases]
+        values[f"{label}.nees_by_noise.{name}"] = [mode.mean_nees for mode in swept]
+        values[f"{label}.position_rmse_m_by_noise.{name}"] = [mode.rmse_m for mode in swept]
+        values[f"{label}.position_bound_m_by_noise.{name}"] = [mode.bound_m for mode in swept]
+    return values
+
+
+ACOUSTIC = Study("where shots came from, by three kinds of measurements", study, AcousticOptions)

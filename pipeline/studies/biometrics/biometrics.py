@@ -1,0 +1,227 @@
+"""The study of biometric score fusion: modality, method and process, and verification of all pairs.
+
+Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
+seeds; those of all pairs get confidence intervals of drawing users again.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from pydantic import PositiveInt
+from scipy.stats import norm
+
+from pipeline.output.charts import Axis, Chart, Panel, curve, thinned
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.biometrics.claims import (
+    CASES,
+    METHODS,
+    PAPER_FUSED,
+    SINGLE,
+    claims_of_bssr1,
+    claims_of_simulation,
+)
+from pipeline.studies.toolkit.localization import summary_table
+from recorders.models.scores import TOPIC, comparisons_of, matchers_of
+from recorders.parameters import Parameters
+from replay.engine.replaying.estimator import configure
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.biometrics.biometrics import LearnerParameters, subsets_of
+from replay.judging.consistency.verification import (
+    FALSE_ACCEPT_RATES,
+    Fused,
+    bootstrap_users,
+    fused_of,
+    relative_rate_increase,
+    roc,
+)
+from replay.judging.errors.evaluation import split_topic
+
+RATE, SPREAD, COUNT = "verification_rate_percent", "verification_rate_sd_percent", "identified_percent"
+# False rates at the ticks of both axes of normal deviates.
+TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
+
+
+class BiometricsOptions(Parameters):
+    """How often the cross validations are repeated, and users are drawn again."""
+
+    seeds: PositiveInt = 5
+    replicates: PositiveInt = 100
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    runner = Runner(experiment, setting)
+    replayed = runner.run()
+    sources = replayed.sources
+    values = replayed.metrics(experiment.metrics)
+    values |= _repeated(runner, sources, values)
+    outcome = Outcome(metrics=dict(values), input_sha256=hash_streams(sources))
+    outcome.tables["summary"] = summary_table(outcome.metrics)
+    outcome.tables["factors"] = factor_table(values, sources[0])
+    outcome.tables["impact"] = impact_table(outcome.tables["factors"])
+    outcome.tables["confidence"] = confidence_table(replayed, setting.options.replicates)
+    outcome.figures["distributions"] = distribution_figure(sources[0])
+    outcome.figures["roc"] = curve_chart(replayed, deviates=False)
+    outcome.figures["det"] = curve_chart(replayed, deviates=True)
+    if experiment.import_:
+        outcome.claims += claims_of_bssr1(values)
+    else:
+        outcome.claims += claims_of_simulation(values, _counts(replayed))
+    return outcome
+
+
+def _repeated(
+    runner: Runner, sources: Sequence[MemorySource], first: Mapping[str, float]
+) -> dict[str, float]:
+    """Means and standard deviations over the seeds of the fusions that draw a trimmed database."""
+    drawn = {}
+    for label, settings in runner.experiment.estimators.items():
+        _, parameters = configure(label, settings)
+        if isinstance(parameters, LearnerParameters) and parameters.pairs == "trimmed":
+            drawn[label] = (dict(settings), parameters.seed)
+    rates = [{key: value for key, value in first.items() if f".{RATE}" in key}]
+    more = range(1, runner.setting.options.seeds if drawn else 1)
+    for step in runner.setting.progress(more, "repeating with other seeds", len(more)):
+        estimators = {label: {**values, "seed": seed + step} for label, (values, seed) in drawn.items()}
+        rates.append(runner.replay(sources, estimators).metrics(["verification"]))
+    values: dict[str, float] = {}
+    for key in rates[0]:
+        over_seeds = [rate[key] for rate in rates]
+        values[key] = float(np.mean(over_seeds))
+        if len(over_seeds) > 1:
+            values[key.replace(RATE, SPREAD)] = float(np.std(over_seeds, ddof=1))
+    return values
+
+
+def factor_table(values: Mapping[str, float], source: MemorySource) -> pd.DataFrame:
+    """Tables 2 to 4: each subset's rate and relative increase by each fusion, paper beside ours.
+
+    Rates of single matchers and of arithmetic fusion are of identification, as in the paper; the paper's
+    relative increases follow from its printed rates, the swapped ones put right.
+    """
+    matchers = matchers_of(source.streams[TOPIC].metadata)
+    rows = []
+    for case, chosen in subsets_of(matchers).items():
+        single = [values.get(f"single.{COUNT}.{matchers[index].name}", np.nan) for index in chosen]
+        for key in values if len(chosen) > 1 else ():
+            label, quantity, of = (*key.split(".", 2), "")[:3]  # failures are of no case
+            has_rate = f"{label}.{RATE}.{case}" in values
+            if of != case or quantity != (RATE if has_rate else COUNT):
+                continue
+            printed = PAPER_FUSED.get(label, {}).get(case, np.nan)
+            alone = [SINGLE.get(matchers[index].name, np.nan) / 100 for index in chosen]
+            increase, relative = relative_rate_increase(values[key] / 100, np.array(single) / 100)
+            rows.append(
+                {
+                    "subset": case,
+                    "fusion": label,
+                    "paper_percent": printed,
+                    "ours_percent": values[key],
+                    "sd_percent": values.get(f"{label}.{SPREAD}.{case}", np.nan),
+                    "mean_single_percent": np.mean(single),
+                    "ari": increase,
+                    "paper_rri": relative_rate_increase(printed / 100, alone)[1],
+                    "rri": relative,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def impact_table(factors: pd.DataFrame) -> pd.DataFrame:
+    """Table 5: the mean relative increase by fusing matchers of one modality, of two, and all."""
+    kinds = {case: "one modality" if case in METHODS else "two modalities" for case in CASES[:-1]}
+    judged = factors[factors["fusion"].isin(PAPER_FUSED) & factors["subset"].isin(CASES)]
+    kind = judged["subset"].map(kinds).fillna("all").rename("fused")
+    return judged.groupby([kind, judged["fusion"]])[["paper_rri", "rri"]].mean().reset_index()
+
+
+def confidence_table(replayed: Replayed, replicates: int) -> pd.DataFrame:
+    """95 % intervals of GAR at FAR and EER of the first run, of drawing users again."""
+    names = [*(f"gar_at_far_{100 * rate:g}_percent" for rate in FALSE_ACCEPT_RATES), "eer_percent"]
+    rows = []
+    for topic, fused in _complete(replayed).items():
+        label, case = split_topic(topic)
+        drawn = 100 * bootstrap_users(fused, replicates, np.random.default_rng(0))
+        bounds = np.quantile(drawn, [0.025, 0.975], axis=0).T
+        rows += [(label, case, name, low, high) for name, (low, high) in zip(names, bounds, strict=True)]
+    return pd.DataFrame(rows, columns=["fusion", "case", "quantity", "low", "high"])
+
+
+def _complete(replayed: Replayed) -> dict[str, Fused]:
+    """The first run's fusions of all pairs, of single matchers and of all together."""
+    found = {
+        topic: fused_of(rows.of_run(0))
+        for topic, rows in replayed.outputs.items()
+        if topic.endswith("/fused")
+        and (split_topic(topic)[1] == "all" or split_topic(topic)[0] == "single")
+    }
+    return {topic: fused for topic, fused in found.items() if fused.is_complete}
+
+
+def _counts(replayed: Replayed) -> dict[str, list[float]]:
+    """Identified users in every run, by fusion and case."""
+    counts: dict[str, list[float]] = {}
+    for run in range(len(replayed.sources)):
+        of_run = {
+            topic: Ragged(rows.of_run(run), np.array([0, len(rows.of_run(run))]))
+            for topic, rows in replayed.outputs.items()
+        }
+        alone = Replayed(replayed.sources[run : run + 1], of_run, [], [], [])
+        values = alone.metrics(["verification"])
+        for key, value in values.items():
+            counts.setdefault(key, []).append(value)
+    return counts
+
+
+def distribution_figure(source: MemorySource) -> Figure:
+    """Histograms of genuine and impostor scores, a plot per matcher."""
+    compared = comparisons_of(source.streams[TOPIC])
+    same = np.eye(len(compared.scores), dtype=bool)
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    plots = figure.subplots(2, -(-len(compared.matchers) // 2)).ravel()
+    for index, (plot, matcher) in enumerate(zip(plots, compared.matchers, strict=False)):
+        score, valid = compared.scores[:, :, index], ~compared.failed[:, :, index]
+        edges = np.linspace(score[valid].min(), score[valid].max(), 80)
+        for name, rows in (("impostor", ~same & valid), ("genuine", same & valid)):
+            plot.hist(score[rows], edges, density=True, alpha=0.6, label=name)
+        plot.set(title=matcher.name, xlabel="score", yscale="log")
+    plots[0].legend()
+    return figure
+
+
+def curve_chart(replayed: Replayed, *, deviates: bool) -> Chart:
+    """ROC, or with normal deviates on both axes the detection error trade-off."""
+    series = []
+    for topic, fused in _complete(replayed).items():
+        found = roc(fused.score, fused.genuine)
+        label = " ".join(split_topic(topic))
+        accept, reject = found.false_accept, 1 - found.genuine_accept
+        inside = np.flatnonzero((accept > 0) & (accept < 1))
+        rows = inside[thinned(len(inside))]
+        if deviates:
+            x, y = norm.ppf(accept[rows]), norm.ppf(np.maximum(reject[rows], 1e-4))
+        else:
+            x, y = accept[rows], found.genuine_accept[rows]
+        series.append(curve(label, x, y))
+    if deviates:
+        low, high = norm.ppf([5e-5, 0.4])
+        limits = float(low), float(high)
+        ticks = {float(norm.ppf(rate)): f"{100 * rate:g}" for rate in TICKS}
+        x, y = (Axis(label=f"{rate} (%)", limits=limits, ticks=ticks) for rate in ("FAR", "FRR"))
+        panel = Panel(x=x, y=y, series=series)
+        return Chart(title="DET", panels=[panel])
+    y = Axis(label="GAR", limits=(0.65, 1.005))
+    return Chart(title="ROC", panels=[Panel(x=Axis(label="FAR", log=True), y=y, series=series)])
+
+
+BIOMETRICS = Study(
+    "fusion of biometric scores: rates by modality, method and process; ROC, EER, Cllr",
+    study,
+    BiometricsOptions,
+)

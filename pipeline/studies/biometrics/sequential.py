@@ -1,0 +1,498 @@
+"""The study of verification in sequence: Wald's test of probe after probe, and Page's of the matcher.
+
+Log-likelihood ratios are calibrated on other users than they judge. Those of a matcher are drawn again,
+users as clusters: a replicate draws users with replacement, and all intervals are quantiles over the
+replicates. The data have one genuine score per user and matcher, so that further probes of one person
+are those of others: independent, or alike by an assumed correlation of normal scores. What is real in
+sequence is one person with matcher after matcher, and many impostors against one identity.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from pydantic import Field, PositiveFloat, PositiveInt
+from scipy.special import ndtr, ndtri
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.judging.consistency.sequential import (
+    Decisions,
+    Rates,
+    decide,
+    first_alarm,
+    page_sums,
+    wald_bounds,
+    wald_probes,
+)
+from replay.judging.consistency.verification import Fused, fused_of
+from replay.judging.errors.evaluation import split_topic
+
+Share = Annotated[float, Field(gt=0, lt=0.5)]
+RatioOf = Callable[[Integers], Floats]
+WAYS = {
+    "independent": "independent probes",
+    "one-identity": "impostors against one identity",
+    "alike": "probes of one person alike",
+    "matchers": "one person, matcher after matcher",
+}
+FAULTS = {
+    "misses": "the person scores as an impostor",
+    "accepts": "impostors score as the person",
+    "drifts": "genuine scores have fallen by one standard deviation",
+}
+BOUNDS = ["value", "low", "high"]
+FIXED_PROBES = 50  # more than any matcher needs
+IMPOSTORS = 100_000  # so many that their tail is that of all
+DRIFT_SIGMA = 1.0
+
+
+class Options(Parameters):
+    """What is stated, and how it is tried.
+
+    `rates` are pairs of false accepts and false rejects, `alike` is the correlation of the normal scores
+    of one person's probes. A matcher is watched by probes for which the other matchers' ratio is beyond
+    `label_ratio`; `run_length` is the stated mean number of these until a false alarm, and
+    `noticed_probes` that until the alarm of each fault.
+    """
+
+    rates: list[tuple[Share, Share]] = [(0.01, 0.01), (0.001, 0.01)]
+    alike: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    sequences: PositiveInt = 5_000
+    replicates: Annotated[int, Field(ge=20)] = 80
+    most_probes: PositiveInt = 200
+    label_ratio: PositiveFloat = 7.0
+    run_length: PositiveFloat = 1000.0
+    watched: PositiveInt = 20
+    watched_probes: PositiveInt = 5000
+    fault_probes: PositiveInt = 500
+    noticed_probes: dict[str, PositiveFloat] = {"misses": 20.0, "accepts": 20.0, "drifts": 100.0}
+
+
+class Drawn(NamedTuple):
+    """A matcher's ratios (users, users) by probe and gallery entry, and a replicate's users (n,)."""
+
+    ratios: Floats
+    users: Integers
+
+    def others(self, gallery: Integers, rng: np.random.Generator) -> Integers:
+        """For each gallery entry (n,) a user that is another."""
+        probe = rng.choice(self.users, len(gallery))
+        while (same := probe == gallery).any():
+            probe[same] = rng.choice(self.users, int(same.sum()))
+        return probe
+
+    def impostors(self, count: int, rng: np.random.Generator) -> tuple[Integers, Integers]:
+        """Users of probes and of gallery entries (count,), never the same."""
+        gallery = rng.choice(self.users, count)
+        return self.others(gallery, rng), gallery
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: Options = setting.options
+    replayed = Runner(experiment, setting).run()
+    ratios = {
+        split_topic(topic)[1]: _matrix(fused_of(rows.of_run(0)))
+        for topic, rows in replayed.outputs.items()
+        if topic.endswith("/fused")
+    }
+    if len(ratios) < 2:
+        raise BadInput(
+            "study biometrics-sequential watches a matcher by the others: give a score-mixture of all "
+            "pairs with the names of two matchers or more as its subsets"
+        )
+    rng = np.random.default_rng(experiment.seed)
+    count = len(next(iter(ratios.values())))
+    draws = [np.arange(count), *rng.integers(count, size=(options.replicates, count))]
+    tests: list[pd.DataFrame] = []
+    watches: list[pd.DataFrame] = []
+    for number, users in enumerate(setting.progress(draws, "drawing users again", len(draws))):
+        drawn = {name: Drawn(matrix, users) for name, matrix in ratios.items()}
+        tests.append(pd.DataFrame(wald_tests(drawn, options, rng)).assign(replicate=number))
+        watches.append(pd.DataFrame(watched(drawn, options, rng)).assign(replicate=number))
+    outcome = Outcome(input_sha256=hash_streams(replayed.sources))
+    _tell_tests(_intervals(pd.concat(tests), ["way", "matcher", "rates"]), ratios, options, outcome, rng)
+    _tell_watches(_intervals(pd.concat(watches), ["fault", "matcher"]), options, outcome)
+    return outcome
+
+
+def _matrix(fused: Fused) -> Floats:
+    """Ratios (users, users) by probe and gallery entry; raises BadInput where they are none of all."""
+    if not (fused.is_ratio and fused.is_complete):
+        raise BadInput(
+            "study biometrics-sequential needs log-likelihood ratios of all pairs: give a score-mixture "
+            'with pairs = "all"'
+        )
+    users = int(fused.gallery.max()) + 1
+    matrix = np.empty((users, users))
+    matrix[fused.probe, fused.gallery] = fused.score
+    return matrix
+
+
+def wald_tests(
+    drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
+) -> Iterator[dict[str, Any]]:
+    """Rates of error and numbers of probes of Wald's test, by way, matcher and stated rates."""
+    count, most = options.sequences, options.most_probes
+    for stated in options.rates:
+        rates = Rates(*stated)
+        for matcher, each in drawn.items():
+            for way in ("independent", "one-identity", "alike"):
+                genuine, impostors = probes_of(way, each, options, rng)
+                decisions = [decide(of, count, rates, most) for of in (genuine, impostors)]
+                yield {"way": way, "matcher": matcher, "rates": stated, **_found(*decisions)}
+        first = next(iter(drawn.values()))
+        users, pairs = first.users, first.impostors(count, rng)
+        own = [np.diag(each.ratios)[users] for each in drawn.values()]
+        of_others = [each.ratios[pairs] for each in drawn.values()]
+        decisions = [
+            decide(in_turn(ratios), len(ratios[0]), rates, len(ratios)) for ratios in (own, of_others)
+        ]
+        yield {"way": "matchers", "matcher": "all", "rates": stated, **_found(*decisions)}
+
+
+def probes_of(
+    way: str, drawn: Drawn, options: Options, rng: np.random.Generator
+) -> tuple[RatioOf, RatioOf]:
+    """What gives the next probes' ratios of sequences: of persons, and of impostors."""
+    genuine = np.diag(drawn.ratios)[drawn.users]
+    if way == "alike":
+        some = drawn.ratios[drawn.impostors(IMPOSTORS, rng)]
+        same, other = (_alike(ratios, options, rng) for ratios in (genuine, some))
+        return same, other
+    claimed = rng.choice(drawn.users, options.sequences)
+
+    def of_impostors(going: Integers) -> Floats:
+        if way == "one-identity":
+            return drawn.ratios[drawn.others(claimed[going], rng), claimed[going]]
+        return drawn.ratios[drawn.impostors(len(going), rng)]
+
+    return lambda going: rng.choice(genuine, len(going)), of_impostors
+
+
+def _alike(ratios: Floats, options: Options, rng: np.random.Generator) -> RatioOf:
+    """Probes whose ratios are distributed as these, and whose normal scores are correlated."""
+    ordered, share = np.sort(ratios), options.alike
+    own = rng.normal(size=options.sequences)
+
+    def ratio_of(going: Integers) -> Floats:
+        normal = np.sqrt(share) * own[going] + np.sqrt(1.0 - share) * rng.normal(size=len(going))
+        return ordered[np.minimum((ndtr(normal) * len(ordered)).astype(int), len(ordered) - 1)]
+
+    return ratio_of
+
+
+def in_turn(ratios: Sequence[Floats]) -> RatioOf:
+    """The first probe of every sequence has the ratio of the first matcher, and so on."""
+    left = iter(ratios)
+    return lambda going: next(left)[going]
+
+
+def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
+    """Shares of wrong decisions and of none, and how many probes a decision took."""
+    undecided = np.concatenate([genuine.probes, impostors.probes]) == 0
+    return {
+        "false_accept": float(impostors.accepted.mean()),
+        "false_reject": float(genuine.rejected.mean()),
+        "genuine_probes": float(genuine.probes[genuine.probes > 0].mean()),
+        "impostor_probes": float(impostors.probes[impostors.probes > 0].mean()),
+        "undecided": float(undecided.mean()),
+    }
+
+
+def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> float:
+    """The least number of independent probes whose summed ratios hold both rates; NaN for none."""
+    drawn = Drawn(ratios, np.arange(len(ratios)))
+    same, other = np.zeros(IMPOSTORS), np.zeros(IMPOSTORS)
+    for number in range(1, FIXED_PROBES + 1):
+        same += rng.choice(np.diag(ratios), IMPOSTORS)
+        other += ratios[drawn.impostors(IMPOSTORS, rng)]
+        if np.mean(same <= np.quantile(other, 1.0 - rates.false_accept)) <= rates.false_reject:
+            return float(number)
+    return float("nan")
+
+
+def watched(
+    drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
+) -> Iterator[dict[str, Any]]:
+    """How many probes pass until the alarm, by fault and matcher; "none" is without a fault.
+
+    Half of the users are the reference, the others are watched.
+    """
+    users = next(iter(drawn.values())).users
+    is_reference = rng.permutation(int(users.max()) + 1) % 2 == 0
+    halves = [users[is_reference[users] == half] for half in (True, False)]
+    for matcher, each in drawn.items():
+        label = sum(other.ratios for name, other in drawn.items() if name != matcher)
+        assert isinstance(label, np.ndarray)
+        size = options.watched * options.watched_probes
+        reference, seen = (
+            labelled(Drawn(each.ratios, half), label, options.label_ratio, size, rng) for half in halves
+        )
+        steady = [np.sort(reference.ratio[reference.is_genuine == kind]) for kind in (False, True)]
+        if min(map(len, steady)) == 0 or len(seen.ratio) < options.watched_probes:
+            raise BadInput(
+                f"study biometrics-sequential: the other matchers are certain of {len(seen.ratio)} "
+                "probes "
+                f"of {size} to watch {matcher} by; lower options.label_ratio, or give other matchers"
+            )
+        for fault in ("none", *FAULTS):
+            probes = options.watched_probes if fault == "none" else options.fault_probes
+            whole = min(len(seen.ratio), options.watched * probes) // probes * probes
+            some = Labelled(seen.ratio[:whole], seen.is_genuine[:whole])
+            now = some._replace(ratio=faulty(fault, some, steady, rng))
+            changes = watching(now, steady).reshape(4, -1, probes)
+            alarm = first_alarm(page_sums(changes).max(axis=0), options.run_length, together=2)
+            yield {
+                "fault": fault,
+                "matcher": matcher,
+                "probes": float(np.where(alarm > 0, alarm, probes).mean()),
+                "silent": float(np.mean(alarm == 0)),
+            }
+
+
+class Labelled(NamedTuple):
+    """Probes of a matcher: its ratio (n,), and whether the other matchers say that it is the person."""
+
+    ratio: Floats
+    is_genuine: Booleans
+
+
+def labelled(
+    drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
+) -> Labelled:
+    """About so many probes, half of them of the person; those that the others leave open are left out.
+
+    `label` (users, users) is the summed ratio of the other matchers.
+    """
+    probe, gallery = drawn.impostors(count, rng)
+    probe = np.where(rng.random(count) < 0.5, gallery, probe)
+    told = label[probe, gallery]
+    clear = np.abs(told) >= least
+    return Labelled(drawn.ratios[probe, gallery][clear], told[clear] > 0.0)
+
+
+def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
+    """The ratios (n,) of probes by a matcher with a fault.
+
+    `steady` are the ratios of impostors and of persons before, in rising order.
+    """
+    others, own = steady
+    match fault:
+        case "misses":
+            return np.where(seen.is_genuine, rng.choice(others, len(seen.ratio)), seen.ratio)
+        case "accepts":
+            return np.where(seen.is_genuine, seen.ratio, rng.choice(own, len(seen.ratio)))
+        case "drifts":
+            fallen = ndtr(normal_scores(seen.ratio, own) - DRIFT_SIGMA) * len(own)
+            return np.where(seen.is_genuine, own[fallen.astype(int)], seen.ratio)
+    return seen.ratio
+
+
+def normal_scores(values: Floats, reference: Floats) -> Floats:
+    """Where values (n,) lie in a reference in rising order, as normal numbers; ties in the middle."""
+    rank = 0.5 * (
+        np.searchsorted(reference, values, "left") + np.searchsorted(reference, values, "right")
+    )
+    return ndtri((rank + 0.5) / (len(reference) + 1.0))
+
+
+def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
+    """Log-likelihood ratios (4, n) of four changes, zero for probes that say nothing of them.
+
+    That the person's ratios become those of impostors, or fall by `DRIFT_SIGMA` of their normal scores;
+    that those of impostors become the person's, or rise so.
+    """
+    others, own = (
+        DRIFT_SIGMA * sign * normal_scores(seen.ratio, reference) - 0.5 * DRIFT_SIGMA**2
+        for sign, reference in zip((1.0, -1.0), steady, strict=True)
+    )
+    is_genuine = seen.is_genuine
+    return np.stack(
+        [
+            np.where(is_genuine, -seen.ratio, 0.0),
+            np.where(is_genuine, own, 0.0),
+            np.where(is_genuine, 0.0, seen.ratio),
+            np.where(is_genuine, 0.0, others),
+        ]
+    )
+
+
+def _intervals(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Of every quantity the value of all users, and where it lies with 95 % over the replicates."""
+    quantities = table.columns.drop([*by, "replicate"])
+    rows = []
+    for key, group in table.groupby(by, sort=False):
+        of = dict(zip(by, key, strict=True))
+        for name in quantities:
+            whole, replicates = group[name].iloc[0], group[name].iloc[1:].dropna()
+            low, high = np.quantile(replicates, [0.025, 0.975]) if len(replicates) else (np.nan, np.nan)
+            rows.append({**of, "quantity": name, "value": whole, "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def _tell_tests(
+    table: pd.DataFrame,
+    ratios: Mapping[str, Floats],
+    options: Options,
+    outcome: Outcome,
+    rng: np.random.Generator,
+) -> None:
+    """Metrics, claims and the figure of Wald's tests."""
+    for row in records(table):
+        quantity, case = row["quantity"], f"{row['matcher']}-{_case(row['rates'])}"
+        if quantity in ("false_accept", "false_reject", "undecided"):
+            outcome.metrics[f"{row['way']}.{quantity}_percent.{case}"] = 100.0 * row["value"]
+        else:
+            outcome.metrics[f"{row['way']}.{quantity}.{case}"] = row["value"]
+    outcome.tables["tests"] = table.assign(rates=table["rates"].map(_percents))
+    for stated, way, error in product(options.rates, WAYS, Rates._fields):
+        if way == "one-identity" and error == "false_reject":
+            continue
+        chosen = _chosen(table, way=way, rates=stated, quantity=error)
+        bound = getattr(wald_bounds(Rates(*stated)), error)
+        what = {"false_accept": "false accepts", "false_reject": "false rejects"}[error]
+        claim = f"{_percents(stated)} stated, {WAYS[way]}: {what} are held"
+        outcome.claims.append(_held(claim, bound, chosen))
+    fewer: list[tuple[str, float, float]] = []
+    near: list[tuple[str, float, dict[str, Any]]] = []
+    for stated in options.rates:
+        rates = Rates(*stated)
+        rows = _chosen(table, way="independent", rates=stated)
+        for matcher, matrix in ratios.items():
+            own = rows[rows["matcher"] == matcher].set_index("quantity")
+            fixed = fixed_number(matrix, rates, rng)
+            case = f"{matcher}-{_case(stated)}"
+            outcome.metrics[f"fixed.probes.{case}"] = fixed
+            probes = [records(own.loc[[f"{kind}_probes"]])[0] for kind in ("genuine", "impostor")]
+            fewer.append((case, fixed, max(each["high"] for each in probes)))
+            means = np.diag(matrix).mean(), matrix[~np.eye(len(matrix), dtype=bool)].mean()
+            for kind, found, mean in zip(("genuine", "impostor"), probes, means, strict=True):
+                wald = wald_probes(rates, float(mean), genuine=kind == "genuine")
+                outcome.metrics[f"wald.{kind}_probes.{case}"] = wald
+                near.append((f"{case} {kind}", wald, found))
+    outcome.claims.append(
+        judged(
+            "independent probes: fewer on average than the fixed number that holds these rates",
+            "(Wald and Wolfowitz, 1948)",
+            ", ".join(f"{case} {most:.2f} of {fixed:.0f}" for case, fixed, most in fewer),
+            all(most < fixed for _, fixed, most in fewer),
+        )
+    )
+    outcome.claims.append(
+        judged(
+            "independent probes: Wald's approximation of their mean number is right within 20 %",
+            "(4.8) of Wald, 1945",
+            ", ".join(f"{case} {row['value']:.2f} for {wald:.2f}" for case, wald, row in near),
+            all(0.8 * wald < row["low"] and row["high"] < 1.2 * wald for _, wald, row in near),
+        )
+    )
+    outcome.figures["tests"] = _chart_of_tests(table, options)
+
+
+def _tell_watches(table: pd.DataFrame, options: Options, outcome: Outcome) -> None:
+    """Metrics and claims of the watch over matchers."""
+    outcome.tables["watch"] = table
+    for row in records(table):
+        name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)
+        outcome.metrics[f"watch.{name}.{row['fault']}-{row['matcher']}"] = scale * row["value"]
+    steady = _chosen(table, fault="none", quantity="probes")
+    outcome.claims.append(
+        _decided(
+            f"a matcher without a fault: {options.run_length:g} probes or more until a false alarm",
+            f"{options.run_length:g} (stated)",
+            _of_matchers(steady, "{:.0f}"),
+            holds=bool((steady["low"] >= options.run_length).all()),
+            fails=bool((steady["high"] < options.run_length).any()),
+        )
+    )
+    for fault, words in FAULTS.items():
+        found = _chosen(table, fault=fault, quantity="probes")
+        most = options.noticed_probes[fault]
+        outcome.claims.append(
+            judged(
+                f"noticed within {most:g} probes on average: {words}",
+                f"{most:g} (own limit)",
+                _of_matchers(found, "{:.1f}"),
+                bool((found["high"] <= most).all()),
+            )
+        )
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table by the names of its columns."""
+    rows: list[Any] = table.to_dict("records")
+    return rows
+
+
+def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
+    """The rows in which columns have these values."""
+    for name, value in of.items():
+        table = table[table[name] == value]
+    return table
+
+
+def _held(claim: str, bound: float, rows: pd.DataFrame) -> Claim:
+    """Whether a stated rate is held."""
+    return _decided(
+        claim,
+        f"at most {100.0 * bound:.3g} % (Wald's inequality)",
+        _of_matchers(rows.assign(**{name: 100.0 * rows[name] for name in BOUNDS}), "{:.2f}") + " %",
+        holds=bool((rows["high"] <= bound).all()),
+        fails=bool((rows["low"] > bound).any()),
+    )
+
+
+def _decided(claim: str, paper: str, ours: str, *, holds: bool, fails: bool) -> Claim:
+    """A claim that holds where all intervals lie within what is stated; it fails by one beyond."""
+    if holds or fails:
+        return judged(claim, paper, ours, holds)
+    return Claim(claim, paper, ours, "not reproducible", "too few users to tell")
+
+
+def _of_matchers(rows: pd.DataFrame, form: str) -> str:
+    """Values with their intervals, matcher by matcher."""
+    return ", ".join(
+        f"{row['matcher']} {form.format(row['value'])} "
+        f"({form.format(row['low'])} to {form.format(row['high'])})"
+        for row in records(rows)
+    )
+
+
+def _percents(rates: tuple[float, float]) -> str:
+    return " and ".join(f"{100.0 * rate:g} %" for rate in rates)
+
+
+def _case(rates: tuple[float, float]) -> str:
+    return "-".join(f"{100.0 * rate:g}".replace(".", "p") for rate in rates)
+
+
+def _chart_of_tests(table: pd.DataFrame, options: Options) -> Chart:
+    """False accepts and mean numbers of probes by matcher, a series for every way and stated rates."""
+    panels = []
+    for quantity, label in (
+        ("false_accept", "false accepts (share)"),
+        ("genuine_probes", "mean number of probes of the person"),
+    ):
+        panel = Panel(x=Axis(label="matcher"), y=Axis(label=label, log=quantity == "false_accept"))
+        for stated, way in product(options.rates, WAYS):
+            rows = _chosen(table, way=way, rates=stated, quantity=quantity)
+            name = f"{WAYS[way]}, {_percents(stated)}"
+            panel.series.append(curve(name, rows["matcher"].tolist(), rows["value"], "markers"))
+        panels.append(panel)
+    return Chart(panels=panels)
+
+
+BIOMETRICS_SEQUENTIAL = Study(
+    "verification by probe after probe, and matchers that fail or drift", study, Options
+)

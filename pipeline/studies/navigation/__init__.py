@@ -1,0 +1,1 @@
+"""Studies of inertial units: navigation, outages, orientation; begin with `gnss_ins`."""

@@ -1,0 +1,145 @@
+"""The study of inertial units: how far off a body is located, the longer its receiver is silent.
+
+The same drives with units of several grades, and an outage in the middle. Of n runs the largest error is
+above that which a share q of all runs stays below, with the probability 1 - q^n: .95 for 59 runs and
+q = .95 (Wilks, Annals of Mathematical Statistics 12(1), 1941).
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from pydantic import PositiveFloat
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from recorders.simulators.navigation import NavigationParameters
+from replay.engine.streams.sources import MemorySource
+from replay.judging.errors.evaluation import Errors
+
+SHARE = 0.95
+
+
+class Limit(Parameters):
+    """How far off the first estimator may be so long after the last fix, for most of the drives."""
+
+    grade: str
+    after_s: PositiveFloat
+    most_m: PositiveFloat
+
+
+class Options(Parameters):
+    """Parameters of the unit by grade, and what is demanded."""
+
+    grades: dict[str, dict[str, float]]
+    limits: list[Limit] = []
+
+
+class Span(NamedTuple):
+    """An outage, in s since a run's epoch."""
+
+    begin_s: float
+    end_s: float
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: Options = setting.options
+    if unknown := {limit.grade for limit in options.limits} - options.grades.keys():
+        raise BadInput(
+            f"options.limits: no grade '{unknown.pop()}'; there are {', '.join(options.grades)}"
+        )
+    outcome = Outcome()
+    sources: list[MemorySource] = []
+    tables: list[pd.DataFrame] = []
+    cases = {grade: {"unit": unit} for grade, unit in options.grades.items()}
+    for grade, replayed in Runner(experiment, setting).cases(cases):
+        span = outage_of(replayed.sources[0])
+        tables += [
+            horizontal(errors, span).assign(grade=grade, estimator=errors.estimator)
+            for errors in replayed.errors
+        ]
+        sources += replayed.sources
+    table = pd.concat(tables)
+    largest = table.groupby(["grade", "estimator", "after_s"], sort=False)["error_m"].max().reset_index()
+    for grade, estimator, after_s, error_m in largest.itertuples(index=False):
+        if after_s in (10.0, 20.0, 30.0):
+            outcome.metrics[f"{estimator}.horizontal_95_m.{grade}-{after_s:g}s"] = float(error_m)
+    label = next(iter(experiment.estimators))
+    outcome.claims = [_claim(limit, label, table, experiment.runs) for limit in options.limits]
+    outcome.claims += _order(list(options.grades), label, largest)
+    outcome.input_sha256 = hash_streams(sources)
+    outcome.tables["largest"] = largest
+    outcome.figures["outage"] = _chart(largest)
+    return outcome
+
+
+def outage_of(source: MemorySource) -> Span:
+    """The outage of a drive; BadInput where it has none, or more than one."""
+    given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
+    if len(given) != 1:
+        raise BadInput(
+            f"study imu-grades: {len(given)} outages; give exactly one, as gnss.outages_s=[[50, 80]]"
+        )
+    return Span(*given[0])
+
+
+def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
+    """How far off an estimator is (m) in every run, so many seconds after the outage began."""
+    inside = (errors.elapsed_s >= span.begin_s) & (errors.elapsed_s < span.end_s)
+    plane = [errors.components.index(name) for name in ("x_m", "y_m")]
+    error_m = np.linalg.norm(errors.error[inside][:, plane], axis=1)
+    after_s = np.round(errors.elapsed_s[inside] - span.begin_s, 6)
+    return pd.DataFrame({"run": errors.run[inside], "after_s": after_s, "error_m": error_m})
+
+
+def _claim(limit: Limit, label: str, table: pd.DataFrame, runs: int) -> Claim:
+    """Whether 95 % of all drives stay within a limit, as sure as the number of runs allows."""
+    chosen = (table["grade"] == limit.grade) & (table["estimator"] == label)
+    errors = table[chosen & np.isclose(table["after_s"], limit.after_s)]["error_m"]
+    found = float(errors.max()) if len(errors) == runs else np.nan
+    return judged(
+        f"{limit.grade}: {limit.after_s:g} s after the last fix 95 % of drives are within "
+        f"{limit.most_m:g} m",
+        f"{limit.most_m:g} m (own limit)",
+        f"at most {found:.2f} m in {runs} drives, which shows it with {1.0 - SHARE**runs:.1%}",
+        found <= limit.most_m and SHARE**runs <= 1.0 - SHARE,
+    )
+
+
+def _order(grades: list[str], label: str, largest: pd.DataFrame) -> list[Claim]:
+    """Whether each grade is at least three times as good as the one before it at the end."""
+    own = largest[largest["estimator"] == label]
+    end = own[own["after_s"] == own["after_s"].max()].set_index("grade")["error_m"]
+    return [
+        judged(
+            f"{better} units are off by at most a third of {worse} ones at the end of the outage",
+            "(own limit)",
+            f"{end[better]:.2f} against {end[worse]:.2f} m",
+            end[better] <= end[worse] / 3.0,
+        )
+        for worse, better in pairwise(grades)
+    ]
+
+
+def _chart(largest: pd.DataFrame) -> Chart:
+    """The largest error over the time since the last fix, by grade and estimator."""
+    panel = Panel(
+        x=Axis(label="time since the last fix (s)"),
+        y=Axis(label="95 % of drives are within (m)", log=True),
+    )
+    for (grade, estimator), rows in largest.groupby(["grade", "estimator"], sort=False):
+        panel.series.append(curve(f"{grade}, {estimator}", rows["after_s"], rows["error_m"]))
+    return Chart(panels=[panel])
+
+
+IMU_GRADES = Study(
+    "how far off units of several grades are, the longer a receiver is silent", study, Options
+)

@@ -1,0 +1,118 @@
+"""The study of orientation from inertial samples: total error over each trial's movement.
+
+BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. What counts are the samples that its authors
+marked as movement; an error is the whole angle from the true orientation to the estimated one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.streams.sources import Source
+from replay.judging.errors.evaluation import Errors
+
+
+class InertialOptions(Parameters):
+    """What is claimed: the mean error over the trials of which estimator, in degrees."""
+
+    estimator: str = "bingham"
+    target_deg: float = 3.5
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: InertialOptions = setting.options
+    replayed = Runner(experiment, setting).run()
+    trials = movement_table(replayed.errors, replayed.sources)
+    means = {
+        str(name): float(rows["movement_rmse_deg"].mean())
+        for name, rows in trials.groupby("estimator", sort=False)
+    }
+    if options.estimator not in means:
+        raise BadInput(
+            f"no estimates of '{options.estimator}' during movement with truth; give a trial with both"
+        )
+    outcome = Outcome(input_sha256=hash_streams(replayed.sources))
+    outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
+    for trial, estimator, rmse_deg, _ in trials.to_numpy():
+        outcome.metrics[f"{estimator}.movement_rmse_deg.{trial}"] = rmse_deg
+    outcome.metrics.update(replayed.metrics(experiment.metrics))
+    outcome.tables["trials"] = trials
+    outcome.figures["trials"] = trials_figure(trials)
+    outcome.claims = _claims(means, options, int((trials["estimator"] == options.estimator).sum()))
+    return outcome
+
+
+def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.DataFrame:
+    """One row per trial and estimator: total RMSE over movement (deg), how many samples that are."""
+    rows = []
+    for errors in found:
+        moving = np.concatenate(
+            [
+                is_moving(source, errors.case, errors.time_ns[errors.run == run])
+                for run, source in enumerate(sources)
+            ]
+        )
+        total = np.linalg.norm(errors.error[moving][:, errors.rotation], axis=1)
+        if len(total):
+            rmse_deg = float(np.degrees(np.sqrt(np.mean(total**2))))
+            rows.append((errors.case, errors.estimator, rmse_deg, len(total)))
+    return pd.DataFrame(rows, columns=["trial", "estimator", "movement_rmse_deg", "samples"])
+
+
+def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """What the last message before each stamp says; the topic speaks at every change."""
+    stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
+    row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1
+    return (row >= 0) & (stream["value"][row.clip(0), 0] != 0.0)
+
+
+def trials_figure(trials: pd.DataFrame) -> Figure:
+    """Total RMSE over movement of every trial and estimator; on a logarithmic axis."""
+    figure = Figure(figsize=(8, 1.5 + 0.5 * trials["trial"].nunique()), layout="constrained")
+    axes = figure.subplots()
+    table = trials.pivot_table(index="trial", columns="estimator", values="movement_rmse_deg")
+    table = table[trials["estimator"].drop_duplicates().tolist()].iloc[::-1]
+    table.plot.barh(ax=axes, logx=True, legend=False)
+    axes.set(xlabel="total orientation RMSE over movement (deg)", ylabel="")
+    figure.legend(loc="outside upper center", ncols=table.shape[1])
+    return figure
+
+
+def _claims(means: dict[str, float], options: InertialOptions, trials: int) -> list[Claim]:
+    own = means[options.estimator]
+    rivals = {name: value for name, value in means.items() if name != options.estimator}
+    claims = [
+        judged(
+            f"mean total orientation RMSE over movement at most {options.target_deg:g} deg",
+            f"{options.target_deg:g} deg (own target; no tuning per trial)",
+            f"{own:.3f} deg over {trials} trials",
+            own <= options.target_deg,
+        )
+    ]
+    if rivals:
+        best = min(rivals, key=rivals.__getitem__)
+        claims.append(
+            judged(
+                "better than gyro alone, gyro minus bias and TRIAD alone",
+                "smaller mean error than each of them",
+                f"{own:.3f} deg against {rivals[best]:.3f} deg of {best}, the best of them",
+                own < rivals[best],
+            )
+        )
+    return claims
+
+
+INERTIAL = Study(
+    "orientation from inertial samples: error over movement, trial by trial", study, InertialOptions
+)

@@ -1,0 +1,220 @@
+"""Outages of a receiver that are made: fixes of a recording withheld, and errors where they are known.
+
+A window is a span whose fixes and velocities are withheld entirely, by the times of the receiver's rows.
+Windows that lie far enough apart share a run. Errors are horizontal, at the withheld rows.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicHermiteSpline
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+from replay.engine.vectors.tangent import states_at
+
+FIX, VELOCITY, TRUTH, INERTIAL = "/fix", "/velocity", "/truth", "/inertial"
+NEEDED = (FIX, VELOCITY, TRUTH, INERTIAL)
+COASTED, HERMITE = "constant-velocity", "hermite"
+# Estimates that lie further apart are not interpolated.
+_GAP_S = 1.0
+
+
+class Rows(NamedTuple):
+    """What the receiver wrote, a row for every fix; the plane is that of east and north.
+
+    Attributes:
+        time_ns: (n,), as it is written.
+        place: (n, 2), NaN where it is not known well enough to be a truth.
+        velocity: (n, 2), of the row, whenever that was measured.
+    """
+
+    time_ns: Integers
+    place: Floats
+    velocity: Floats
+
+    @property
+    def since_s(self) -> Floats:
+        """Seconds since the first row."""
+        return (self.time_ns - self.time_ns[0]) * 1e-9
+
+
+class Window(NamedTuple):
+    """A span (s since the first row) whose rows, by their numbers, are withheld."""
+
+    length_s: float
+    start_s: float
+    rows: Integers
+
+    @property
+    def name(self) -> str:
+        """What the window is called among the cases."""
+        return f"{self.length_s:g}s-at-{self.start_s:g}s"
+
+
+def rows_of(source: MemorySource) -> Rows:
+    """The receiver's rows of a recording; raises BadInput where a topic is missing or has no message."""
+    for topic in NEEDED:
+        if topic not in source.topics or not source.topics[topic].messages:
+            why = "; rows with a fixed solution make it, and there are none" if topic == TRUTH else ""
+            raise BadInput(
+                f"{source.name}: has no messages of {topic}{why}; outages are made of "
+                f"{', '.join(NEEDED)}"
+            )
+    fix, velocity, truth = (source.read([topic])[topic] for topic in (FIX, VELOCITY, TRUTH))
+    # a delay that the mapping states moves publish times alone
+    time_ns = fix.log_time_ns
+    place, speed = np.full((len(fix), 2), np.nan), np.full((len(fix), 2), np.nan)
+    for into, stream, values in (
+        (place, truth, truth["state"]),
+        (speed, velocity, velocity["velocity_mps"]),
+    ):
+        _, own, other = np.intersect1d(time_ns, stream.log_time_ns, return_indices=True)
+        into[own] = values[other, :2]
+    return Rows(time_ns, place, speed)
+
+
+def windows_of(rows: Rows, length_s: float, first_s: float, every_s: float) -> list[Window]:
+    """The windows of a length, of which all rows, the one before and the one after are a truth."""
+    since_s = rows.since_s
+    found = []
+    for start_s in np.arange(first_s, since_s[-1] - length_s, every_s).tolist():
+        inside = np.flatnonzero((since_s >= start_s) & (since_s < start_s + length_s))
+        if len(inside) and inside[0] > 0 and inside[-1] + 1 < len(since_s):
+            around = np.arange(inside[0] - 1, inside[-1] + 2)
+            if np.isfinite(rows.place[around]).all():
+                found.append(Window(length_s, start_s, inside))
+    return found
+
+
+def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[Window]]:
+    """Windows of a length that share a run: `apart` steps of `every_s` lie between their starts."""
+    shared: dict[int, list[Window]] = {}
+    for window in windows:
+        shared.setdefault(round((window.start_s - windows[0].start_s) / every_s) % apart, []).append(
+            window
+        )
+    return list(shared.values())
+
+
+def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> MemorySource:
+    """The recording without the rows of windows, of which it tells as outages."""
+    gone_ns = np.concatenate([rows.time_ns[:0], *(rows.time_ns[each.rows] for each in windows)])
+    streams = dict(source.streams)
+    for topic in (FIX, VELOCITY):
+        stream = streams[topic]
+        streams[topic] = stream.take(~np.isin(stream.log_time_ns, gone_ns))
+    start_s, length_s = (
+        np.array([getattr(each, name) for each in windows]) for name in ("start_s", "length_s")
+    )
+    begin_ns = rows.time_ns[0] + np.rint(1e9 * start_s).astype(np.int64)
+    streams[f"{FIX}/outages"] = make_stream(
+        f"{FIX}/outages",
+        schemas.OUTAGE,
+        begin_ns,
+        end_time_ns=begin_ns + np.rint(1e9 * length_s).astype(np.int64),
+    )
+    return replace(source, streams=streams)
+
+
+def coasted(rows: Rows, window: Window) -> Floats:
+    """Errors (m, 2) of the place and the velocity, as they are printed, of the row before."""
+    before = window.rows[0] - 1
+    ahead_s = (rows.since_s[window.rows] - rows.since_s[before])[:, None]
+    return rows.place[before] + ahead_s * rows.velocity[before] - rows.place[window.rows]
+
+
+def hermite(rows: Rows, window: Window) -> Floats:
+    """Errors (m, 2) of the cubic through the places and velocities of the rows at both ends.
+
+    It is the smoother of a white acceleration.
+    """
+    ends = [window.rows[0] - 1, window.rows[-1] + 1]
+    between = CubicHermiteSpline(rows.since_s[ends], rows.place[ends], rows.velocity[ends])
+    return between(rows.since_s[window.rows]) - rows.place[window.rows]
+
+
+def estimated(rows: Rows, window: Window, states: Stream) -> tuple[Floats, float]:
+    """Errors (m, 2) of estimates, NaN where there are none, and their NEES at the last withheld row."""
+    time_ns = rows.time_ns[window.rows]
+    plane = [states.components.index(name) for name in ("x_m", "y_m")]
+    place = states["mean"][:, plane]
+    found = states_at(states.publish_time_ns, place, time_ns, ("linear", "linear"), _GAP_S)
+    error = found - rows.place[window.rows]
+    if not np.isfinite(error[-1]).all():
+        return error, np.nan
+    last = np.searchsorted(states.publish_time_ns, time_ns[-1])
+    size = round(states["covariance"].shape[1] ** 0.5)
+    covariance = states["covariance"][last].reshape(size, size)[np.ix_(plane, plane)]
+    return error, float(error[-1] @ np.linalg.solve(covariance, error[-1]))
+
+
+def error_table(
+    rows: Rows, runs: Sequence[Sequence[Window]], outputs: Mapping[str, Ragged], labels: Sequence[str]
+) -> pd.DataFrame:
+    """One row per withheld row and estimator: window, seconds since its start, error, NEES at its end.
+
+    `runs` are the windows of each run of the outputs.
+    """
+    tables = []
+    for run, windows in enumerate(runs):
+        for window in windows:
+            for label, error, nees in _errors(rows, window, outputs, labels, run):
+                length_m = np.linalg.norm(error, axis=1)
+                tables.append(
+                    pd.DataFrame(
+                        {
+                            "estimator": label,
+                            "length_s": window.length_s,
+                            "start_s": window.start_s,
+                            "window": window.name,
+                            "since_s": rows.since_s[window.rows] - window.start_s,
+                            "error_m": length_m,
+                            "nees": np.where(np.arange(len(error)) == len(error) - 1, nees, np.nan),
+                        }
+                    )
+                )
+    return pd.concat(tables, ignore_index=True)
+
+
+def _errors(
+    rows: Rows, window: Window, outputs: Mapping[str, Ragged], labels: Sequence[str], run: int
+) -> Iterator[tuple[str, Floats, float]]:
+    for label in labels:
+        yield label, *estimated(rows, window, outputs[f"/estimates/{label}/state"].of_run(run))
+    yield COASTED, coasted(rows, window), np.nan
+    yield HERMITE, hermite(rows, window), np.nan
+
+
+def window_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """One row per window and estimator: the error at the end, the RMSE over the window, the NEES."""
+    by = errors.groupby(["estimator", "length_s", "start_s", "window"], sort=False)
+    found = by.agg(
+        end_m=("error_m", "last"),
+        over_rmse_m=("error_m", lambda error: np.sqrt(np.mean(np.square(error)))),
+        end_nees=("nees", "last"),
+    )
+    return found.reset_index()
+
+
+def length_table(windows: pd.DataFrame) -> pd.DataFrame:
+    """One row per estimator and length: root mean square errors over the windows, and the mean NEES."""
+    by = windows.groupby(["estimator", "length_s"], sort=False)
+    found = by.agg(
+        windows=("window", "size"),
+        end_rmse_m=("end_m", _root_mean_square),
+        end_median_m=("end_m", "median"),
+        over_rmse_m=("over_rmse_m", _root_mean_square),
+        end_nees=("end_nees", "mean"),
+    )
+    return found.reset_index()
+
+
+def _root_mean_square(values: pd.Series) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

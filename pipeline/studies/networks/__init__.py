@@ -1,0 +1,1 @@
+"""Studies of sensor networks and robots that share estimates; begin with `networks`."""

@@ -1,0 +1,242 @@
+"""The study of robots that share estimates under stress, on recorded logs.
+
+When a robot sees another, both get a message. Here some of these sightings are taken out of the log: all
+but one in an interval, a random half, those of a robot that leaves; or a robot is sure of a wrong start.
+The estimators fuse at once, so messages that are late are left to `network-stress`. The claims are ours,
+and were set before their numbers were seen; intervals are over the robots.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import PositiveFloat, PositiveInt
+
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.parameters import Parameters
+from replay.engine.streams.sources import MemorySource
+
+Booleans = NDArray[np.bool_]
+
+CI, UNGATED, NAIVE = "ci", "ungated", "naive"
+OWN = "(own claim)"
+LIMIT = 2.5  # of a mean NEES of 2 components, as in the study of cooperation
+MESSAGE_BYTES = 8 * (1 + 3 + 6)  # stamp, pose, triangle of its covariance
+SEED = 1
+
+
+class CooperativeStressOptions(Parameters):
+    """How often two robots share at most; which leaves for the middle third, and which starts wrong."""
+
+    intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)
+    leaving: PositiveInt = 5
+    liar: PositiveInt = 1
+    lie_m: PositiveFloat = 2.0
+
+
+# Which sightings of robots are kept: of a stream, the robot that sees, and which rows are such.
+Keep = Callable[[Stream, int, Booleans], Booleans]
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: CooperativeStressOptions = setting.options
+    runner = Runner(experiment, setting)
+    calm = runner.run()
+    numbers = _robots(calm.sources[0], options)
+    generator = np.random.default_rng(SEED)
+    cases: dict[str, Callable[[MemorySource], MemorySource]] = {
+        f"once in {interval_s:g} s": partial(
+            _edited, keep=partial(_once_in, interval_s), numbers=numbers
+        )
+        for interval_s in options.intervals_s
+    }
+    cases["half lost"] = partial(_edited, keep=partial(_half, generator), numbers=numbers)
+    cases["leaving"] = partial(_edited, keep=partial(_while_there, options.leaving), numbers=numbers)
+    cases["lying"] = partial(_lying, options=options)
+    parts = [_rows(calm, calm.sources, numbers).assign(case="calm")]
+    for name, edit in cases.items():
+        sources = [edit(source) for source in calm.sources]
+        parts.append(_rows(runner.replay(sources), sources, numbers).assign(case=name))
+    table = pd.concat(parts, ignore_index=True)
+    outcome = Outcome(tables={"robots": table})
+    for row in table.to_dict("records"):
+        case = f"{row['case']}-{row['robot']}".replace(" ", "-").replace(".", "_")
+        for quantity in ("position_rmse_m", "position_nees"):
+            outcome.metrics[f"{row['estimator']}.{quantity}.{case}"] = row[quantity]
+    outcome.claims = _claims(table, f"robot{options.liar}")
+    outcome.figures["bandwidth"] = _chart(table)
+    outcome.input_sha256 = hash_streams(calm.sources)
+    return outcome
+
+
+def _robots(source: MemorySource, options: CooperativeStressOptions) -> list[int]:
+    """The numbers of a log's robots; raises BadInput where one that is to leave or to lie is none."""
+    topics = [topic.removeprefix("/robot").partition("/") for topic in source.streams]
+    numbers = sorted(int(number) for number, _, leaf in topics if leaf == "range_bearing")
+    for name in ("leaving", "liar"):
+        if getattr(options, name) not in numbers:
+            raise BadInput(
+                f"options.{name} = {getattr(options, name)} is not one of the robots "
+                f"{', '.join(map(str, numbers))} of {source.name}; name one of them"
+            )
+    return numbers
+
+
+def _edited(source: MemorySource, keep: Keep, numbers: Sequence[int]) -> MemorySource:
+    """The log with some of the sightings of robots left out."""
+    streams = dict(source.streams)
+    for number in numbers:
+        stream = streams[f"/robot{number}/range_bearing"]
+        fellow = np.isin(stream["target_id"], numbers)
+        streams[stream.topic] = stream.take(np.flatnonzero(~fellow | keep(stream, number, fellow)))
+    return replace(source, streams=streams)
+
+
+def _once_in(interval_s: float, stream: Stream, _: int, fellow: Booleans) -> Booleans:
+    """At most one sighting of each robot in an interval."""
+    kept = np.zeros(len(stream), bool)
+    for target in np.unique(stream["target_id"][fellow]):
+        last_ns = -np.inf
+        for row in np.flatnonzero(stream["target_id"] == target).tolist():
+            if stream.publish_time_ns[row] - last_ns >= interval_s * 1e9:
+                kept[row], last_ns = True, stream.publish_time_ns[row]
+    return kept
+
+
+def _half(generator: np.random.Generator, stream: Stream, _: int, __: Booleans) -> Booleans:
+    """A random half."""
+    return generator.uniform(size=len(stream)) < 0.5
+
+
+def _while_there(leaving: int, stream: Stream, robot: int, _: Booleans) -> Booleans:
+    """Those in which the leaving robot has no part, in the middle third of the log."""
+    times = stream.publish_time_ns
+    first, second = times[0] + (times[-1] - times[0]) * np.array([1, 2]) // 3
+    is_away = (times >= first) & (times < second)
+    return ~is_away | ((robot != leaving) & (stream["target_id"] != leaving))
+
+
+def _lying(source: MemorySource, options: CooperativeStressOptions) -> MemorySource:
+    """The log with one robot as sure as ever of a start that is wrong."""
+    prior = source.streams[f"/robot{options.liar}/prior"]
+    mean = prior["mean"].copy()
+    mean[:, 0] += options.lie_m
+    moved = replace(prior, columns={**prior.columns, "mean": mean})
+    return replace(source, streams={**source.streams, prior.topic: moved})
+
+
+def _rows(replayed: Replayed, sources: Sequence[MemorySource], numbers: Sequence[int]) -> pd.DataFrame:
+    """RMSE and NEES of the position by estimator and robot, and what a robot sends a second."""
+    sightings, span_s = 0, 0.0
+    for source in sources:
+        seen = [source.streams[f"/robot{number}/range_bearing"] for number in numbers]
+        sightings += sum(int(np.isin(each["target_id"], numbers).sum()) for each in seen)
+        first_ns, last_ns = source.extent("publish_time")
+        span_s += (last_ns - first_ns) * 1e-9
+    rows = []
+    for errors in replayed.errors:
+        place = errors.position
+        error, covariance = errors.error[:, place], errors.covariance[:, place][:, :, place]
+        nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+        rows.append(
+            {
+                "estimator": errors.estimator,
+                "robot": errors.case.partition("/")[0],
+                "position_rmse_m": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+                "position_nees": float(np.mean(nees)),
+                # a sighting is a message to either of the two
+                "bytes_per_s": 2 * sightings * MESSAGE_BYTES / span_s / len(numbers),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _claims(table: pd.DataFrame, liar: str) -> list[Claim]:
+    """Whether CI stays consistent under each stress, and what the gate is worth beside a liar."""
+
+    def nees(case: str, estimator: str) -> Interval:
+        chosen = (table["case"] == case) & (table["estimator"] == estimator)
+        if case == "lying":
+            chosen &= table["robot"] != liar
+        return mean_interval(table["position_nees"][chosen].to_list())
+
+    cases = [case for case in table["case"].unique() if case != "lying"]
+    found = {case: nees(case, CI) for case in cases}
+    worst = max(found, key=lambda case: found[case].high)
+    naive = {case: nees(case, NAIVE) for case in cases}
+    best = min(naive, key=lambda case: naive[case].low)
+    gated, ungated = nees("lying", CI), nees("lying", UNGATED)
+    consistent = f"confirmed if the interval's upper end is {LIMIT:g} or less"
+    return [
+        judged(
+            "CI is consistent when robots seldom share, when messages are lost, when one leaves",
+            OWN,
+            f"NEES of the position, most for '{worst}': {_told(found[worst])}",
+            found[worst].high <= LIMIT,
+            consistent,
+        ),
+        judged(
+            "fused as if they were independent, robots are inconsistent in all of these cases",
+            OWN,
+            f"NEES of the position, least for '{best}': {_told(naive[best])}",
+            naive[best].low > LIMIT,
+            f"confirmed if the interval's lower end is above {LIMIT:g}",
+        ),
+        judged(
+            "a robot that is sure of a wrong start makes the others inconsistent without a gate",
+            OWN,
+            f"NEES of the others' position {_told(ungated)}",
+            ungated.low > LIMIT,
+            f"confirmed if the interval's lower end is above {LIMIT:g}",
+        ),
+        judged(
+            "with the gate the others stay consistent beside it",
+            OWN,
+            f"NEES of the others' position {_told(gated)}",
+            gated.high <= LIMIT,
+            consistent,
+        ),
+    ]
+
+
+def _told(interval: Interval) -> str:
+    return f"{interval.mean:.3g}, 95 % {interval.low:.3g} to {interval.high:.3g}"
+
+
+def _chart(table: pd.DataFrame) -> Chart:
+    """Errors and NEES, means over the robots, over what a robot sends a second."""
+    chosen = table[table["case"].str.startswith("once") | (table["case"] == "calm")]
+    means = chosen.groupby(["estimator", "case", "bytes_per_s"], sort=False).mean(numeric_only=True)
+    panels = []
+    for quantity, label in (
+        ("position_rmse_m", "RMSE of the position (m)"),
+        ("position_nees", "NEES of the position"),
+    ):
+        panel = Panel(x=Axis(label="sent by a robot (B/s)", log=True), y=Axis(label=label, log=True))
+        for estimator, rows in means.reset_index().groupby("estimator", sort=False):
+            rows = rows.sort_values("bytes_per_s")
+            panel.series.append(
+                curve(str(estimator), rows["bytes_per_s"], rows[quantity], "line+markers")
+            )
+        panels.append(panel)
+    panels[1].series.append(level("consistent", np.sort(means.reset_index()["bytes_per_s"]), 2))
+    return Chart(columns=2, panels=panels)
+
+
+COOPERATIVE_STRESS = Study(
+    "robots that share seldom, leave, or start at a wrong place: errors and consistency",
+    study,
+    CooperativeStressOptions,
+)

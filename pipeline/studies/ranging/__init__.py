@@ -1,0 +1,1 @@
+"""Studies of ultra-wideband ranges; begin with `ranging`."""

@@ -1,0 +1,123 @@
+"""What the studies of ranges share: recordings in a folder, their replay, errors by the truth."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.localization import summary_table
+from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.parameters import Parameters
+from recorders.recording import import_run
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.sources import MemorySource, memory_source
+
+
+class RangingOptions(Parameters):
+    """How much older than stamped ranges are taken to be, beside an estimator's own `range_delay_s`."""
+
+    range_delay_s: float = 0.0
+
+
+class Recording(NamedTuple):
+    """One recording: its name, where it lies, and the files beside that which belong to it."""
+
+    name: str
+    path: Path
+    more: tuple[Path, ...] = ()
+
+
+class Replayed(NamedTuple):
+    """A recording with the outputs of every estimator, by the last parts of their topics."""
+
+    recording: Recording
+    source: MemorySource
+    outputs: Mapping[str, Mapping[str, Stream]]
+
+
+def recordings(setting: Setting, pattern: str) -> list[Path]:
+    """The files of this name in the folder of data or below; raises BadInput where there are none."""
+    assert setting.data is not None
+    found = sorted(setting.data.rglob(pattern)) if setting.data.is_dir() else []
+    if not found:
+        raise BadInput(
+            f"{setting.data}: has no {pattern}, nor has a folder in it; give the recording's folder "
+            "or one above it"
+        )
+    return found
+
+
+def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -> Iterator[Replayed]:
+    """The recordings one by one; logs are kept of all, the timeline of the first."""
+    assert experiment.import_ is not None
+    delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
+    estimators = dict(experiment.estimators)
+    if delay_s:
+        for label, values in estimators.items():
+            estimators[label] = {**values, "range_delay_s": values.get("range_delay_s", 0.0) + delay_s}
+    for number, recording in enumerate(found):
+        values = {**experiment.import_.parameters, "more": [str(path) for path in recording.more]}
+        source = memory_source(*import_run(experiment.import_.source, recording.path, values))
+        outputs = runner.replay([source], estimators).outputs
+        folder = recording.name if len(found) > 1 else ""
+        runner.keep([source], outputs, folder, drawn=None if number else "")
+        by_label: dict[str, dict[str, Stream]] = {label: {} for label in estimators}
+        for topic, ragged in outputs.items():
+            label, _, leaf = topic.removeprefix("/estimates/").rpartition("/")
+            if label in by_label:
+                by_label[label][leaf] = ragged.of_run(0)
+        yield Replayed(recording, source, by_label)
+
+
+class Reference(NamedTuple):
+    """The truth: stamps in order (n,), and its components (n, d); those of angles do not wrap."""
+
+    time_ns: Integers
+    state: Floats
+
+    def at(self, time_ns: Integers) -> Floats:
+        """Linear between stamps."""
+        since = (self.time_ns - self.time_ns[0]) * 1e-9
+        wanted = (time_ns - self.time_ns[0]) * 1e-9
+        return np.stack([np.interp(wanted, since, column) for column in self.state.T], axis=1)
+
+
+def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
+    """The mean NIS of single ranges within a span."""
+    stamps = innovations.publish_time_ns
+    inside = (stamps >= begin_ns) & (stamps <= end_ns)
+    return float(np.mean(innovations["normalised_innovation_squared"][inside]))
+
+
+def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> tuple[Outcome, pd.DataFrame]:
+    """Metrics and tables of figures by estimator and recording, and the table of all."""
+    table = pd.DataFrame(rows)
+    outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
+    for row in rows:
+        outcome.metrics |= {
+            f"{row['estimator']}.{name}.{row['recording']}": float(value)
+            for name, value in row.items()
+            if name not in ("estimator", "recording")
+        }
+    outcome.tables |= {"recordings": table, "summary": summary_table(outcome.metrics)}
+    notes = [(each.recording.name, *note) for each in found for note in each.source.run.notes.items()]
+    outcome.tables["notes"] = pd.DataFrame(notes, columns=["recording", "what", "count"])
+    return outcome, table
+
+
+def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:
+    """Errors of every estimator (n,) over time, of one recording."""
+    begin_ns = min(int(time_ns[0]) for time_ns, _ in errors.values() if len(time_ns))
+    panel = Panel(x=Axis(label="time (s)"), y=Axis(label=label, log=True))
+    for name, (time_ns, error) in errors.items():
+        rows = np.unique(np.linspace(0, max(len(time_ns) - 1, 0), 600).astype(int))
+        panel.series.append(curve(name, (time_ns[rows] - begin_ns) * 1e-9, error[rows]))
+    return Chart(panels=[panel])

@@ -1,0 +1,238 @@
+"""The study of positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
+
+Published errors are those of a part of each path, which begins and ends where it enters a place. The
+truth is linear between its rows, but for those at another height than the others by half a metre.
+Published tracks are scored at their stamps, ours at the rows of the truth.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.studies.ranging.ranging import (
+    RangingOptions,
+    Recording,
+    Reference,
+    Replayed,
+    errors_chart,
+    mean_nis,
+    outcome_of,
+    recordings,
+    replayed,
+)
+from pipeline.studies.toolkit.repetitions import rms_length
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats
+
+PUBLISHED = ("LS", "ESKF")
+
+
+class Place(Parameters):
+    """Where a window begins or ends: a part of the plane."""
+
+    x_above_m: float = -np.inf
+    x_below_m: float = np.inf
+    y_above_m: float = -np.inf
+    y_below_m: float = np.inf
+
+    def holds(self, position: Floats) -> Booleans:
+        """Which positions (n, 2) lie there."""
+        x, y = position.T
+        inside = (x > self.x_above_m) & (x <= self.x_below_m)
+        return inside & (y > self.y_above_m) & (y <= self.y_below_m)
+
+
+class Window(Parameters):
+    """The part of a path that is scored."""
+
+    begin: Place = Place()
+    end: Place = Place()
+
+
+class Target(Parameters):
+    """What the best filter and the smoother are held to."""
+
+    filter_m: PositiveFloat
+    smoother_m: PositiveFloat
+
+
+class UwbOutdoorOptions(RangingOptions):
+    """Windows by the name of a folder that a recording lies in; without one all of it is scored.
+
+    Targets are those of single recordings, by name. `level_m` is how far from the path's median height
+    a row of the truth may lie.
+    """
+
+    windows: dict[str, Window] = {}
+    targets: dict[str, Target] = {}
+    level_m: PositiveFloat = 0.5
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: UwbOutdoorOptions = setting.options
+    folders = [path.parent for path in recordings(setting, "trajectory.csv")]
+    named = [Recording("-".join(each.resolve().parts[-3:]), each) for each in folders]
+    found = list(replayed(experiment, setting, named))
+    rows, claims, drawn = [], [], {}
+    for each in found:
+        window = next(
+            (
+                options.windows[part]
+                for part in each.recording.path.resolve().parts
+                if part in options.windows
+            ),
+            None,
+        )
+        truth, begin_ns, end_ns = scored_truth(each, window, options.level_m)
+        published = {
+            track: published_rmse(each, track, truth, begin_ns, end_ns)
+            for track in PUBLISHED
+            if f"/published/{track}" in each.source.streams
+        }
+        own = {}
+        for label, outputs in each.outputs.items():
+            inside = (truth.time_ns >= begin_ns) & (truth.time_ns <= end_ns)
+            stamps, states = truth.time_ns[inside], outputs["state"]
+            estimate = Reference(states.publish_time_ns, states["mean"][:, :2]).at(stamps)
+            error = estimate - truth.state[inside, :2]
+            nis = mean_nis(outputs["innovation"], begin_ns, end_ns)
+            own[label] = {"position_rmse_m": rms_length(error), "nis": nis}
+            if each is found[0]:
+                drawn[label] = stamps, np.hypot(*error.T)
+        name = each.recording.name
+        paper = (
+            printed(each.recording.path) if window else {}
+        )  # errors of other paths are of unknown parts
+        rows += [{"estimator": label, "recording": name, **figures} for label, figures in own.items()]
+        rows += [
+            {"estimator": f"published-{track}", "recording": name, "position_rmse_m": rmse[0]}
+            for track, rmse in published.items()
+        ]
+        claims += _claims(name, paper, published, own, options.targets.get(name))
+    outcome, _ = outcome_of(found, rows)
+    outcome.metrics = {key: value for key, value in outcome.metrics.items() if value == value}
+    outcome.figures["errors"] = errors_chart(drawn, f"position error (m), {found[0].recording.name}")
+    outcome.claims = claims
+    return outcome
+
+
+def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[Reference, int, int]:
+    """The truth x, y, z, and the stamps between which is scored; BadInput where it misses the window."""
+    stream = of.source.streams["/truth"]
+    time_ns, state = stream.publish_time_ns, stream["state"][:, :3]
+    begin, end = 0, len(time_ns) - 1
+    if window is not None:
+        starts = np.flatnonzero(window.begin.holds(state[:, :2]))
+        begin = int(starts[0]) if len(starts) else len(time_ns)
+        ends = begin + np.flatnonzero(window.end.holds(state[begin:, :2]))
+        if not len(ends):
+            raise BadInput(
+                f"{of.recording.path}: its path does not cross the window; set options.windows to "
+                "one of its own, or to {} for all of it"
+            )
+        end = int(ends[0])
+    level = np.abs(state[:, 2] - np.median(state[:, 2])) < level_m
+    return Reference(time_ns[level], state[level]), int(time_ns[begin]), int(time_ns[end])
+
+
+def published_rmse(
+    of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
+) -> tuple[float, float]:
+    """The error in the plane, and in space, of a published track within the window."""
+    stream = of.source.streams[f"/published/{track}"]
+    inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
+    error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
+    return rms_length(error[:, :2]), rms_length(error)
+
+
+def printed(folder: Path) -> dict[str, float]:
+    """The errors that a recording comes with, by their names; none without such a file."""
+    path = folder / "RMSD_results.txt"
+    if not path.exists():
+        return {}
+    lines = re.findall(r"(\w+) RMSE(_2d)?: *([\d.]+)", path.read_text(encoding="utf-8"))
+    return {f"{track}{plane}": float(value) for track, plane, value in lines}
+
+
+def _claims(
+    name: str,
+    paper: Mapping[str, float],
+    published: Mapping[str, tuple[float, float]],
+    own: dict[str, dict[str, float]],
+    target: Target | None,
+) -> list[Claim]:
+    """What is claimed of one recording, as far as its files and the estimators that were run allow."""
+    rmse = {label: figures["position_rmse_m"] for label, figures in own.items()}
+    claims = []
+    if "LS_2d" in paper and "LS" in published:
+        plane, space = published["LS"]
+        claims.append(
+            judged(
+                f"{name}: the published least squares errs as is printed, to four digits",
+                f"{paper['LS_2d']:.5g} m in the plane, {paper.get('LS', np.nan):.5g} m in space",
+                f"{plane:.5g} m, {space:.5g} m",
+                abs(plane - paper["LS_2d"]) < 5e-5 and abs(space - paper.get("LS", space)) < 5e-5,
+            )
+        )
+    filters = {each: rmse[each] for each in ("ekf", "earlier", "student") if each in rmse}
+    if filters and published:
+        best, rival = min(filters, key=lambda each: filters[each]), min(published.values())[0]
+        limit = target.filter_m if target else rival
+        claims.append(
+            judged(
+                f"{name}: robust filters of ranges alone are better than the published tracks",
+                ", ".join(f"{track} {each[0]:.3f} m" for track, each in published.items())
+                + (f"; own target {limit:g} m" if target else ""),
+                f"{', '.join(f'{label} {value:.3f} m' for label, value in filters.items())}",
+                max(filters.values()) < rival and filters[best] <= limit,
+                "one setting for all recordings",
+            )
+        )
+    if target and "smoother:ekf" in rmse:
+        claims.append(
+            judged(
+                f"{name}: the smoother gains over the filter",
+                f"own target {target.smoother_m:g} m",
+                f"{rmse['smoother:ekf']:.3f} m",
+                rmse["smoother:ekf"] <= target.smoother_m,
+            )
+        )
+    wanted = ("ekf", "not-robust", "dropping", "dropping-with-a-way-back", "earlier")
+    if not set(wanted) <= rmse.keys():
+        return claims
+    robust, plain, dropping, returning, earlier = (rmse[each] for each in wanted)
+    return [
+        *claims,
+        judged(
+            f"{name}: ranges that are off spoil a filter that takes them as they are",
+            "more than 1 m",
+            f"{plain:.2f} m against {robust:.3f} m",
+            plain > 1.0 and plain > 2.0 * robust,
+        ),
+        judged(
+            f"{name}: leaving them out needs a way back",
+            "dropping can lose the track",
+            f"{dropping:.2f} m when dropped, {returning:.2f} m with a way back after 1 s, "
+            f"{robust:.3f} m inflated",
+            dropping > robust and returning < dropping,
+        ),
+        judged(
+            f"{name}: ranges lag: stamps .1 s earlier fit better",
+            ".834 m (A), .297 m (B)" if target else "own expectation",
+            f"{earlier:.3f} m against {robust:.3f} m",
+            earlier < robust,
+        ),
+    ]
+
+
+UWB_OUTDOOR = Study(
+    "positions from ranges to anchors outdoors, beside published tracks", study, UwbOutdoorOptions
+)

@@ -1,0 +1,157 @@
+"""The study of poses from ranges between anchors and tags: lias, ultra-wideband with motion capture.
+
+Estimates are scored from `skip_s` on at their stamps; the truth is linear between its own. The body of
+the motion capture is not quite that of the tags, so that errors have a mean that no filter can know:
+figures are also given without it.
+"""
+
+from typing import Any
+
+import numpy as np
+from pydantic import NonNegativeFloat
+
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.studies.ranging.ranging import (
+    RangingOptions,
+    Recording,
+    Reference,
+    Replayed,
+    errors_chart,
+    mean_nis,
+    outcome_of,
+    recordings,
+    replayed,
+)
+from pipeline.studies.toolkit.repetitions import rms_length
+from recorders.errors import BadInput
+from recorders.models.orientation import heading
+from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats, Integers
+
+ASKED = 0.05  # how near the reference's figures ours have to be
+
+
+class UwbPoseOptions(RangingOptions):
+    """When scoring begins, and the yaw of the tags' frame against the truth's body."""
+
+    skip_s: NonNegativeFloat = 2.0
+    mounting_yaw_deg: float = 0.0
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    pairs = []
+    for path in recordings(setting, "UWB*.csv"):
+        captured = path.with_name(path.name.replace("UWB", "motion_capture", 1))
+        if not captured.exists():
+            raise BadInput(
+                f"{path}: has no {captured.name} beside it, the motion capture of the run; give the "
+                "folder as published"
+            )
+        name = path.stem.removeprefix("UWB").strip("_") or path.parent.name
+        pairs.append(Recording(name, path, (captured,)))
+    found = list(replayed(experiment, setting, pairs))
+    rows: list[dict[str, Any]] = []
+    drawn = {}
+    for each in found:
+        for label in each.outputs:
+            figures, time_ns, error = figures_of(each, label, setting.options)
+            rows.append({"estimator": label, "recording": each.recording.name, **figures})
+            if each is found[0]:
+                drawn[label] = time_ns, np.hypot(error[:, 0], error[:, 1])
+    outcome, table = outcome_of(found, rows)
+    outcome.figures["errors"] = errors_chart(drawn, f"position error (m), {found[0].recording.name}")
+    for name in table["recording"].unique():
+        of_one: Any = table[table["recording"] == name].set_index("estimator").to_dict("index")
+        outcome.claims += _claims(str(name), of_one)
+    return outcome
+
+
+def figures_of(
+    of: Replayed, label: str, options: UwbPoseOptions
+) -> tuple[dict[str, float], Integers, Floats]:
+    """The figures of one estimator, and its errors x, y, heading (n, 3) with their stamps (n,)."""
+    captured = of.source.streams["/truth"]
+    order = np.argsort(captured.publish_time_ns, kind="stable")
+    yaw = np.unwrap(heading(captured["state"][order, 3:7])) + np.radians(options.mounting_yaw_deg)
+    truth = Reference(
+        captured.publish_time_ns[order], np.column_stack([captured["state"][order, :2], yaw])
+    )
+    states = of.outputs[label]["state"]
+    stamps = states.publish_time_ns
+    begin_ns = max(int(stamps[0]) + round(options.skip_s * 1e9), int(truth.time_ns[0]))
+    rows = (stamps >= begin_ns) & (stamps <= truth.time_ns[-1])
+    if not rows.any():
+        raise BadInput(
+            f"{of.recording.path}: no estimate of {label} is within the span of the motion capture"
+        )
+    error = states["mean"][rows, :3] - truth.at(stamps[rows])
+    error[:, 2] = wrap_angle(error[:, 2])
+    size = round(np.sqrt(states["covariance"].shape[1]))
+    information = np.linalg.inv(states["covariance"][rows].reshape(-1, size, size)[:, :3, :3])
+    around = error - error.mean(axis=0)
+    nees, nees_around = (
+        float(np.mean(np.einsum("ki,kij,kj->k", each, information, each))) for each in (error, around)
+    )
+    figures = {
+        "position_rmse_m": rms_length(error[:, :2]),
+        "heading_rmse_deg": float(np.degrees(rms_length(error[:, 2:]))),
+        "position_spread_m": rms_length(around[:, :2]),
+        "heading_spread_deg": float(np.degrees(rms_length(around[:, 2:]))),
+        "nis": mean_nis(of.outputs[label]["innovation"], begin_ns, int(truth.time_ns[-1])),
+        "nees": nees,
+        "nees_around_mean": nees_around,
+    }
+    return figures, stamps[rows], error
+
+
+def _claims(name: str, figures: dict[Any, dict[str, float]]) -> list[Claim]:
+    """What is claimed of one recording, where the estimators that it is of were run."""
+    if not {"biased", "ekf", "cautious", "likeliest", "links"} <= figures.keys():
+        return []
+    biased, plain, cautious, likeliest, links = (
+        figures[label] for label in ("biased", "ekf", "cautious", "likeliest", "links")
+    )
+    return [
+        judged(
+            f"{name}: a common bias that is known halves the error of the position",
+            ".154 m without, .0758 m with",
+            f"{biased['position_rmse_m']:.3f} m without, {plain['position_rmse_m']:.4f} m with",
+            plain["position_rmse_m"] < 0.6 * biased["position_rmse_m"],
+        ),
+        judged(
+            f"{name}: the likeliest white noise has an NIS of 1 and is too sure of itself",
+            "NIS 1.00, NEES 54 of 3, position no better (.078 m)",
+            f"NIS {likeliest['nis']:.2f}, NEES {likeliest['nees']:.0f}, "
+            f"{likeliest['position_rmse_m']:.4f} m",
+            abs(likeliest["nis"] - 1.0) < 0.1
+            and likeliest["nees"] > 30.0
+            and likeliest["position_rmse_m"] > plain["position_rmse_m"] * (1.0 - ASKED),
+            "errors of ranges last for seconds; innovations do not see them",
+        ),
+        judged(
+            f"{name}: three times the noise is the plain mend: as accurate, and more nearly consistent",
+            ".0755 m, NIS .07, NEES 6.5",
+            f"{cautious['position_rmse_m']:.4f} m, NIS {cautious['nis']:.3f}, "
+            f"NEES {cautious['nees']:.1f}",
+            cautious["position_rmse_m"] < plain["position_rmse_m"] * (1.0 + ASKED)
+            and cautious["nees"] < 0.5 * plain["nees"],
+        ),
+        judged(
+            f"{name}: with errors of each link that last in the state, NIS is about 1 and the "
+            "uncertainty is told: NEES about the mean error below that of white noise, and at most 6 "
+            "of 3",
+            "own claim",
+            f"NIS {links['nis']:.2f}, NEES {links['nees_around_mean']:.1f} about the mean error, with "
+            f"the likeliest white noise {likeliest['nees_around_mean']:.1f}; "
+            f"{links['position_rmse_m']:.4f} m",
+            abs(links["nis"] - 1.0) < 0.2
+            and links["nees_around_mean"] <= 6.0
+            and links["nees_around_mean"] < likeliest["nees_around_mean"],
+        ),
+    ]
+
+
+UWB_POSE = Study("poses in the plane from ranges between anchors and tags", study, UwbPoseOptions)

@@ -1,0 +1,126 @@
+"""What the studies of the S2KF's paper share: filters against the one with the exact moments.
+
+An experiment's runs are replayed for several seeds, because errors differ more between seeds than
+between sample sets of one kind; each seed is an ensemble of its own.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import Field, PositiveInt
+
+from pipeline.output.charts import Axis, Panel, curve
+from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.runner import Runner
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+
+Floats = NDArray[np.float64]
+REFERENCE = "analytic"
+
+
+class Options(Parameters):
+    """How many data seeds to average over, and how many rotations of the S2KF's sets to try beside."""
+
+    data_seeds: PositiveInt = 4
+    rotations: Annotated[int, Field(ge=0)] = 0
+
+
+class Track(NamedTuple):
+    """One filter's estimates of an ensemble; NaN from where a run failed."""
+
+    mean: Floats
+    """(runs, steps, n)"""
+    covariance: Floats
+    """(runs, steps, n, n)"""
+
+    @property
+    def failed(self) -> int:
+        """How many runs did not reach the last step."""
+        return int(np.isnan(self.mean[:, -1, 0]).sum())
+
+
+class Ensemble(NamedTuple):
+    """The runs of one seed: their truth (runs, steps, n) after the start, and every filter's track."""
+
+    sources: list[MemorySource]
+    truth: Floats
+    tracks: dict[str, Track]
+
+
+def ensembles(
+    experiment: Experiment,
+    setting: Setting,
+    options: Options,
+    extra: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    written: bool = True,
+) -> Iterator[Ensemble]:
+    """Record and replay the experiment for every seed; the first runs' logs are those of the first.
+
+    `extra` estimators are replayed too, but not written, nor is anything unless `written`. Raises
+    BadInput where the reference is not among the estimators.
+    """
+    if REFERENCE not in experiment.estimators:
+        raise BadInput(f"this study compares with the estimator '{REFERENCE}'; add it to the experiment")
+    for number in range(options.data_seeds):
+        again = experiment.model_copy(update={"seed": experiment.seed + number})
+        runner = Runner(again, setting)
+        sources = runner.obtain()
+        outputs = replay_in_memory(sources, experiment.estimators, progress=setting.progress)
+        if number == 0 and written:
+            runner.keep(sources, outputs)
+        outputs |= replay_in_memory(sources, extra or {}, progress=setting.progress)
+        truth = np.stack([source.streams["/truth"]["state"][1:] for source in sources])
+        labels = [*experiment.estimators, *(extra or {})]
+        yield Ensemble(
+            sources,
+            truth,
+            {label: track(outputs[f"/estimates/{label}/state"], truth.shape[1]) for label in labels},
+        )
+
+
+def track(estimates: Ragged, steps: int) -> Track:
+    """The estimates of all runs as arrays; a run's estimates go from the first step to its failure."""
+    counts = np.diff(estimates.offsets)
+    there = np.arange(steps) < counts[:, None]
+    size = estimates["mean"].shape[1]
+    mean = np.full((len(counts), steps, size), np.nan)
+    covariance = np.full((len(counts), steps, size, size), np.nan)
+    mean[there] = estimates["mean"]
+    covariance[there] = estimates["covariance"].reshape(-1, size, size)
+    return Track(mean, covariance)
+
+
+def rmse(difference: Floats) -> Floats:
+    """Root mean square by step of differences (runs, steps, ...), over the runs that have one."""
+    squared = np.sum(difference**2, axis=tuple(range(2, difference.ndim)))
+    return np.sqrt(np.nanmean(squared, axis=0))
+
+
+def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
+    """One line per estimator over the steps, averaged over the seeds."""
+    mean = steps.groupby(["estimator", "step"], sort=False)[quantity].mean()
+    lines = {str(name): mean[name] for name in mean.index.get_level_values("estimator").unique()}
+    return Panel(
+        x=Axis(label="step"),
+        y=Axis(label=label),
+        series=[curve(name, line.index, line) for name, line in lines.items()],
+    )
+
+
+def falling(values: Sequence[float]) -> bool:
+    """Whether every value is below the one before it."""
+    return bool(np.all(np.diff(values) < 0))
+
+
+def averages(rows: pd.DataFrame, quantity: str) -> dict[str, float]:
+    """The average over steps and seeds by estimator."""
+    mean = rows.groupby("estimator", sort=False)[quantity].mean()
+    return {str(name): float(value) for name, value in mean.items()}

@@ -1,0 +1,325 @@
+"""How many samples pay in a linear regression Kalman filter: from 2 to 20 dimensions, and on drives.
+
+Moments come first, apart from any filter: waves y = sin(k'x + phase) of x ~ N(0, I) have exact ones, by
+    E exp(i k'x) = exp(-|k|^2 / 2).
+The vectors k point in all directions, or along the axes, as a sine of the heading does. The samplings
+are those of the experiment's estimators, which then follow robots and vehicles.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from time import process_time
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import MetricValue, Outcome
+from pipeline.runs.ensemble import hash_streams, judge, replay_in_memory
+from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.repetitions import Interval, mean_interval, rmse_of_runs
+from pipeline.studies.tracking.tracking import lower
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.arrays import Floats
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+from replay.sampling import Sampler, Samples, parse_sampling
+
+DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
+OWN = "(not in the paper)"
+X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
+
+
+class Drive(Parameters):
+    """What is recorded; estimates are judged by their positions."""
+
+    scenario: str
+    parameters: dict[str, Any] = {}
+
+
+class Options(Parameters):
+    """Dimensions, functions of each, the standard deviation of k'x, and by which share more must pay."""
+
+    dimensions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (2, 5, 10, 20)
+    functions: Annotated[int, Field(ge=2)] = 60
+    phase_sigma_rad: PositiveFloat = 1.0
+    pays: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    drives: dict[str, Drive] = {}
+
+
+class Waves(NamedTuple):
+    """sin(K x + phases): vectors K (m, n), phases (m,)."""
+
+    vectors: Floats
+    phases: Floats
+
+
+class Moments(NamedTuple):
+    """Of what a function gives: mean (m,), covariance (m, m), covariance of x with it (n, m)."""
+
+    mean: Floats
+    covariance: Floats
+    cross: Floats
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: Options = setting.options
+    samplings = samplings_of(experiment)
+    moments = moment_errors(samplings, options, experiment.seed)
+    tables, sources = [], []
+    for name, drive in options.drives.items():
+        recorded, table = driven(experiment, setting, name, drive)
+        counts = {label: at(table["dimension"][0]).count for label, at in samplings.items()}
+        tables.append(table.assign(drive=name, samples=table["estimator"].map(counts)))
+        sources += recorded
+    outcome = Outcome(input_sha256=hash_streams(sources), tables={"moments": moments})
+    outcome.metrics |= _moment_metrics(moments)
+    outcome.claims += _moment_claims(moments)
+    runs = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+    if tables:
+        outcome.tables["runs"] = runs
+        outcome.metrics |= _drive_metrics(runs, options)
+        outcome.claims += _drive_claims(runs, options)
+    outcome.figures["samples"] = _chart(moments, runs)
+    return outcome
+
+
+def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
+    """The samplings of the estimators by their labels; BadInput where there is none."""
+    kinds = {label: str(values.get("kind", label)) for label, values in experiment.estimators.items()}
+    found: dict[str, Callable[[int], Sampler]] = {
+        label: parse_sampling(kind.removeprefix("lrkf:")).at
+        for label, kind in kinds.items()
+        if kind.startswith("lrkf:")
+    }
+    if not found:
+        raise BadInput("study lrkf-dimension compares samplings: give estimators such as lrkf:ukf")
+    return found
+
+
+def exact(waves: Waves) -> Moments:
+    """The moments of waves of x ~ N(0, I)."""
+    vectors, phases = waves
+    squared = np.sum(vectors**2, axis=1)
+    fading = np.exp(-0.5 * squared)
+
+    def product(sign: float) -> Floats:
+        """E cos((k_i + sign k_j)'x + phase_i + sign phase_j)."""
+        apart = vectors[:, None] + sign * vectors
+        return np.exp(-0.5 * np.sum(apart**2, axis=2)) * np.cos(phases[:, None] + sign * phases)
+
+    mean = np.sin(phases) * fading
+    covariance = 0.5 * (product(-1.0) - product(1.0)) - np.outer(mean, mean)
+    return Moments(mean, covariance, (np.cos(phases) * fading) * vectors.T)
+
+
+def sampled(waves: Waves, samples: Samples) -> Moments:
+    """What a sample set (L, n) makes of them."""
+    points, weights = samples
+    values = np.sin(points @ waves.vectors.T + waves.phases)
+    mean = weights @ values
+    weighted = weights[:, None] * (values - mean)
+    return Moments(mean, weighted.T @ (values - mean), points.T @ weighted)
+
+
+def moment_errors(
+    samplings: Mapping[str, Callable[[int], Sampler]], options: Options, seed: int
+) -> pd.DataFrame:
+    """One row per sampling, dimension, direction and function: relative errors of its moments.
+
+    That of the mean is the root mean square in standard deviations of what the function gives, those of
+    the covariances are by the Frobenius norm.
+    """
+    rows = []
+    for dimension in options.dimensions:
+        for number, direction in enumerate(DIRECTIONS):
+            rng, drawing = np.random.default_rng([seed, dimension, number]).spawn(2)
+            functions = [_waves(dimension, direction, options, rng) for _ in range(options.functions)]
+            for label, at in samplings.items():
+                sampler = at(dimension)
+                drawn = sampler.draw(drawing, (len(functions),))
+                for function, waves in enumerate(functions):
+                    wanted = exact(waves)
+                    found = sampled(waves, Samples(*(part[function] for part in drawn)))
+                    sigma = np.sqrt(np.diag(wanted.covariance))
+                    mean_error = np.sqrt(np.mean(((found.mean - wanted.mean) / sigma) ** 2))
+                    others = [_relative(*each) for each in zip(found[1:], wanted[1:], strict=True)]
+                    rows.append(
+                        (label, dimension, sampler.count, direction, function, mean_error, *others)
+                    )
+    names = ["estimator", "dimension", "samples", "direction", "function"]
+    return pd.DataFrame(rows, columns=[*names, "mean_error", "covariance_error", "cross_error"])
+
+
+def _waves(dimension: int, direction: str, options: Options, rng: np.random.Generator) -> Waves:
+    vectors = rng.standard_normal((dimension, dimension)) if direction == "all" else np.eye(dimension)
+    vectors *= options.phase_sigma_rad / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return Waves(vectors, rng.uniform(-np.pi, np.pi, dimension))
+
+
+def _relative(found: Floats, wanted: Floats) -> float:
+    return float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted))
+
+
+def driven(
+    experiment: Experiment, setting: Setting, name: str, drive: Drive
+) -> tuple[list[MemorySource], pd.DataFrame]:
+    """The runs of a scenario, kept in a folder of its name; one row per estimator and run.
+
+    A row has the state's dimension, the RMSE of the position, the mean NEES for each component, and how
+    long a second of a run took all cores together, in ms: the mean of all runs at once.
+    """
+    record = Record(scenario=drive.scenario, parameters=drive.parameters)
+    runner = Runner(experiment.model_copy(update={"record": record}), setting)
+    sources = runner.obtain()
+    outputs: dict[str, Ragged] = {}
+    rows = []
+    for label, settings in setting.progress(
+        experiment.estimators.items(), name, len(experiment.estimators)
+    ):
+        replay_in_memory(sources[:1], {label: settings})  # compiles
+        begin = process_time()
+        found = replay_in_memory(sources, {label: settings})
+        seconds = process_time() - begin
+        [errors] = judge(sources, found, experiment.gap_limit_s).errors
+        lasts_s = float(sum(errors.elapsed_s[errors.run == run].max() for run in range(len(sources))))
+        places = replace(errors, error=errors.error[:, errors.position])
+        for run, rmse_m in enumerate(rmse_of_runs(places, len(sources)).tolist()):
+            nees = float(np.mean(errors.nees[errors.run == run])) / len(errors.components)
+            rows.append((label, run, len(errors.components), rmse_m, nees, 1e3 * seconds / lasts_s))
+        outputs |= found
+    runner.keep(sources, outputs, name, drawn=name)
+    columns = ["estimator", "run", "dimension", "position_rmse_m", "nees_per_component", "cpu_ms_per_s"]
+    return sources, pd.DataFrame(rows, columns=columns)
+
+
+def _moment_metrics(moments: pd.DataFrame) -> dict[str, MetricValue]:
+    quantities = ["mean_error", "covariance_error", "cross_error"]
+    means: Any = moments.groupby(["estimator", "dimension", "direction"], sort=False)[quantities].mean()
+    return {
+        f"{label}.{quantity}.n{dimension}-{direction}": float(value)
+        for (label, dimension, direction), row in means.iterrows()
+        for quantity, value in row.items()
+    }
+
+
+def _drive_metrics(runs: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
+    found: dict[str, MetricValue] = {}
+    for drive, of_drive in runs.groupby("drive", sort=False):
+        quantities = ["position_rmse_m", "nees_per_component", "samples"]
+        means: Any = of_drive.groupby("estimator", sort=False)[quantities].mean()
+        for label, row in means.iterrows():
+            found |= {f"{label}.{name}.{drive}": float(value) for name, value in row.dropna().items()}
+        enough = means["position_rmse_m"] <= (1.0 + options.pays) * means["position_rmse_m"].min()
+        found[f"lrkf.samples_that_pay.{drive}"] = float(means["samples"][enough].min())
+    return found
+
+
+def _moment_claims(moments: pd.DataFrame) -> list[Claim]:
+    """What more samples are expected to be worth, of the samplings that the experiment has."""
+    known, claims = set(moments["estimator"]), []
+    for direction, words in DIRECTIONS.items():
+        of_direction = moments[moments["direction"] == direction]
+        for label, other, statement in (
+            ("s2kf-100", "s2kf-25", "100 LCD samples err less than 25"),
+            ("s2kf-100", "ukf", "100 LCD samples err less than the UKF's"),
+            ("s2kf-100", "rukf-12", "100 LCD samples err less than RUKF-12's, however many these are"),
+        ):
+            if {label, other} <= known:
+                apart = {
+                    f"N = {dimension}": _log_ratio(rows, label, other)
+                    for dimension, rows in of_direction.groupby("dimension", sort=False)
+                }
+                claims.append(lower(f"mean of waves {words}: {statement}", OWN, "(log ratio)", apart))
+        if "ukf" in known:
+            claims.append(_grows(of_direction, words))
+    return claims
+
+
+def _log_ratio(rows: pd.DataFrame, label: str, other: str) -> Interval:
+    by_function: Any = rows.pivot_table("mean_error", "function", "estimator")
+    return mean_interval(np.log(by_function[label] / by_function[other]).tolist())
+
+
+def _grows(rows: pd.DataFrame, words: str) -> Claim:
+    own = rows[rows["estimator"] == "ukf"]
+    first, last = (
+        mean_interval(own["mean_error"][own["dimension"] == dimension].tolist())
+        for dimension in (own["dimension"].min(), own["dimension"].max())
+    )
+    return judged(
+        f"mean of waves {words}: the UKF's error grows from {own['dimension'].min()} to "
+        f"{own['dimension'].max()} dimensions",
+        OWN,
+        f"{first.mean:.3f} ({first.low:.3f} to {first.high:.3f}) and "
+        f"{last.mean:.3f} ({last.low:.3f} to {last.high:.3f}) standard deviations",
+        last.low > first.high,
+    )
+
+
+def _drive_claims(runs: pd.DataFrame, options: Options) -> list[Claim]:
+    claims, share = [], options.pays
+    for drive, rows in runs.groupby("drive", sort=False):
+        rmse_m: Any = rows.pivot_table("position_rmse_m", "run", "estimator")
+        for label, other, more in (
+            ("ukf", "ekf", "samples instead of derivatives"),
+            ("s2kf-100", "ukf", "100 LCD samples instead of the UKF's"),
+        ):
+            if {label, other} <= set(rmse_m):
+                ratio = (100.0 * (rmse_m[label] / rmse_m[other] - 1.0)).tolist()
+                gain = mean_interval(ratio)
+                claims.append(
+                    judged(
+                        f"{drive}: {more} lower the RMSE of the position by {share:.0%} or more",
+                        OWN,
+                        f"{gain} %",
+                        gain.high <= -100.0 * share,
+                    )
+                )
+    return claims
+
+
+def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:
+    """Errors of means over the number of samples by dimension; of drives, errors and time."""
+    panels = []
+    for direction, words in DIRECTIONS.items():
+        of_direction = moments[moments["direction"] == direction]
+        for dimension, rows in of_direction.groupby("dimension", sort=False):
+            title = f"waves {words}, N = {dimension}"
+            y = Axis(label="error of the mean (sigma)", log=True, limits=(3e-3, 1.0))
+            panels.append(_over_samples(rows, "mean_error", y, title))
+    for drive, rows in runs.groupby("drive", sort=False) if len(runs) else ():
+        title = f"{drive}, {rows['dimension'].iloc[0]} states"
+        middle_m = float(rows["position_rmse_m"].mean())
+        y = Axis(label="RMSE of the position (m)", limits=(0.0, 1.5 * middle_m))
+        panels.append(_over_samples(rows, "position_rmse_m", y, title))
+        y = Axis(label="CPU time for a second (ms)", log=True)
+        panels.append(_over_samples(rows, "cpu_ms_per_s", y, title))
+    return Chart(panels=panels, columns=moments["dimension"].nunique())
+
+
+def _over_samples(rows: pd.DataFrame, quantity: str, y: Axis, title: str) -> Panel:
+    """A line for each family of samplings; the extended filter, which has no samples, as a level."""
+    x = Axis(label="samples", log=True, limits=X_LIMITS, ticks={each: f"{each:g}" for each in X_TICKS})
+    panel = Panel(x=x, y=y, title=title)
+    mean = rows.groupby(["estimator", "samples"], dropna=False, sort=False)[quantity].mean()
+    table = mean.reset_index()
+    for name, own in table.groupby(table["estimator"].str.partition("-")[0], sort=False):
+        if own["samples"].isna().all():
+            panel.series.append(level(str(name), X_LIMITS, own[quantity].iloc[0]))
+        else:
+            panel.series.append(curve(str(name), own["samples"], own[quantity], "line+markers"))
+    return panel
+
+
+LRKF_DIMENSION = Study(
+    "sampling filters over dimension and number of samples: errors of moments, drives and time",
+    study,
+    Options,
+)

@@ -1,0 +1,302 @@
+"""Estimation on the torus: what a coupling makes of the samples (figure 3), and the recursive filter.
+
+Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. The
+propagation is numerics without a log; its truth is the population value, from Gauss-Hermite nodes in
+place of the paper's 10,000 samples. The filter is what the paper announces; a filter on a grid is its
+reference.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydantic import PositiveFloat, PositiveInt
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import Replayed, hash_streams, require_memory
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.repetitions import rmse_of_runs
+from recorders.errors import BadInput
+from recorders.models.headings import turn_together
+from recorders.models.planar import wrap_angle
+from recorders.parameters import Parameters
+from recorders.simulators.headings import HeadingsParameters
+from replay.distributions import wrapped_normal
+from replay.distributions.wrapped_normal import Samples, WrappedNormal
+from replay.engine.streams.sources import MemorySource
+from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from replay.estimators.directional.torus import make_heading_model
+
+Floats = NDArray[np.float64]
+
+
+class PropagationOptions(Parameters):
+    """Figure 3's sweep."""
+
+    sigma_rad: tuple[PositiveFloat, PositiveFloat] = (0.8, 1.3)
+    couplings_rad: tuple[float, ...] = (0.1, 0.2, 0.5, 1.0)
+    correlations: tuple[float, ...] = tuple(np.linspace(-0.9, 0.9, 19).round(12).tolist())
+    random_samples: PositiveInt = 50
+    central_weights: tuple[float, ...] = (0.2, 0.45)
+
+
+class MomentErrors(NamedTuple):
+    """Errors of mean and covariance, entrywise means, (correlations,); random: (runs, correlations)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+def propagation_errors(
+    options: PropagationOptions, coupling_rad: float, runs: int, rng: np.random.Generator
+) -> dict[str, MomentErrors]:
+    """Samples are moved once and refitted by mixed maximum likelihood, as the truth is.
+
+    Keys: `five-wW` for every central weight, W in percent, `ukf`, `random`.
+    """
+    rho, sigma = np.array(options.correlations), np.array(options.sigma_rad)
+    unit = np.stack([np.ones_like(rho), rho, rho, np.ones_like(rho)], axis=-1).reshape(-1, 2, 2)
+    root = np.linalg.cholesky(np.outer(sigma, sigma) * unit)
+    distributions = WrappedNormal(np.zeros((len(rho), 2)), root @ np.swapaxes(root, -1, -2))
+    moments = wrapped_normal.circular_moments(distributions)
+    star = np.sqrt(2.5) * np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]])
+    several = WrappedNormal(*(np.stack([part] * runs) for part in distributions))
+    drawn = wrapped_normal.sample(several, options.random_samples, rng)
+    share = 1.0 / options.random_samples
+    sets = {
+        **{
+            f"five-w{100 * weight:g}": wrapped_normal.five_samples(moments, weight)
+            for weight in options.central_weights
+        },
+        "ukf": _linear_samples(root, star, np.full(5, 0.2)),
+        "random": Samples(drawn, np.full(drawn.shape[:-1], share)),
+    }
+    truth = wrapped_normal.fit_mixed_mle(_moved(_linear_samples(root, *_gauss_hermite()), coupling_rad))
+    found = {}
+    for name, samples in sets.items():
+        fitted = wrapped_normal.fit_mixed_mle(_moved(samples, coupling_rad))
+        found[name] = MomentErrors(
+            np.abs(wrap_angle(fitted.mean - truth.mean)).mean(axis=-1),
+            np.abs(fitted.covariance - truth.covariance).mean(axis=(-1, -2)),
+        )
+    return found
+
+
+def _gauss_hermite(order: int = 40) -> tuple[Floats, Floats]:
+    """Nodes (n, 2) and weights (n,) of a standard normal in the plane."""
+    x, w = np.polynomial.hermite_e.hermegauss(order)
+    nodes = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+    weights = np.outer(w, w).ravel() / w.sum() ** 2
+    kept = weights > 1e-14
+    return nodes[kept], weights[kept]
+
+
+def _linear_samples(root: Floats, points: Floats, weights: Floats) -> Samples:
+    positions = points @ np.swapaxes(root, -1, -2)
+    return Samples(positions, np.broadcast_to(weights, positions.shape[:-1]))
+
+
+def _moved(samples: Samples, coupling_rad: float) -> Samples:
+    x = samples.positions
+    return Samples(
+        np.stack(turn_together(x[..., 0], x[..., 1], coupling_rad, 0.0, 0.0), axis=-1), samples.weights
+    )
+
+
+def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
+    """Figure 3; see `pipeline.runs.experiment.Study`. `runs` are those of the random samples."""
+    options: PropagationOptions = setting.options
+    if experiment.record or experiment.import_ or experiment.estimators:
+        raise BadInput("study torus-propagation needs no data; leave out record, import and estimators")
+    drawn_bytes = experiment.runs * len(options.correlations) * options.random_samples * 2 * 8
+    require_memory(f"{experiment.runs} runs of random samples", 2 * drawn_bytes)  # as drawn, and moved
+    outcome = Outcome()
+    tables = []
+    for coupling_rad in setting.progress(
+        options.couplings_rad, "propagating", len(options.couplings_rad)
+    ):
+        rng = np.random.default_rng(experiment.seed)
+        found = propagation_errors(options, coupling_rad, experiment.runs, rng)
+        case = f"c={1000 * coupling_rad:g}-mrad"
+        for name, errors in found.items():
+            outcome.metrics[f"{name}.mean_error_rad.{case}"] = float(errors.mean.mean())
+            outcome.metrics[f"{name}.covariance_error_rad2.{case}"] = float(errors.covariance.mean())
+            tables.append(_rows(options, coupling_rad, name, errors))
+        own = found[f"five-w{100 * options.central_weights[0]:g}"]
+        outcome.claims += _propagation_claims(case, own, found["ukf"], found["random"])
+    outcome.tables["errors"] = pd.concat(tables)
+    outcome.figures["errors"] = propagation_chart(outcome.tables["errors"], options)
+    return outcome
+
+
+def _rows(
+    options: PropagationOptions, coupling_rad: float, name: str, errors: MomentErrors
+) -> pd.DataFrame:
+    mean, covariance = (np.atleast_2d(part).mean(axis=0) for part in errors)
+    return pd.DataFrame(
+        {
+            "coupling_rad": coupling_rad,
+            "samples": name,
+            "correlation": options.correlations,
+            "mean_error_rad": mean,
+            "covariance_error_rad2": covariance,
+        }
+    )
+
+
+def _propagation_claims(
+    case: str, own: MomentErrors, ukf: MomentErrors, random: MomentErrors
+) -> list[Claim]:
+    """Who wins at how many correlations: in the mean, and in the covariance."""
+    claims = []
+    for rival, name in ((ukf, "the UKF's five"), (random, "random samples (mean over the runs)")):
+        wins, count = [], len(own.mean)
+        for ours, theirs in zip(own, rival, strict=True):
+            wins.append(int((ours < np.atleast_2d(theirs).mean(axis=0)).sum()))
+        claims.append(
+            judged(
+                f"significantly outperforms {name}: {case}",
+                "smaller errors of mean and covariance at every correlation",
+                f"mean {own.mean.mean():.4f} against {rival.mean.mean():.4f} rad, wins {wins[0]} of "
+                f"{count}; covariance {own.covariance.mean():.4f} against "
+                f"{rival.covariance.mean():.4f} rad^2, wins {wins[1]} of {count}",
+                min(wins) == count,
+            )
+        )
+    return claims
+
+
+def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
+    """Errors over the correlation: a column per coupling, mean above and covariance below."""
+    quantities = {
+        "mean_error_rad": "error of the mean (rad)",
+        "covariance_error_rad2": "error of the covariance (rad²)",
+    }
+    panels = []
+    for quantity, label in quantities.items():
+        for coupling_rad in options.couplings_rad:
+            of_coupling = table[table["coupling_rad"] == coupling_rad]
+            series = [
+                curve(str(name), rows["correlation"], rows[quantity])
+                for name, rows in of_coupling.groupby("samples", sort=False)
+            ]
+            panels.append(
+                Panel(
+                    title=f"c = {coupling_rad:g} rad",
+                    x=Axis(label="correlation"),
+                    y=Axis(label=label, log=True),
+                    series=series,
+                )
+            )
+    return Chart(columns=len(options.couplings_rad), panels=panels)
+
+
+class FilterOptions(Parameters):
+    """Cases: what differs in the scenario's parameters. The grid has this many cells per angle."""
+
+    cases: dict[str, dict[str, float]] = {}
+    grid_cells: PositiveInt = 48
+    estimator: str = "torus"
+
+
+def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
+    """The recursive toroidal filter beside unscented filters; see `pipeline.runs.experiment.Study`."""
+    options: FilterOptions = setting.options
+    if options.estimator not in experiment.estimators:
+        raise BadInput(
+            f"experiment '{experiment.title}': estimator {options.estimator} is missing; add it"
+        )
+    outcome = Outcome()
+    sources: list[MemorySource] = []
+    errors_rad: dict[str, dict[str, Floats]] = {}
+    for case, replayed in Runner(experiment, setting).cases(options.cases or {"all": {}}):
+        found = {
+            errors.estimator: rmse_of_runs(errors, len(replayed.sources)) / np.sqrt(2.0)
+            for errors in replayed.errors
+        }
+        found["grid"] = _grid_errors_rad(replayed, options.grid_cells)
+        rmse = {name: float(np.sqrt(np.nanmean(error**2))) for name, error in found.items()}
+        outcome.metrics.update({f"{name}.angle_rmse_rad.{case}": each for name, each in rmse.items()})
+        outcome.claims += _filter_claims(case, rmse, options.estimator)
+        errors_rad[case] = found
+        sources += replayed.sources
+    outcome.input_sha256 = hash_streams(sources)
+    outcome.tables["runs"] = pd.concat(
+        [pd.DataFrame({"case": case, **found}) for case, found in errors_rad.items()]
+    )
+    outcome.figures["errors"] = filter_figure(errors_rad)
+    return outcome
+
+
+def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
+    """The RMSE per angle of every run (runs,) of Bayes' rule on a grid over the torus."""
+    logs = [source.read(["/truth", "/headings"]) for source in replayed.sources]
+    stated = replayed.sources[0].run
+    assert stated is not None
+    given = HeadingsParameters.model_validate(stated.parameters)
+    system, measurement = given.covariances()
+    model = make_heading_model(
+        given.coupling_rad, (given.drift1_rad, given.drift2_rad), system, measurement
+    )
+    truth = np.concatenate([log["/truth"]["state"] for log in logs])
+    measured = np.concatenate([log["/headings"]["value"] for log in logs])
+    offsets = np.cumsum([0, *(len(log["/truth"]) for log in logs)])
+    prior = wrapped_normal.density(
+        WrappedNormal(np.zeros(2), given.prior_sigma_rad**2 * np.eye(2)), torus_grid(cells)
+    )
+    state = np.broadcast_to(prior / prior.sum(), (len(logs), cells, cells))
+    found = run_torus_grid_filter(model, state, offsets, measured)
+    squared = (wrap_angle(found.mean - truth) ** 2).mean(axis=1)
+    return np.sqrt(np.add.reduceat(squared, offsets[:-1]) / np.diff(offsets))
+
+
+def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Claim]:
+    own = rmse[estimator]
+    claims = [
+        judged(
+            f"at least as good as {name}: {case}",
+            "announced as future work, without numbers",
+            f"{own:.4f} against {rival:.4f} rad per angle",
+            own <= 1.005 * rival,
+        )
+        for name, rival in rmse.items()
+        if name not in (estimator, "grid")
+    ]
+    excess = own / rmse["grid"] - 1.0
+    return [
+        *claims,
+        judged(
+            f"nearly optimal, within 2 % of Bayes' rule on a grid: {case}",
+            "(not in the paper)",
+            f"{own:.4f} against {rmse['grid']:.4f} rad per angle, {100 * excess:.1f} % more",
+            excess < 0.02,
+        ),
+    ]
+
+
+def filter_figure(errors_rad: dict[str, dict[str, Floats]]) -> Figure:
+    """The runs' errors of every filter, case by case."""
+    figure = Figure(figsize=(2.8 * len(errors_rad) + 1, 4), layout="constrained")
+    plots = np.atleast_1d(figure.subplots(1, len(errors_rad), sharey=True))
+    for axes, (case, found) in zip(plots, errors_rad.items(), strict=True):
+        shown = [error[np.isfinite(error)] for error in found.values()]
+        axes.boxplot(shown, tick_labels=list(found), showmeans=True, sym=".")
+        axes.set_title(case)
+        axes.tick_params(axis="x", rotation=20)
+    plots[0].set_ylabel("RMSE of a run per angle (rad)")
+    return figure
+
+
+TORUS_PROPAGATION = Study(
+    "five samples on the torus beside the UKF's and random ones, moved and refitted",
+    study_propagation,
+    PropagationOptions,
+)
+TORUS_FILTER = Study(
+    "the recursive toroidal filter beside unscented filters and a grid", study_filter, FilterOptions
+)

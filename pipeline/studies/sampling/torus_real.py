@@ -1,0 +1,336 @@
+"""Real angles on the torus: densities fitted to dihedrals of a protein, filters that predict the wind.
+
+What is fitted is judged on angles that the fit has not seen: dihedrals stretch by stretch of the chain,
+winds of the second half with noise and coupling that are most likely in the first. Neighbours resemble
+each other, so that intervals are Student's, of the means of blocks.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from pydantic import PositiveInt
+from scipy.optimize import minimize
+from scipy.special import expit, logsumexp
+from threadpoolctl import threadpool_limits
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from recorders.errors import BadInput
+from recorders.models.headings import turn_on
+from recorders.models.planar import wrap_angle
+from recorders.parameters import Parameters
+from replay.distributions import wrapped_normal
+from replay.distributions.torus_mixtures import (
+    VonMisesMixture,
+    WrappedMixture,
+    fit_von_mises_mixture,
+    fit_wrapped_mixture,
+)
+from replay.distributions.wrapped_normal import Samples, WrappedNormal
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.results import state_stream
+from replay.engine.vectors.components import Components
+from replay.estimators.directional.grid import run_torus_grid_filter, torus_grid
+from replay.estimators.directional.torus import (
+    HeadingModel,
+    make_heading_model,
+    run_toroidal_filter,
+    run_unscented_filter,
+)
+
+Filter = Callable[..., tuple[WrappedNormal, WrappedNormal]]
+
+_PRIOR = np.diag([0.1, 0.5]) ** 2
+_TURNS = 2.0 * np.pi * np.arange(-5, 6)
+
+
+class Options(Parameters):
+    """How dihedrals are held out, how many components mixtures may have, and the blocks of intervals."""
+
+    folds: PositiveInt = 10
+    most_components: PositiveInt = 8
+    block_residues: PositiveInt = 10
+    block_hours: PositiveInt = 12
+    grid_cells: PositiveInt = 48
+
+
+class Prediction(NamedTuple):
+    """What was said of every hour but the first: log density of what came, and its circular distance."""
+
+    log_density: Floats
+    error_rad: Floats
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Fit and predict; see `pipeline.runs.experiment.Study`."""
+    options: Options = setting.options
+    if experiment.estimators:
+        raise BadInput("study torus-real has filters of its own: leave out estimators")
+    runner = Runner(experiment, setting)
+    (source,) = runner.obtain()
+    outcome = Outcome(input_sha256=hash_streams([source]))
+    dihedrals = np.asarray(source.in_order("/dihedrals", "publish_time")["value"])
+    wind = np.asarray(source.in_order("/wind", "publish_time")["value"])[:, 0]
+    with threadpool_limits(1):  # fits this small only keep a second core spinning
+        _judge_fits(held_out(dihedrals, options, setting), options, outcome)
+    half = len(wind) // 2
+    found = {name: most_likely(wind[:half], run) for name, run in FILTERS.items()}
+    _judge_predictions(wind, half, found, options, outcome)
+    time_ns = source.in_order("/wind", "publish_time").publish_time_ns
+    predicted = (
+        _told(name, time_ns, predicted_by(wind, run, found[name])) for name, run in FILTERS.items()
+    )
+    runner.keep([source], {each.stream.topic: each for each in predicted})
+    return outcome
+
+
+def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame:
+    """The log density of every pair of angles under what was fitted to the other stretches of the chain.
+
+    The number of a mixture's components is that which does best on stretches held out of the others.
+    """
+    stretches = np.array_split(np.arange(len(angles)), options.folds)
+    found = np.full((len(angles), 7), np.nan)
+    for stretch in setting.progress(stretches, "fitting dihedrals", len(stretches)):
+        others = np.setdiff1d(np.arange(len(angles)), stretch)
+        count = _count_of(angles[others], options)
+        given, left = angles[others], angles[stretch]
+        even = Samples(given, np.full(len(given), 1.0 / len(given)))
+        by_moments = wrapped_normal.fit_moments(wrapped_normal.sample_moments(even))
+        one, several = fit_wrapped_mixture(given, 1), fit_wrapped_mixture(given, count)
+        fits: list[WrappedMixture | VonMisesMixture] = [one, several]
+        fits += [
+            fit_von_mises_mixture(given, kind, start)
+            for start in (one, several)
+            for kind in ("sine", "cosine")
+        ]
+        found[stretch, 0] = np.log(wrapped_normal.density(by_moments, left))
+        found[stretch, 1:] = np.stack([fit.log_density(left) for fit in fits], axis=1)
+    names = ["moments", "wrapped", "wrapped-mixture", "sine", "cosine", "sine-mixture", "cosine-mixture"]
+    return pd.DataFrame(found, columns=names)
+
+
+def _count_of(angles: Floats, options: Options) -> int:
+    """How many wrapped normals are most likely on stretches that they were not fitted to."""
+    stretches = np.array_split(np.arange(len(angles)), 3)
+    scores = []
+    for count in range(1, options.most_components + 1):
+        fits = [fit_wrapped_mixture(np.delete(angles, each, axis=0), count) for each in stretches]
+        scores.append(
+            sum(fit.log_density(angles[each]).sum() for fit, each in zip(fits, stretches, strict=True))
+        )
+    return 1 + int(np.argmax(scores))
+
+
+def _judge_fits(table: pd.DataFrame, options: Options, outcome: Outcome) -> None:
+    for name, column in table.items():
+        outcome.metrics[f"{name}.log_density.dihedrals"] = float(column.mean())
+    outcome.tables["dihedrals"] = table.rename_axis("residue").reset_index()
+    for claim, better, worse in (
+        ("maximum likelihood fits a wrapped normal better than moments", "wrapped", "moments"),
+        ("a mixture is needed", "wrapped-mixture", "wrapped"),
+        ("a von Mises density with sines fits better than a wrapped normal", "sine", "wrapped"),
+        ("a von Mises density with cosines fits better than a wrapped normal", "cosine", "wrapped"),
+        ("mixtures: sines fit better than wrapped normals", "sine-mixture", "wrapped-mixture"),
+        ("mixtures: cosines fit better than wrapped normals", "cosine-mixture", "wrapped-mixture"),
+    ):
+        gain = interval(table[better] - table[worse], options.block_residues)
+        outcome.claims.append(_gains(f"dihedrals: {claim}", gain, "a residue"))
+
+
+def _judge_predictions(
+    wind: Floats,
+    half: int,
+    found: Mapping[str, Mapping[str, float]],
+    options: Options,
+    outcome: Outcome,
+) -> None:
+    said = {name: predict(wind, run, found[name]) for name, run in FILTERS.items()}
+    said["grid"] = predict_on_grid(wind, found["torus"], options.grid_cells)
+    said |= persistence(wind, half)
+    rows = [
+        pd.DataFrame({"hour": np.arange(1, len(wind)), "predictor": name, **each._asdict()})
+        for name, each in said.items()
+    ]
+    outcome.tables["wind"] = pd.concat(rows, ignore_index=True)
+    later = {name: Prediction(*(each[half - 1 :] for each in both)) for name, both in said.items()}
+    for name, each in later.items():
+        outcome.metrics[f"{name}.log_density.wind"] = float(each.log_density.mean())
+        outcome.metrics[f"{name}.error_rad.wind"] = float(each.error_rad.mean())
+    for name, parameters in found.items():
+        outcome.metrics |= {f"{name}.{key}.wind": value for key, value in parameters.items()}
+    outcome.figures["wind"] = _chart(outcome.tables["wind"], half)
+
+    def gain(name: str, other: str) -> Interval:
+        return interval(later[name].log_density - later[other].log_density, options.block_hours)
+
+    outcome.claims += [
+        _gains(f"wind: five samples predict better than {other}", gain("torus", name), "an hour")
+        for name, other in (
+            ("persistence", "persistence"),
+            ("persistence-with-jumps", "persistence with jumps anywhere"),
+            ("ukf", "the wrapped UKF"),
+        )
+    ]
+    lost = gain("torus", "grid")
+    outcome.claims.append(
+        judged(
+            "wind: five samples are enough, within .02 an hour of Bayes' rule on a grid",
+            "(not in the paper)",
+            f"log density {_said(lost)} an hour",
+            lost.low > -0.02,
+        )
+    )
+    nearer = interval(later["persistence"].error_rad - later["torus"].error_rad, options.block_hours)
+    outcome.claims.append(
+        judged(
+            "wind: five samples are nearer to the next direction than persistence",
+            "(not in the paper)",
+            f"circular distance {_said(nearer)} rad less",
+            nearer.low > 0.0,
+        )
+    )
+
+
+def interval(values: Floats | pd.Series, block: int) -> Interval:
+    """The mean, and where it lies with 95 % by Student's distribution of the means of whole blocks."""
+    whole = np.asarray(values)[: len(values) // block * block]
+    return mean_interval(whole.reshape(-1, block).mean(axis=1).tolist())
+
+
+def _said(gain: Interval) -> str:
+    return f"{gain.mean:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})"
+
+
+def _gains(claim: str, gain: Interval, unit: str) -> Claim:
+    """A claim that holds where the whole interval is above zero."""
+    return judged(claim, "(not in the paper)", f"log density {_said(gain)} {unit}", gain.low > 0.0)
+
+
+FILTERS: dict[str, Filter] = {
+    "torus": partial(run_toroidal_filter, motion=turn_on),
+    "ukf": partial(run_unscented_filter, motion=turn_on, wrapped=True),
+}
+
+
+def most_likely(
+    wind: Floats, run: Callable[..., tuple[WrappedNormal, WrappedNormal]]
+) -> dict[str, float]:
+    """The coupling and both sigmas, by their names as parameters, that predict directions best."""
+
+    def given(x: Floats) -> dict[str, float]:
+        system, measurement = np.exp(x[1:])
+        return {
+            "coupling_rad": float(np.tanh(x[0])),
+            "system_sigma_rad": float(system),
+            "measurement_sigma_rad": float(measurement),
+        }
+
+    def cost(x: Floats) -> float:
+        total = float(predict(wind, run, given(x)).log_density.sum())
+        return -total if np.isfinite(total) else np.inf
+
+    starts = [[coupling, np.log(0.4), np.log(0.2)] for coupling in (-0.5, 0.0, 0.5)]
+    found = [minimize(cost, start, method="Nelder-Mead") for start in starts]
+    return given(min(found, key=lambda each: each.fun).x)
+
+
+def _model(parameters: Mapping[str, float]) -> HeadingModel:
+    noise = (parameters[f"{which}_sigma_rad"] ** 2 * np.eye(2) for which in ("system", "measurement"))
+    return make_heading_model(parameters["coupling_rad"], (0.0, 0.0), *noise)
+
+
+def _measured(wind: Floats) -> Floats:
+    """Every hour but the first: the direction is measured, its turn is not."""
+    return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
+
+
+def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> WrappedNormal:
+    """Direction and turn of every hour, from those before it; it begins at the first direction."""
+    model, measured = _model(parameters), _measured(wind)
+    prior = WrappedNormal(np.array([[wind[0], 0.0]]), _PRIOR[None])
+    _, after = run(model, prior, np.array([0, len(measured)]), measured)
+    before = WrappedNormal(
+        *(np.concatenate([first, rest[:-1]]) for first, rest in zip(prior, after, strict=True))
+    )
+    hours = np.arange(len(measured) + 1)
+    return run(model, before, hours, np.full(measured.shape, np.nan))[1]
+
+
+def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Prediction:
+    """What a filter says of every hour."""
+    next_ = predicted_by(wind, run, parameters)
+    variance = next_.covariance[:, 0, 0] + parameters["measurement_sigma_rad"] ** 2
+    return _of_normal(wind[1:] - next_.mean[:, 0], variance)
+
+
+def _of_normal(deviation: Floats, variance: Floats | float) -> Prediction:
+    deviation, variance = wrap_angle(deviation), np.reshape(variance, (-1, 1))
+    exponents = -0.5 * (deviation[:, None] + _TURNS) ** 2 / variance
+    log_density = logsumexp(exponents - 0.5 * np.log(2.0 * np.pi * variance), axis=1)
+    return Prediction(log_density, np.abs(deviation))
+
+
+def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -> Prediction:
+    """The same by Bayes' rule on a grid."""
+    measured = _measured(wind)
+    prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
+    begin = (prior / prior.sum())[None]
+    said = run_torus_grid_filter(
+        _model(parameters), begin, np.array([0, len(measured)]), measured, turn_on
+    )
+    return Prediction(said.log_density, np.abs(wrap_angle(wind[1:] - said.predicted[:, 0])))
+
+
+def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
+    """The next hour is like this one, up to a wrapped normal; or, now and then, any direction."""
+    turn = np.diff(wind)
+
+    def said(x: Floats, share: float) -> Prediction:
+        normal = _of_normal(turn, np.exp(2.0 * x[0]))
+        log_density = np.logaddexp(
+            np.log1p(-share) + normal.log_density, np.log(max(share, 1e-300) / (2.0 * np.pi))
+        )
+        return Prediction(log_density, normal.error_rad)
+
+    def cost(x: Floats) -> float:
+        share = 0.0 if len(x) == 1 else float(expit(x[1]))
+        return -float(said(x, share).log_density[: half - 1].sum())
+
+    plain = minimize(cost, [np.log(0.5)], method="Nelder-Mead").x
+    with_jumps = minimize(cost, [np.log(0.3), -2.0], method="Nelder-Mead").x
+    return {
+        "persistence": said(plain, 0.0),
+        "persistence-with-jumps": said(with_jumps, float(expit(with_jumps[1]))),
+    }
+
+
+def _chart(table: pd.DataFrame, half: int) -> Chart:
+    """How much more was said of the later hours than persistence says, summed up."""
+    wide = table.pivot_table(index="hour", columns="predictor", values="log_density").loc[half:]
+    gains = wide.sub(wide["persistence"], axis=0).cumsum()
+    panel = Panel(x=Axis(label="hour"), y=Axis(label="log density above persistence, summed"))
+    for name in gains.columns.drop("persistence"):
+        panel.series.append(curve(str(name), gains.index, gains[name]))
+    return Chart(panels=[panel])
+
+
+def _told(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
+    """A filter's predictions of every hour but the first, as estimates."""
+    angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
+    stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)
+    return Ragged(stream, np.array([0, len(stream)]))
+
+
+TORUS_REAL = Study(
+    "wrapped normals and von Mises densities fitted to dihedrals, and winds predicted", study, Options
+)

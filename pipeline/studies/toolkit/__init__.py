@@ -1,0 +1,1 @@
+"""What studies of any family share; begin with `localization`."""

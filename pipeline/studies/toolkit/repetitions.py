@@ -1,0 +1,109 @@
+"""A paper's Monte Carlo experiment, repeated: step k over all runs of an ensemble is one repetition.
+
+A log that holds the same experiment several times over, with fresh noise, gives one estimate each. So an
+ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a rule that a paper states
+for its 100 runs can be tried as often.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
+
+from pipeline.output.charts import Axis, Series, curve
+from pipeline.runs.ensemble import Replayed
+from recorders.errors import BadInput
+from replay.judging.errors.evaluation import Errors
+
+Floats = NDArray[np.float64]
+# Where a mean NEES lies with 95 %.
+EFFICIENT = "95 % if efficient"
+
+
+def require_spread(solutions: int) -> None:
+    """Raise BadInput where `solutions` of one experiment have no standard error."""
+    if solutions < 2:
+        raise BadInput(
+            "one run gives no standard error, by which claims are judged; give --runs 2 or more"
+        )
+
+
+def errors_named(replayed: Replayed, estimator: str) -> Errors:
+    """The errors of an estimator that has one estimate stream."""
+    [errors] = [each for each in replayed.errors if each.estimator == estimator]
+    return errors
+
+
+def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
+    """Values (n, ...) of every estimate as (repetitions, runs, ...), NaN where a solution failed."""
+    repeated = np.full((int(errors.step.max(initial=-1)) + 1, runs, *values.shape[1:]), np.nan)
+    repeated[errors.step, errors.run] = values
+    return repeated
+
+
+class Interval(NamedTuple):
+    """The mean of independent values, and where it lies with 95 %."""
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f}, 95 % {self.low:+.2f} to {self.high:+.2f}"
+
+
+def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
+    """The mean of independent values, and its interval by Student's distribution; NaN for one value."""
+    count, mean = len(values), float(np.mean(values))
+    if count < 2:
+        return Interval(mean, np.nan, np.nan)
+    half = stdtrit(count - 1, 0.5 + probability / 2) * np.std(values, ddof=1) / np.sqrt(count)
+    return Interval(mean, mean - float(half), mean + float(half))
+
+
+def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
+    """Over one axis or several, leaving out what is NaN."""
+    return np.sqrt(np.nanmean(values**2, axis=axis))
+
+
+def rms_length(errors: Floats) -> float:
+    """The root mean square of the lengths of errors (n, d); NaN of none."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else np.nan
+
+
+def rmse_of_runs(errors: Errors, runs: int) -> Floats:
+    """The root mean square length of every run's errors (runs,); NaN for a run without any."""
+    squared = np.sum(errors.error**2, axis=1)
+    count = np.bincount(errors.run, minlength=runs)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.bincount(errors.run, squared, runs) / count)
+
+
+def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float, float]:
+    """How far printed RMSEs (k,) of `runs` runs are from ours, in standard errors, and what is allowed.
+
+    `squared` (n, k) are our squared errors. The worst of k is allowed what it exceeds with 5 %.
+    """
+    mean = np.nanmean(squared, axis=0)
+    error = np.nanstd(squared, axis=0) * np.sqrt(1.0 / runs + 1.0 / len(squared))
+    allowed = float(ndtri(1.0 - 0.025 / len(printed)))
+    return float(np.max(np.abs(printed**2 - mean) / error)), allowed
+
+
+def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
+    """Whether a share of `independent` trials is, within two standard errors, at least as expected."""
+    return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
+
+
+def groups(
+    values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
+) -> tuple[Axis, list[Series]]:
+    """Values side by side in named groups: an axis of groups, and a series per place in the group."""
+    size = max(len(group) for group in values)
+    series = []
+    for place in range(size):
+        x = np.arange(len(values)) + (place - 0.5 * (size - 1)) * 0.8 / size
+        series.append(curve(labels[place], x, [group[place] for group in values], "markers"))
+    return Axis(label=axis, ticks={float(place): name for place, name in enumerate(names)}), series

@@ -1,0 +1,114 @@
+"""What studies of trackers have in common: their tracks judged by run, and claims by intervals.
+
+Tracks are judged as `replay.judging.tracks.errors` says, at instants that are the same for all trackers.
+A claim that one tracker is better than another is judged by the mean of their differences over the runs,
+and holds where all of its 95 % interval does.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pipeline.output.claims import Claim, judged
+from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from recorders.errors import BadInput
+from recorders.log import Stream
+from replay.engine.arrays import Floats
+from replay.engine.streams.blocks import Ragged
+from replay.judging.errors.evaluation import Innovations
+from replay.judging.tracks.distances import hota, idf1, trajectory_gospa
+from replay.judging.tracks.errors import (
+    CUTOFF_M,
+    PERIOD_S,
+    Judged,
+    TracksAt,
+    as_trajectories,
+    track_errors,
+    track_figures,
+    tracks_at,
+)
+
+# What trajectory GOSPA takes for a target that goes on with another track: half a target missed.
+SWITCH_PENALTY_M = 10.0
+
+
+def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream, Stream]:
+    """How many tracks an estimator tells of in every scan of a run, and these tracks.
+
+    Raises BadInput where it is no tracker.
+    """
+    leaves = [f"/estimates/{label}/{leaf}" for leaf in ("set", "track")]
+    if not all(leaf in outputs for leaf in leaves):
+        raise BadInput(
+            f"estimator {label} gives no tracks, and this study compares trackers; leave it out"
+        )
+    sizes, tracks = (outputs[leaf].of_run(run) for leaf in leaves)
+    return sizes, tracks
+
+
+def figures_of(told: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
+    """What the tracks of a run are worth, told at the instants of the truths (targets, k, 2).
+
+    Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
+    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root
+    of the number of instants, so that it is as large as GOSPA.
+    """
+    tracks = as_trajectories(told)
+    away = np.linalg.norm(tracks[:, None] - truths[None], axis=3)
+    near = tracks[np.nanmin(away, axis=(1, 2), initial=np.inf) < CUTOFF_M]
+    lengths_s = [np.ptp(np.flatnonzero(there)) * PERIOD_S for there in np.isfinite(near[..., 0])]
+    whole = trajectory_gospa(near, truths, CUTOFF_M, SWITCH_PENALTY_M)
+    return track_figures(track_errors(told, truths)) | {
+        "tracks": float(len(near)),
+        "track_length_s": float(np.mean(lengths_s)) if lengths_s else float("nan"),
+        "trajectory_gospa_m": whole.total / np.sqrt(truths.shape[1]),
+        "hota": float(hota(near, truths, CUTOFF_M).hota.mean()),
+        "idf1": idf1(near, truths, CUTOFF_M),
+    }
+
+
+def table_of(
+    outputs: Mapping[str, Ragged],
+    labels: Sequence[str],
+    runs: Mapping[str, Judged],
+    delay_s: float = 0.0,
+) -> pd.DataFrame:
+    """One row per estimator and run, by name; what was told later than `delay_s` before is not known."""
+    rows = []
+    for label in labels:
+        for run, (name, at) in enumerate(runs.items()):
+            told = tracks_at(*sets_of(outputs, label, run), at.time_ns, round(delay_s * 1e9))
+            rows.append({"estimator": label, "run": name, **figures_of(told, at.truths)})
+    return pd.DataFrame(rows)
+
+
+def means_of(table: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """The means over the runs, by estimator."""
+    means: Any = table.drop(columns="run").groupby("estimator", sort=False).mean()
+    return {str(label): row.to_dict() for label, row in means.iterrows()}
+
+
+def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
+    """Mean NIS per measured component, by estimator and sensor: of tracks' likeliest detections."""
+    return {
+        f"{each.estimator}.nis_per_component.{each.case}": float(each.squared.sum() / each.degrees.sum())
+        for each in innovations
+        if each.degrees.sum()
+    }
+
+
+def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
+    """By how much a quantity of one estimator is above that of another, over the runs."""
+    by_run: Any = table.pivot_table(quantity, "run", "estimator", sort=False)
+    return mean_interval((by_run[label] - by_run[other]).tolist())
+
+
+def lower(claim: str, paper: str, unit: str, gained: Mapping[str, Interval], why: str = "") -> Claim:
+    """A claim that quantities fall, by name: it holds where all intervals lie below zero."""
+    ours = "; ".join(f"{name} {interval} {unit}".strip() for name, interval in gained.items())
+    unsure = [name for name, each in gained.items() if each.low < 0.0 <= each.high]
+    if unsure:
+        why = "; ".join(filter(None, [f"the interval of {' and '.join(unsure)} holds zero", why]))
+    return judged(claim, paper, ours, all(each.high < 0.0 for each in gained.values()), why)

@@ -1,0 +1,201 @@
+"""How time and error of cooperative vehicles' filters grow with the number of vehicles.
+
+Vehicles start anywhere in a square: one that grows with their number, so that they stay as far apart, or
+one so small that any fix may be of any vehicle. Where a method's time grows faster than any power, it is
+told by the factor for every further vehicle; else by the power.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from pydantic import PositiveFloat, PositiveInt
+
+from pipeline.output.charts import Axis, Chart, Panel, curve
+from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
+from pipeline.runs.ensemble import hash_streams, judge, replay_in_memory
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.runner import Runner
+from pipeline.studies.vehicles.cases import scores_of
+from recorders.errors import BadInput
+from recorders.parameters import Parameters
+from replay.engine.streams.sources import MemorySource
+
+# Of powers of N, no estimator here needs more than this one.
+HIGHEST_POWER = 5.0
+TICKS = (2, 5, 10, 20, 50, 100)
+
+
+class Swept(Parameters):
+    """Up to how many vehicles a method goes, where they start, and how its work should grow."""
+
+    most: PositiveInt
+    place: Literal["apart", "together"] = "apart"
+    growth: Literal["polynomial", "exponential"] = "polynomial"
+
+
+class ScalingOptions(Parameters):
+    """The numbers of vehicles; the area per vehicle, and the side of the square that all share."""
+
+    vehicles: tuple[PositiveInt, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 20, 35, 50)
+    area_per_vehicle_m2: PositiveFloat = 2000.0
+    together_m: PositiveFloat = 4.0
+    methods: dict[str, Swept] = {}
+
+
+class Growth(NamedTuple):
+    """How time grows over the greater half of the numbers: the power of N, or the factor per vehicle."""
+
+    power: float
+    factor: float
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: ScalingOptions = setting.options
+    if not experiment.record or set(options.methods) != set(experiment.estimators):
+        raise BadInput(
+            f"experiment '{experiment.title}': give [record], and a method for every estimator"
+        )
+    rows, sources = [], []
+    for count in setting.progress(options.vehicles, "numbers of vehicles", len(options.vehicles)):
+        for place in ("apart", "together"):
+            chosen = {
+                label: settings
+                for label, settings in experiment.estimators.items()
+                if options.methods[label].place == place and count <= options.methods[label].most
+            }
+            if chosen:
+                recorded = _record(Runner(experiment, setting), options, count, place)
+                rows += [(label, place, count, *_timed(recorded, label, chosen)) for label in chosen]
+                sources += recorded
+    columns = ["estimator", "place", "vehicles", "step_ms", "position_rmse_m", "failed_runs"]
+    table = pd.DataFrame(rows, columns=columns)
+    growth = {label: growth_of(own) for label, own in table.groupby("estimator", sort=False)}
+    outcome = Outcome(tables={"scaling": table, "growth": _table(growth, options)})
+    for label, own in table.groupby("estimator", sort=False):
+        name = str(label)
+        for row in own.to_dict("records"):
+            case = f"{row['vehicles']:02d}-vehicles"
+            outcome.metrics[f"{name}.step_ms.{case}"] = row["step_ms"]
+            outcome.metrics[f"{name}.position_rmse_m.{case}"] = row["position_rmse_m"]
+        outcome.metrics[f"{name}.most_vehicles"] = float(own["vehicles"].max())
+        outcome.metrics[f"{name}.growth_power"] = growth[name].power
+        outcome.metrics[f"{name}.growth_factor_per_vehicle"] = growth[name].factor
+    outcome.claims += _claims(table, growth, options)
+    outcome.figures["scaling"] = _chart(table)
+    outcome.input_sha256 = hash_streams(sources)
+    return outcome
+
+
+def _record(runner: Runner, options: ScalingOptions, count: int, place: str) -> list[MemorySource]:
+    side = np.sqrt(options.area_per_vehicle_m2 * count) if place == "apart" else options.together_m
+    square = (-0.5 * side, 0.5 * side) * 2
+    return runner.obtain({"vehicles": count, "field_m": square})
+
+
+def _timed(
+    sources: Sequence[MemorySource], label: str, estimators: Mapping[str, Mapping[str, Any]]
+) -> tuple[float, float, int]:
+    """CPU ms of a run's step, the assigned RMSE of a vehicle's place in m, and how many runs failed."""
+    chosen = {label: estimators[label]}
+    replay_in_memory(sources[:1], chosen)  # compiles
+    begin = time.process_time()
+    outputs = replay_in_memory(sources, chosen)
+    taken = time.process_time() - begin
+    sets = judge(sources, outputs, 0.2).sets
+    [found] = scores_of(sources, outputs, [label], sets).values()
+    steps = sum(len(source.streams["/network/scan"]) for source in sources)
+    vehicles = sum(topic.endswith("/prior") for topic in sources[0].streams)
+    well = np.isfinite(found.assigned)
+    error = float(np.median(found.assigned[well])) if well.any() else np.nan
+    return 1e3 * taken / steps, error / np.sqrt(vehicles), found.failed
+
+
+def growth_of(table: pd.DataFrame) -> Growth:
+    """Fitted to the greater half of the numbers of vehicles, where the work hides what is constant."""
+    own = table[table["vehicles"] >= table["vehicles"].median()]
+    if len(own) < 2:
+        return Growth(np.nan, np.nan)
+    logs = np.log(own["step_ms"])
+    power = np.polyfit(np.log(own["vehicles"]), logs, 1)[0]
+    factor = np.exp(np.polyfit(own["vehicles"], logs, 1)[0])
+    return Growth(float(power), float(factor))
+
+
+def _table(growth: Mapping[Any, Growth], options: ScalingOptions) -> pd.DataFrame:
+    rows = [(label, options.methods[label].growth, *each) for label, each in growth.items()]
+    return pd.DataFrame(rows, columns=["estimator", "work", "power", "factor_per_vehicle"])
+
+
+def _claims(table: pd.DataFrame, growth: Mapping[Any, Growth], options: ScalingOptions) -> list[Claim]:
+    def named(work: str) -> list[str]:
+        return [label for label, swept in options.methods.items() if swept.growth == work]
+
+    polynomial, exponential = named("polynomial"), named("exponential")
+    most = table.groupby("estimator")["vehicles"].max()
+    found = []
+    if polynomial:
+        ours = ", ".join(f"{label} N^{growth[label].power:.1f} to {most[label]}" for label in polynomial)
+        found.append(
+            judged(
+                "association makes the demands grow exponentially with the number of vehicles",
+                "combinatorial growth of JPDA, PHD, MHT",
+                ours,
+                any(growth[label].power > HIGHEST_POWER for label in polynomial),
+                "the best association, the topology and the PHD are polynomial",
+            )
+        )
+    if exponential:
+        ours = ", ".join(
+            f"{label} x{growth[label].factor:.1f} per vehicle to {most[label]}" for label in exponential
+        )
+        found.append(
+            judged(
+                "the SME filter bypasses the combinatorial complexity of association",
+                "no enumeration",
+                ours,
+                all(growth[label].factor < 1.5 for label in exponential),
+                "the exact likelihood of the sums is a permanent: 2^N, or all N! maps of vehicles that "
+                "are close together",
+            )
+        )
+    if {"powers", "kf"} <= set(most.index):
+        errors = table.pivot_table(index="vehicles", columns="estimator", values="position_rmse_m")
+        ratio = (errors["powers"] / errors["kf"]).fillna(np.inf)
+        ratio = ratio[ratio.index <= most["powers"]]
+        found.append(
+            judged(
+                "sums of powers are unsuitable for many vehicles",
+                "10 vehicles need order 10",
+                ", ".join(f"{n}: {each:.3g}" for n, each in ratio.items()) + " times the KF's error",
+                ratio.iloc[-1] > 1.5,
+            )
+        )
+    return found
+
+
+def _chart(table: pd.DataFrame) -> Chart:
+    """Time of a step and error of a vehicle over the number of vehicles."""
+    ticks = {float(count): str(count) for count in TICKS if count <= table["vehicles"].max()}
+    x = Axis(label="vehicles", log=True, ticks=ticks)
+    axes = {
+        "step_ms": Axis(label="CPU time of a step (ms)", log=True),
+        "position_rmse_m": Axis(label="error of a vehicle (m)", limits=(0, 3)),
+    }
+    panels = []
+    for quantity, y in axes.items():
+        series = [
+            curve(str(label), own["vehicles"], own[quantity], "line+markers")
+            for label, own in table.groupby("estimator", sort=False)
+        ]
+        panels.append(Panel(x=x, y=y, series=series))
+    return Chart(columns=2, panels=panels)
+
+
+VEHICLES_SCALING = Study(
+    "time and error of cooperative vehicles' filters over the number of vehicles", study, ScalingOptions
+)

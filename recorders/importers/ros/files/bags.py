@@ -1,0 +1,156 @@
+"""Which files a bag has: one, or those of a folder, split and compressed as ROS does it."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+import zstandard
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from recorders.atomic import scratch_folder
+from recorders.errors import BadInput
+from recorders.importers.ros.files.raw import BagFile, Batch, Connection, joined
+
+SUFFIXES = (".bag", ".db3", ".mcap")
+_WANTED = "give a .bag, .db3 or .mcap file of ROS, or the folder of one"
+_ZSTD = ".zstd"
+
+
+@dataclass
+class Bag:
+    """The files of one bag, in the order of their splits, and what is known to be missing.
+
+    `stated` is how many messages metadata.yaml says that each topic has; where `is_packed`, every
+    message is compressed by itself.
+    """
+
+    path: Path
+    files: list[BagFile]
+    missing: list[str] = field(default_factory=list)
+    stated: Counter[str] = field(default_factory=Counter)
+    is_packed: bool = False
+
+    def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
+        """The messages of the wanted connections, file by file."""
+        for file in self.files:
+            for batch in file.batches(wanted):
+                yield _unpacked(batch) if self.is_packed else batch
+
+    @property
+    def connections(self) -> list[Connection]:
+        """Those of all files."""
+        return [each for file in self.files for each in file.connections]
+
+    @property
+    def others(self) -> list[str]:
+        """What is in all files beside messages."""
+        return [each for file in self.files for each in file.others]
+
+    @property
+    def losses(self) -> list[str]:
+        """What cannot be read, a sentence each; whole after the reading."""
+        return [*self.missing, *(loss for file in self.files for loss in file.losses)]
+
+
+def looks_like_bag(path: Path) -> bool:
+    """Whether a path is named as a bag that is no MCAP file: a folder of one, a .bag or a .db3 file."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or bool(_members(path, {}))
+    return path.suffix in (".bag", ".db3")
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag; raises BadInput where there is none, or nothing of it can be read.
+
+    Files that are compressed as a whole lie uncompressed in a scratch folder meanwhile.
+    """
+    about = _metadata(path) if path.is_dir() else {}
+    paths = _members(path, about) if path.is_dir() else [path]
+    there = [each for each in paths if each.is_file()]
+    bag = Bag(
+        path,
+        [],
+        [f"{each}: is missing, although metadata.yaml names it" for each in paths if each not in there],
+    )
+    if not there:
+        raise BadInput(f"{path}: has no bag in it; {_WANTED}")
+    for entry in about.get("topics_with_message_count") or []:
+        bag.stated[entry["topic_metadata"]["name"]] += int(entry["message_count"])
+    bag.is_packed = str(about.get("compression_mode") or "").lower() == "message"
+    with scratch_folder("fuselog-ros") as scratch:
+        for each in there:
+            bag.files.append(_open_file(each, scratch))
+        if len({type(each) for each in bag.files}) > 1:
+            raise BadInput(f"{path}: has bags of several formats in it; give one of them")
+        yield bag
+
+
+def _open_file(path: Path, scratch: Path) -> BagFile:
+    place = path
+    if path.suffix == _ZSTD:
+        place = scratch / path.stem
+        try:
+            with path.open("rb") as packed, place.open("wb") as file:
+                zstandard.ZstdDecompressor().copy_stream(packed, file)
+        except zstandard.ZstdError as error:
+            raise BadInput(f"{path}: cannot be decompressed ({error})") from None
+    if place.suffix == ".mcap":
+        from recorders.importers.ros.files.mcap_file import McapFile
+
+        return McapFile(place)
+    if place.suffix == ".db3":
+        from recorders.importers.ros.files.sqlite_file import SqliteFile
+
+        return SqliteFile(place)
+    if place.suffix in (".bag", ".active"):
+        from recorders.importers.ros.files.ros1_file import Ros1File
+
+        return Ros1File(place)
+    raise BadInput(f"{path}: is not a bag; {_WANTED}")
+
+
+def _unpacked(batch: Batch) -> Batch:
+    """The same messages, uncompressed; one that cannot be is empty."""
+    parts = []
+    for begin, length in zip(batch.begins.tolist(), batch.lengths.tolist(), strict=True):
+        try:
+            parts.append(zstandard.decompress(batch.data[begin : begin + length].tobytes()))
+        except zstandard.ZstdError:
+            parts.append(b"")
+    return joined(batch.connection, parts, batch.log_time_ns)
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    """What metadata.yaml says of a bag of ROS 2; nothing where there is none."""
+    place = folder / "metadata.yaml"
+    if not place.exists():
+        return {}
+    try:
+        about = YAML(typ="safe").load(place.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    except (OSError, ValueError, KeyError, TypeError, YAMLError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadInput(f"{place}: cannot be read ({said}); give the bag's files one by one") from None
+    if not isinstance(about, dict):
+        raise BadInput(f"{place}: does not describe a bag; give the bag's files one by one")
+    return about
+
+
+def _members(folder: Path, about: dict[str, Any]) -> list[Path]:
+    """The files of a folder, as its metadata lists them, else by their names, numbers in order."""
+    stated = [folder / PurePath(str(name)).name for name in about.get("relative_file_paths") or []]
+    if stated:
+        return stated
+    found = [each for each in folder.iterdir() if each.name.removesuffix(_ZSTD).endswith(SUFFIXES)]
+    return sorted(
+        found,
+        key=lambda each: [
+            (int(part or 0), part) if part.isdigit() else (-1, part)
+            for part in re.split(r"(\d+)", each.name)
+        ],
+    )

@@ -1,0 +1,324 @@
+"""Estimators from plain functions: what is alike in all of them, written once.
+
+`recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
+`batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix
+that has them, name the outputs, and tell of a run that failed while the others go on.
+"""
+
+import copy
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Topic, schemas
+from recorders.parameters import Parameters, ParametersType
+from replay.engine.api.inputs import Given, Messages, OneRun, generator_of, messages_of
+from replay.engine.api.outputs import Estimates, Outputs, Solved
+from replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
+from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
+from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.channels import bindings, resolved
+from replay.engine.streams.failures import Failure, reason_of
+from replay.engine.streams.measurements import Vectors
+from replay.engine.vectors.components import Components
+
+Generators = tuple[np.random.Generator | None, ...]
+
+
+def recursive(
+    summary: str,
+    *,
+    parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
+    streams: Mapping[str, Schema],
+    whole: Mapping[str, Schema],
+    components: Components,
+    truth: str = "",
+    measured: Components | None = None,
+    vectors: Mapping[str, Vectors] | None = None,
+    optional: Collection[str] = (),
+    outputs: Mapping[str, Schema] = MappingProxyType({}),
+    draws: bool = False,
+    start: Callable[[Given[ParametersType]], tuple[Any, Any]],
+    follow: Callable[..., None] | None = None,
+    follow_all: Callable[..., None] | None = None,
+    compiled: bool = True,
+    allocates: bool = True,
+) -> Estimator[ParametersType]:
+    """An estimator that follows its messages in time.
+
+    Args:
+        summary: what it is, in one line.
+        parameters: their type; without one there are none.
+        streams: the topics to follow, with their schemas; see `bindings` for their names.
+        whole: the topics that `start` needs whole, such as a map or a prior. Gaussian estimates among
+            them are priors: of the estimate's components, see `Given.prior`.
+        components: the estimate's components by name, with their kinds.
+        truth: the topic with the truth of what is estimated.
+        measured: the components of the innovations, where `follow` tells of them.
+        vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
+            does not say of them is refused; without an entry here vectors come as the log has them.
+        optional: which of `streams` and `whole` a log may lack.
+        outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
+        draws: whether random numbers are drawn: `follow` then gets the run's own generator as its last
+            argument, `follow_all` those of all runs. It depends on the parameter `seed` and the run's
+            first message, not on other runs, blocks or cores.
+        start: what is given -> settings, and the state: a NamedTuple of arrays with a first axis of
+            runs. A run has failed where its row in the first of them is not finite.
+        follow: follow(run, settings, messages, state, results) takes one run through a block of its
+            messages: it changes that run's rows of `state`, and fills `results`, in place.
+        follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
+            at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
+        compiled: whether `follow` is compiled; plain Python is a hundred times slower.
+        allocates: whether `follow` makes arrays, see
+            `replay.engine.compiling.compile.compile_over_runs`.
+
+    The shortest range so far, of everything that was seen:
+
+    >>> class Shortest(NamedTuple):
+    ...     range_m: np.ndarray
+    >>> def start(given):
+    ...     return (), Shortest(np.full((given.runs, 1), 1e9))
+    >>> def follow(run, settings, messages, state, results):
+    ...     for row in range(messages.offsets[run], messages.offsets[run + 1]):
+    ...         state.range_m[run, 0] = min(state.range_m[run, 0], messages.value[row, 1])
+    ...         results.mean[row, 0] = state.range_m[run, 0]
+    ...         results.covariance[row, 0, 0] = 0.01
+    >>> nearest = recursive(
+    ...     "shortest range so far",
+    ...     streams={"/range": schemas.RANGE},
+    ...     whole={},
+    ...     components={"range_m": "linear"},
+    ...     start=start,
+    ...     follow=follow,
+    ...     compiled=False,
+    ... )
+    >>> from recorders.log import RunMetadata, make_stream
+    >>> from recorders.recording import Recording
+    >>> from replay.engine.replaying.replaying import collect, replay
+    >>> from replay.engine.streams.sources import memory_source
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
+    >>> bound = nearest.bind("nearest", source.topics, Parameters())
+    >>> estimates = collect(replay([source], bound))
+    >>> estimates["/estimates/nearest/state"]["mean"].ravel().tolist()
+    [5.0, 3.0, 3.0]
+    """
+    if (follow is None) == (follow_all is None):
+        raise BadInput(
+            f"estimator '{summary}': neither follow nor follow_all is given; give one of them"
+        )
+    for leaf, schema in outputs.items():
+        _require_numbers(summary, leaf, schema)
+
+    @cache
+    def loop() -> Callable[..., None]:
+        assert follow is not None
+        if not compiled:
+            return uncompiled_over_runs(follow)
+        return compile_over_runs(follow, allocates=allocates)
+
+    def advance_all(arguments: tuple[Any, ...], generators: Generators) -> None:
+        if follow_all is not None:
+            follow_all(*arguments, *([generators] if draws else []))
+        else:
+            loop()(len(generators), *arguments, own=generators if draws else None)
+
+    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+        made = Outputs(
+            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
+        )
+        wanted = {found[topic].name: each for topic, each in (vectors or {}).items() if topic in found}
+        numbers = np.array([number for number, each in enumerate(streams) if each in found])
+
+        def started(maps: Mapping[str, Ragged], runs: int) -> _Carried:
+            settings, state = start(Given(values, found, maps, runs))
+            return _Carried(settings, state, np.zeros(runs, bool), (None,) * runs)
+
+        def begin(given: dict[str, Ragged]) -> _Carried | None:
+            maps = {each: given[found[each].name] for each in whole if each in found}
+            return started(maps, next(iter(maps.values())).runs) if maps else None
+
+        def advance(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+            # without anything whole, the first block is what tells how many runs there are
+            settings, before, told, generators = carried or started({}, len(block.events.offsets) - 1)
+            state = type(before)(*(array.copy() for array in before))
+            messages, skipped = messages_of(block, wanted, values)
+            messages = messages._replace(topic=numbers[messages.topic])
+            results = made.blank(len(messages.time_ns))
+            generators = _drawn_on(generators, messages, values) if draws else generators
+            advance_all((settings, messages, state, results), generators)
+            is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
+            failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
+            told = told | failing
+            outcome = made.of_block(messages, results, np.flatnonzero(failing))
+            return _Carried(settings, state, told, generators), [*outcome, *made.of_skipped(skipped)]
+
+        read, needed = _topics(found, streams), _topics(found, whole)
+        return Recursive(name, read, needed, begin, advance, _priors(found, whole, components))
+
+    return _estimator(summary, parameters, {**streams, **whole}, optional, bind)
+
+
+def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
+    for field in schema.fields[1:]:
+        if field.kind == "vector":
+            raise BadInput(
+                f"estimator '{summary}': field {field.name} of its output {leaf} is a vector; give a "
+                "further output of a recursion fields of one number each"
+            )
+
+
+def _drawn_on(generators: Generators, messages: Messages, parameters: Any) -> Generators:
+    """The runs' generators for one block: copies, since a block may have to be gone through again.
+
+    A run that has none yet gets one at its first message.
+    """
+    return tuple(
+        copy.deepcopy(generator)
+        if generator is not None or begin == end
+        else generator_of(parameters, [messages.time_ns[begin : begin + 1], messages.value[begin]])
+        for generator, begin, end in zip(
+            generators, messages.offsets[:-1], messages.offsets[1:], strict=True
+        )
+    )
+
+
+def batch(
+    summary: str,
+    *,
+    parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
+    streams: Mapping[str, Schema],
+    whole: Mapping[str, Schema],
+    components: Components,
+    truth: str = "",
+    measured: Components | None = None,
+    optional: Collection[str] = (),
+    outputs: Mapping[str, Schema] = MappingProxyType({}),
+    solve: Callable[[Given[ParametersType]], Solved],
+) -> Estimator[ParametersType]:
+    """An estimator that solves whole streams.
+
+    Args as for `recursive`, and:
+        outputs: further outputs by name, with their schemas; see `Estimates.further`.
+        solve: solve(given) gets the streams and whole topics of all runs, by the names asked for;
+            `each_run` makes it of a function of one run.
+
+    The mean of all ranges:
+
+    >>> def mean_range(streams, parameters):
+    ...     ranges = streams["/range"]
+    ...     mean, covariance = ranges["range_m"].mean().reshape(1, 1), np.full((1, 1, 1), 0.01)
+    ...     return Estimates(ranges.publish_time_ns[-1:], mean, covariance)
+    >>> average = batch(
+    ...     "mean range",
+    ...     streams={"/range": schemas.RANGE},
+    ...     whole={},
+    ...     components={"range_m": "linear"},
+    ...     solve=each_run(mean_range),
+    ... )
+    >>> from recorders.log import RunMetadata, make_stream
+    >>> from recorders.recording import Recording
+    >>> from replay.engine.replaying.replaying import collect, replay
+    >>> from replay.engine.streams.sources import memory_source
+    >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 1, 2], range_m=[5, 3, 4])
+    >>> source = memory_source(Recording([seen]), RunMetadata("example"))
+    >>> estimates = collect(replay([source], average.bind("average", source.topics, Parameters())))
+    >>> estimates["/estimates/average/state"]["mean"].tolist()
+    [[4.0]]
+    """
+
+    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+        made = Outputs(
+            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
+        )
+
+        def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
+            streams_of = {each: given[topic.name] for each, topic in found.items()}
+            runs = next(iter(streams_of.values())).runs
+            return made.of_solved(solve(Given(values, found, streams_of, runs)), runs)
+
+        read, needed = _topics(found, streams), _topics(found, whole)
+        return Batch(name, read, needed, solve_all, _priors(found, whole, components))
+
+    return _estimator(summary, parameters, {**streams, **whole}, optional, bind)
+
+
+def each_run(
+    solve: Callable[[OneRun, ParametersType], Estimates],
+) -> Callable[[Given[ParametersType]], Solved]:
+    """Solve run by run, for `batch`: solve(streams, parameters) gets a run's streams by name.
+
+    They know more of the run: `OneRun.prior`, `stated` and a `generator`. Where `solve` raises, that
+    run has failed; where all do, it is the input that is bad.
+    """
+
+    def solve_all(given: Given[ParametersType]) -> Solved:
+        solved: dict[int, Estimates] = {}
+        failures: dict[int, Failure] = {}
+        errors: list[Exception] = []
+        for run in range(given.runs):
+            streams = OneRun(given, run)
+            try:
+                solved[run] = solve(streams, given.parameters)
+            except (MemoryError, OSError):
+                raise
+            except Exception as error:
+                end_ns = max(stream.publish_time_ns.max(initial=0) for stream in streams.values())
+                failures[run] = Failure(int(end_ns), reason_of(error))
+                errors.append(error)
+        if not solved:
+            raise errors[0]
+        return Solved(solved, failures)
+
+    return solve_all
+
+
+def _priors(
+    found: Mapping[str, Topic], whole: Mapping[str, Schema], components: Components
+) -> dict[str, Components]:
+    return {
+        found[name].name: components
+        for name, schema in whole.items()
+        if schema is schemas.GAUSSIAN_ESTIMATE and name in found
+    }
+
+
+def _topics(found: Mapping[str, Topic], names: Mapping[str, Schema]) -> tuple[str, ...]:
+    return tuple(found[name].name for name in names if name in found)
+
+
+def _estimator(
+    summary: str,
+    parameters: type[ParametersType],
+    asked: Mapping[str, Schema],
+    optional: Collection[str],
+    bind_one: Callable[[str, str, Mapping[str, Topic], ParametersType], Bound],
+) -> Estimator[ParametersType]:
+    def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
+        return [
+            bind_one(f"{label}{prefix}", prefix, found, values)
+            for prefix, found in bindings(topics, asked, optional)
+        ]
+
+    needs = [
+        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
+        for name, schema in asked.items()
+    ]
+    return Estimator(summary, ", ".join(needs), parameters, bind)
+
+
+class _Carried(NamedTuple):
+    """What a recursion carries from block to block; `told` (runs,) says whose failure was told.
+
+    A run's generator is None until there is a message, or where none is wanted.
+    """
+
+    settings: Any
+    state: Any
+    told: NDArray[np.bool_]
+    generators: Generators

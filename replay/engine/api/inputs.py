@@ -1,0 +1,168 @@
+"""What estimators from plain functions are given: whole streams, one run of them, a block's messages."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Generic, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, Topic
+from recorders.parameters import ParametersType
+from replay.engine.philox import run_key
+from replay.engine.streams.blocks import Block, Ragged, ragged_rows
+from replay.engine.streams.channels import given_or_stated
+from replay.engine.streams.measurements import Vectors, numbers_of
+from replay.engine.streams.priors import gaussians
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Given(Mapping[str, Ragged], Generic[ParametersType]):
+    """What is given of all runs; topics go by the names under which an estimator asked for them.
+
+    It maps those that are given whole to their streams: of a recursion what it starts from, of a batch
+    all. A topic that is optional and that the log lacks is not in it.
+    """
+
+    parameters: ParametersType
+    topics: Mapping[str, Topic]
+    whole: Mapping[str, Ragged]
+    runs: int
+
+    def stated(self, topic: str, name: str) -> float:
+        """The parameter `name`, or where it is None the number that the topic's channel states.
+
+        Raises BadInput where neither does.
+        """
+        return given_or_stated(self.parameters, [self.topics[topic]], name)
+
+    def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
+        """The prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
+
+        They are of the estimate's components, in their order, whatever the log's order is. NaN where a
+        run has none that can be used: it has failed, and gets no messages.
+        """
+        return gaussians(self.whole[topic])
+
+    def __getitem__(self, topic: str) -> Ragged:
+        """A whole topic, all runs end to end."""
+        return self.whole[topic]
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of what is given."""
+        return iter(self.whole)
+
+    def __len__(self) -> int:
+        """How many topics are given."""
+        return len(self.whole)
+
+
+@dataclass(frozen=True, eq=False)
+class OneRun(Mapping[str, Stream]):
+    """What is given of one run, stream by stream; see `Given` and `each_run`."""
+
+    given: Given[Any]
+    run: int
+
+    def stated(self, topic: str, name: str) -> float:
+        """See `Given.stated`."""
+        return self.given.stated(topic, name)
+
+    def prior(self, topic: str) -> tuple[int, Floats, Floats]:
+        """The run's prior, see `Given.prior`: stamp, mean (d,), covariance (t, t)."""
+        stream = self[topic]
+        time_ns, mean, covariance = gaussians(Ragged(stream, np.array([0, len(stream)])))
+        return int(time_ns[0]), mean[0], covariance[0]
+
+    @cached_property
+    def generator(self) -> np.random.Generator:
+        """The run's own generator: from the parameter `seed` and the first messages of its streams.
+
+        So it is the same on any number of cores, and whatever other runs there are.
+        """
+        first = [column[:1] for stream in self.values() for column in stream.columns.values()]
+        return generator_of(self.given.parameters, first)
+
+    def __getitem__(self, topic: str) -> Stream:
+        """A topic's messages of this run."""
+        return self.given[topic].of_run(self.run)
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of what is given."""
+        return iter(self.given)
+
+    def __len__(self) -> int:
+        """How many topics are given."""
+        return len(self.given)
+
+
+def generator_of(parameters: Any, first: Iterable[NDArray]) -> np.random.Generator:
+    """A counter-based generator (Philox), keyed by a seed and a run's first data."""
+    key = run_key(getattr(parameters, "seed", 0), first)
+    return np.random.Generator(np.random.Philox(key=key))
+
+
+class Messages(NamedTuple):
+    """The messages of all runs in time order: run r owns the rows offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns: (n,).
+        topic: (n,) which stream, in the order in which they were asked for.
+        value: (n, width) the fields after the sensor's clock, in order of declaration; NaN beyond. Of
+            vectors there are the components that were asked for, in that order.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    topic: Integers
+    value: Floats
+
+
+class Skipped(NamedTuple):
+    """Messages that were not used: offsets by run, stamps, and the number of the reason of each."""
+
+    offsets: Integers
+    time_ns: Integers
+    reason: Integers
+    reasons: list[str]
+
+
+def messages_of(
+    block: Block, vectors: Mapping[str, Vectors], parameters: Any
+) -> tuple[Messages, Skipped]:
+    """A block's messages, their fields as numbers; and those that lack a covariance."""
+    events = block.events
+    read = [
+        numbers_of(ragged.stream, vectors.get(topic), parameters)
+        for topic, ragged in block.streams.items()
+    ]
+    tables, missing = zip(*read, strict=True)
+    skip = np.concatenate(missing)[events.source]
+    reasons = [vectors[topic].complaint(topic) if topic in vectors else "" for topic in block.streams]
+    skipped = Skipped(
+        ragged_rows(skip, events.offsets), events.time_ns[skip], events.topic[skip], reasons
+    )
+    # the messages of one topic are in order already
+    value = tables[0] if len(tables) == 1 else _side_by_side(tables)[events.source]
+    rows = ~skip if skip.any() else slice(None)
+    kept = Messages(
+        ragged_rows(~skip, events.offsets),
+        events.time_ns[rows],
+        events.topic[rows],
+        value[rows],
+    )
+    return kept, skipped
+
+
+def _side_by_side(tables: Sequence[Floats]) -> Floats:
+    """Tables one after another, NaN where one has fewer columns than the widest."""
+    width = max(table.shape[1] for table in tables)
+    found = np.full((sum(map(len, tables)), width), np.nan)
+    for begin, table in zip(np.cumsum([0, *map(len, tables)]), tables, strict=False):
+        found[begin : begin + len(table), : table.shape[1]] = table
+    return found

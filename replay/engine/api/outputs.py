@@ -1,0 +1,261 @@
+"""What estimators from plain functions fill or return, and the output topics that are made of it."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream, make_stream, schemas
+from replay.engine.api.inputs import Floats, Integers, Messages, Skipped
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.failures import Failure, reason_stream
+from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream, states_in
+from replay.engine.vectors.components import Components
+from replay.engine.vectors.tangent import tangent_components
+
+DIVERGED = "the estimate is no longer finite: the filter diverged"
+
+
+class Results(NamedTuple):
+    """What a recursion fills, one row for every message; a row of NaN says nothing.
+
+    Attributes:
+        mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
+            space (see `replay.engine.vectors.tangent`), d where all are linear or angles.
+        innovation, innovation_covariance: (n, m), (n, m, m) of the message.
+        squared: (n,) the normalised innovation squared.
+        accepted: (n,) whether a gate let the message in; 1 unless set.
+        target: (n,) what the message was about; 0 unless set.
+        further: (n, k) the fields of the further outputs that were named, after the sensor's clock, side
+            by side in order; a message is told of an output where its first field is a number.
+    """
+
+    mean: Floats
+    covariance: Floats
+    innovation: Floats
+    innovation_covariance: Floats
+    squared: Floats
+    accepted: Integers
+    target: Integers
+    further: Floats
+
+
+class Solution(NamedTuple):
+    """How the solutions ended, (n,) each; the cost is what was minimised."""
+
+    iterations: Integers
+    converged: Integers
+    rank: Integers
+    cost: Floats
+
+
+class Told(NamedTuple):
+    """What a batch says beside its estimates: stamps (n,), and columns by the fields of a schema."""
+
+    time_ns: Integers
+    columns: Mapping[str, NDArray]
+
+
+class Measured(NamedTuple):
+    """Innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
+
+    `target` (n,) is what each was about; 0 unless given.
+    """
+
+    time_ns: Integers
+    innovation: Floats
+    covariance: Floats
+    target: Integers | None = None
+
+
+class Estimates(NamedTuple):
+    """What one run's streams were solved to.
+
+    Attributes:
+        time_ns, mean, covariance: stamps (n,), means (n, d), covariances (n, t, t).
+        solution: how it ended.
+        innovations: of the measurements, where the batch names what is `measured`.
+        further: by name, what the batch's further `outputs` say.
+    """
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    solution: Solution | None = None
+    innovations: Measured | None = None
+    further: Mapping[str, Told] = MappingProxyType({})
+
+
+class Solved(NamedTuple):
+    """The estimates by run, and the failures; a run that failed has no estimates."""
+
+    estimates: Mapping[int, Estimates]
+    failures: Mapping[int, Failure]
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The output topics of one bound estimator: state, failures and, where told, innovations."""
+
+    name: str
+    topic: str
+    truth: str
+    components: Components
+    measured: Components
+    further: Mapping[str, Schema]
+
+    @property
+    def tangent(self) -> int:
+        """How many components the tangent space has."""
+        return len(tangent_components(list(self.components), list(self.components.values())))
+
+    def blank(self, rows: int) -> Results:
+        """Results that say nothing."""
+        d, t, m = len(self.components), self.tangent, len(self.measured)
+        width = sum(len(schema.fields) - 1 for schema in self.further.values())
+        return Results(
+            np.full((rows, d), np.nan),
+            np.full((rows, t, t), np.nan),
+            np.full((rows, m), np.nan),
+            np.full((rows, m, m), np.nan),
+            np.full(rows, np.nan),
+            np.ones(rows, np.int64),
+            np.zeros(rows, np.int64),
+            np.full((rows, width), np.nan),
+        )
+
+    def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
+        """The outputs of one block; of several estimates at a stamp the last stands."""
+        # what is said of a covariance that is none is for the replay to find
+        said = np.isfinite(np.einsum("nd->n", results.mean))
+        rows = _last_of_stamps(messages, np.flatnonzero(said))
+        columns = messages.time_ns, messages.offsets, self.components, self.truth
+        state = states_in(rows, f"{self.topic}/state", *columns, results.mean, results.covariance)
+        failures = {}
+        for run in failing.tolist():
+            begin, end = messages.offsets[run : run + 2]
+            last = np.flatnonzero(said[begin:end]).max(initial=-1)
+            end_ns = messages.time_ns[min(begin + last + 1, end - 1)]
+            failures[run] = Failure(int(end_ns), DIVERGED)
+        made = [
+            state,
+            failures_by_run(self.topic, failures, len(messages.offsets) - 1),
+        ]
+        if self.measured:
+            made.append(self._innovations_of_block(messages, results))
+        return [*made, *self._further_of_block(messages, results.further)]
+
+    def of_skipped(self, skipped: Skipped) -> list[Ragged]:
+        """What was not used, for estimators of what may lack a covariance."""
+        if not any(skipped.reasons):
+            return []
+        topic = f"{self.topic}/skipped"
+        stream = reason_stream(topic, schemas.SKIPPED, skipped.time_ns, skipped.reason, skipped.reasons)
+        return [Ragged(stream, skipped.offsets)]
+
+    def of_solved(self, solved: Solved, runs: int) -> list[Ragged]:
+        """The outputs of a batch."""
+        made = [failures_by_run(self.topic, solved.failures, runs)]
+        parts: dict[str, dict[int, Stream]] = {}
+        for run, estimates in solved.estimates.items():
+            for stream in self._of_run(estimates):
+                parts.setdefault(stream.topic, {})[run] = stream
+        for found in parts.values():
+            nothing = next(iter(found.values())).take(slice(0, 0))
+            made.append(gather([found.get(run, nothing) for run in range(runs)]))
+        return made
+
+    def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
+        rows = np.flatnonzero(np.isfinite(results.squared))
+        stream = innovation_stream(
+            f"{self.topic}/innovation",
+            messages.time_ns[rows],
+            self.measured,
+            self.truth,
+            target_id=results.target[rows],
+            accepted=results.accepted[rows],
+            innovation=results.innovation[rows],
+            covariance=results.innovation_covariance[rows],
+            squared=results.squared[rows],
+        )
+        return Ragged(stream, np.searchsorted(rows, messages.offsets))
+
+    def _further_of_block(self, messages: Messages, told: Floats) -> Iterator[Ragged]:
+        first = 0
+        for name, schema in self.further.items():
+            names = [field.name for field in schema.fields[1:]]
+            own, first = told[:, first : first + len(names)], first + len(names)
+            rows = np.flatnonzero(np.isfinite(own[:, 0]))
+            columns = dict(zip(names, own[rows].T, strict=True))
+            stream = make_stream(f"{self.topic}/{name}", schema, messages.time_ns[rows], **columns)
+            yield Ragged(stream, np.searchsorted(rows, messages.offsets))
+
+    def _of_run(self, estimates: Estimates) -> Iterator[Stream]:
+        """What is said of one run, in streams; raises BadInput where a shape is wrong."""
+        time_ns, mean, covariance = self._checked(
+            "", estimates[:3], ((), (len(self.components),), (self.tangent,) * 2)
+        )
+        topic, components = f"{self.topic}/state", self.components
+        yield state_stream(topic, time_ns, components, self.truth, mean, covariance)
+        if estimates.solution is not None:
+            yield make_stream(
+                f"{self.topic}/solution",
+                schemas.SOLUTION,
+                time_ns,
+                metadata={"truth": self.truth},
+                **estimates.solution._asdict(),
+            )
+        if self.measured:
+            yield self._innovations_of_run(estimates.innovations)
+        for name, schema in self.further.items():
+            if name in estimates.further:
+                told = estimates.further[name]
+                columns: dict[str, Any] = dict(told.columns)
+                yield make_stream(f"{self.topic}/{name}", schema, told.time_ns, **columns)
+
+    def _innovations_of_run(self, told: Measured | None) -> Stream:
+        m = len(self.measured)
+        told = told or Measured(np.empty(0, np.int64), np.empty((0, m)), np.empty((0, m, m)))
+        time_ns, innovation, covariance = self._checked("innovations.", told[:3], ((), (m,), (m, m)))
+        count = len(time_ns)
+        weighted = np.linalg.solve(covariance, innovation[..., None])[..., 0]
+        return innovation_stream(
+            f"{self.topic}/innovation",
+            time_ns,
+            self.measured,
+            self.truth,
+            target_id=np.zeros(count, np.int64) if told.target is None else told.target,
+            accepted=np.ones(count, np.int64),
+            innovation=innovation,
+            covariance=covariance,
+            squared=np.einsum("ni,ni->n", innovation, weighted),
+        )
+
+    def _checked(
+        self, part: str, arrays: Sequence[Any], shapes: Sequence[tuple[int, ...]]
+    ) -> tuple[Integers, Floats, Floats]:
+        """Stamps, means and covariances as arrays; raises BadInput where a shape is wrong."""
+        time_ns, mean, covariance = (np.asarray(array) for array in arrays)
+        names = ("time_ns", "innovation" if part else "mean", "covariance")
+        for name, array, shape in zip(names, (time_ns, mean, covariance), shapes, strict=True):
+            wanted = (*time_ns.shape[:1], *shape)
+            if array.shape != wanted:
+                raise BadInput(
+                    f"estimator {self.name}: {part}{name} has the shape {array.shape}; "
+                    f"{wanted} is needed"
+                )
+        return time_ns, mean.astype(float, copy=False), covariance.astype(float, copy=False)
+
+
+def _last_of_stamps(messages: Messages, rows: Integers) -> Integers:
+    """Of these rows, in order, the last one of every stamp of a run."""
+    time_ns = messages.time_ns[rows]
+    is_last = np.ones(len(rows), bool)
+    np.not_equal(time_ns[1:], time_ns[:-1], out=is_last[:-1])
+    ends = np.searchsorted(rows, messages.offsets[1:])
+    is_last[ends[ends > 0] - 1] = True
+    return rows[is_last]

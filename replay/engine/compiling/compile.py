@@ -1,0 +1,197 @@
+"""Loops over runs of plain functions, compiled and shared among the cores.
+
+A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
+arrays is written in LLVM's text by ourselves (`replay.engine.compiling.kernels`), in milliseconds; any
+other goes through numba (`replay.engine.compiling.through_numba`). With FUSELOG_UNCOMPILED=1 all are
+plain Python, which a debugger can follow: that is the reference.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache, lru_cache, wraps
+from itertools import pairwise
+from types import FunctionType
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
+
+import numpy as np
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+class Loop(Protocol):
+    """A compiled loop over runs."""
+
+    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
+        """What goes through the runs from a first one up to an end, with these arguments.
+
+        The last of them, `scratch`, is what one core works in.
+        """
+        ...
+
+
+def compiled(
+    function: Callable[Parameters, Result], *, allocates: bool = True
+) -> Callable[Parameters, Result]:
+    """Compile a function of arrays and numbers, with all that it calls, when it is first called.
+
+    For what Python calls as it stands; inside another kernel it is compiled with the rest. Its arguments
+    are given by position. One that makes no arrays (`allocates=False`) is compiled in a twentieth of the
+    time; it returns nothing, or one number of the kind that its annotation says.
+    Raises BadInput, when called, where a source is not at hand.
+    """
+
+    @cache
+    def kernel() -> Callable[Parameters, Result]:
+        if allocates:
+            from replay.engine.compiling.through_numba import function_of
+        else:
+            from replay.engine.compiling.kernels.native import function_of
+        return function_of(function)
+
+    @wraps(function)
+    def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        if is_uncompiled():
+            with np.errstate(all="ignore"):
+                return function(*arguments, **named)
+        return kernel()(*arguments, **named)
+
+    return call
+
+
+def compile_over_runs(
+    run_once: Callable[..., None], *, allocates: bool = True, title: str = ""
+) -> Callable[..., None]:
+    """Compile a function of one run into a loop over all runs, on all cores.
+
+    Args:
+        run_once: `run_once(run, *arguments)` does the work of run number `run` and writes only what
+            belongs to that run. It may be a closure over model functions and numbers: that is how it is
+            specialised. It may use NumPy and functions that keep to the same.
+        allocates: whether it makes arrays. A kernel that does not is compiled in a twentieth of the
+            time, and is several times as fast.
+        title: what it is to who waits until it is compiled, such as "ekf of robot".
+
+    Returns `loop(runs, *arguments, scratch=None, own=None)`; its results do not depend on the number of
+    runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
+    `run_once`: arrays that one run after another may work in. Or that is `own[run]`, such as the run's
+    generator of random numbers; a run whose own is None is left out.
+    Raises BadInput where a source is not at hand (a function typed at a prompt, say).
+
+    For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
+    array is an IndexError; with FUSELOG_BOUNDSCHECK=1 it is one in compiled kernels too.
+    """
+    title = title or f"{run_once.__module__}.{run_once.__name__}"
+
+    @cache
+    def loop() -> Loop:
+        if allocates:
+            from replay.engine.compiling.through_numba import loop_of
+
+            return loop_of(run_once, title)
+        from replay.engine.compiling.kernels.native import Kernel
+
+        return Kernel(cast(FunctionType, run_once), title)
+
+    def over_runs(runs: int, *arguments: Any, **memory: Any) -> None:
+        if is_uncompiled():
+            plain(runs, *arguments, **memory)
+        else:
+            _share(loop(), runs, *arguments, **memory)
+
+    plain = uncompiled_over_runs(run_once)
+    if allocates and not is_uncompiled():
+        loop()  # says at once where a source is not at hand
+    return over_runs
+
+
+def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    """What `compile_over_runs` returns, in plain Python; NaN and infinity raise nothing here either."""
+
+    def loop(
+        runs: int,
+        *arguments: Any,
+        scratch: Callable[[], Any] | None = None,
+        own: Sequence[Any] | None = None,
+    ) -> None:
+        memory = [scratch()] if scratch else []
+        with np.errstate(all="ignore"):
+            for run in range(runs):
+                if own is None:
+                    run_once(run, *arguments, *memory)
+                elif own[run] is not None:
+                    run_once(run, *arguments, own[run])
+
+    return loop
+
+
+def _share(
+    loop: Loop,
+    runs: int,
+    *arguments: Any,
+    scratch: Callable[[], Any] | None = None,
+    own: Sequence[Any] | None = None,
+) -> None:
+    """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+
+    def prepared() -> Callable[[int, int], None]:
+        if own is None:
+            return loop.of(arguments, [scratch()] if scratch else [])
+        of_own = {run: loop.of((*arguments, each)) for run, each in enumerate(own) if each is not None}
+
+        def through(first: int, end: int) -> None:
+            for run in range(first, end):
+                if run in of_own:
+                    of_own[run](run, run + 1)
+
+        return through
+
+    def work(through: Callable[[int, int], None] | None) -> None:
+        through = through or prepared()
+        for first, end in waiting:
+            through(first, end)
+
+    cores, first = min(runs, core_count()), prepared()
+    if cores <= 1:
+        first(0, runs)
+        return
+    cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
+    waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
+    first(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported
+    helpers = [_helpers(os.getpid()).submit(work, None) for _ in range(cores - 1)]
+    try:
+        work(first)
+    finally:  # none works on when this returns
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+
+
+def use_cores(count: int) -> None:
+    """Have kernels of this process use so many cores."""
+    os.environ["NUMBA_NUM_THREADS"] = str(count)
+    core_count.cache_clear()
+    _helpers.cache_clear()
+
+
+@cache
+def core_count() -> int:
+    """How many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
+    asked = os.environ.get("NUMBA_NUM_THREADS", "")
+    if asked.isdigit() and int(asked) > 0:
+        return int(asked)
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+@lru_cache(maxsize=1)
+def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    """The threads beside the calling one; a forked process has none of its parent's."""
+    return ThreadPoolExecutor(max(1, core_count() - 1))
+
+
+def is_uncompiled() -> bool:
+    """Whether kernels are plain Python now."""
+    return os.environ.get("FUSELOG_UNCOMPILED") == "1"

@@ -1,0 +1,155 @@
+"""Keeps the compiled code of kernels on disk: each is loaded, or compiled once by one process."""
+
+import __future__
+
+import gc
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import lru_cache, partial
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numba
+from numba.core import errors, types
+from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.serialize import dumps
+
+from recorders.errors import BadInput
+from replay.engine.compiling.cache import (
+    cache_folder,
+    in_turn,
+    is_private,
+    read_checked,
+    say_once,
+    write_checked,
+)
+from replay.engine.compiling.kernels.telling import compiling
+
+# In place of the colours in which numba sets its error messages.
+_COLOURLESS = SimpleNamespace(
+    **dict.fromkeys(("code", "errmsg", "filename", "highlight", "indicate", "reset"), str)
+)
+
+
+@lru_cache(maxsize=64)
+def load(text: str, title: str) -> Callable[..., Any]:
+    """The function `kernel` of a module with this text; `title` is what to call it to a user."""
+    versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
+    name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
+    module = ModuleType(name)
+    sys.modules[name] = module  # compiled code that was kept looks for it there
+    execute(text, name, module)
+    if not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        module.kernel._cache = code = _CompiledCode(name, title)
+        module.kernel.compile = partial(code.compile, module.kernel.compile)
+    return module.kernel
+
+
+def execute(source: str, name: str, module: ModuleType) -> None:
+    """Define what a source defines in a module; `name` is its file in tracebacks."""
+    exec(compile(source, name, "exec", __future__.annotations.compiler_flag), vars(module))
+
+
+class _CompiledCode:
+    """Keeps the compiled code of one kernel, in the place of numba's own cache.
+
+    A file is checked before it is executed. Nothing about the disk stops the work: what cannot be loaded
+    is compiled anew and replaced.
+    """
+
+    cache_path = None
+
+    def __init__(self, name: str, title: str) -> None:
+        self._name = name
+        self._title = title
+        # what holds while it is compiled
+        self._meanwhile = ExitStack()
+
+    def compile(self, by_numba: Callable[[Any], Any], signature: Any) -> Any:
+        """Load or compile the kernel for these types of arguments; numba asks the methods below."""
+        with global_compiler_lock, self._meanwhile:
+            return by_numba(signature)
+
+    def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
+        """The code, or None: it is compiled then, which is said where it takes long.
+
+        Of several processes that want it one compiles, and the others load what that one has kept.
+        """
+        target.refresh()  # numba's own cache says: "to ensure it is initialized"
+        path = self._path(signature, target)
+        if path is None or not is_private(path.parent):
+            self._meanwhile.enter_context(_compiling(self._title))
+            return None
+        found = _loaded(path, target)
+        if found is None:
+            self._meanwhile.enter_context(_compiling(self._title))
+            if self._meanwhile.enter_context(in_turn(path)):
+                found = _loaded(path, target)
+        return found
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep the code."""
+        path = self._path(signature, result.target_context)
+        # an address in the code is worth nothing in another process
+        if path is None or result.library.has_dynamic_globals or not is_private(path.parent):
+            return
+        try:
+            write_checked(path, dumps((path.name, result._reduce())), "a kernel that fuselog compiled")
+        except BadInput as error:
+            why = str(error).removeprefix(f"{path}: ")
+            say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
+
+    def _path(self, signature: Any, target: Any) -> Path | None:
+        """The file for one processor and these types of arguments."""
+        key = "\n".join([*map(str, target.codegen().magic_tuple()), *map(_described, signature)])
+        try:
+            folder = cache_folder()
+        except RuntimeError:  # a user without a home
+            return None
+        return folder / "kernels" / f"{self._name}-{sha256(key.encode()).hexdigest()[:24]}.bin"
+
+
+def _loaded(path: Path, target: Any) -> CompileResult | None:
+    content = read_checked(path)
+    if content is None:
+        return None
+    try:
+        name, parts = pickle.loads(content)
+        return CompileResult._rebuild(target, *parts) if name == path.name else None
+    except Exception:  # whatever a file of other versions, or of a class that has moved, leads to
+        return None
+
+
+@contextmanager
+def _compiling(title: str) -> Iterator[None]:
+    """Say that a kernel is compiled, where that takes long, and do meanwhile what makes that shorter.
+
+    A compiler makes very many objects and little garbage; looking for that takes a seventh of its time.
+    numba makes an error of every type that does not fit and tries the next; colours of these, which are
+    there where colorama is installed, take a thirtieth.
+    """
+    collecting = gc.isenabled()
+    colours = errors._termcolor_inst  # type: ignore[attr-defined]
+    gc.disable()
+    errors._termcolor_inst = _COLOURLESS  # type: ignore[attr-defined]
+    try:
+        with compiling(title):
+            yield
+    finally:
+        errors._termcolor_inst = colours  # type: ignore[attr-defined]
+        if collecting:
+            gc.enable()
+
+
+def _described(kind: Any) -> str:
+    """The name of a type, and the fields of a named tuple, which numba knows by its class alone."""
+    if not isinstance(kind, types.BaseTuple):
+        return str(kind)
+    entries = ", ".join(map(_described, kind.types))  # type: ignore[attr-defined]
+    return f"{getattr(kind, 'instance_class', tuple)} {getattr(kind, 'fields', '')} ({entries})"

@@ -1,0 +1,137 @@
+"""What a kernel is called with: described for its key, packed as words, and loaded in the kernel.
+
+NumPy's own structure of an array says where its numbers and its sizes are; its address is the word.
+"""
+
+import operator
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.compiling.kernels.numbers import REAL, TRUTH, WHOLE, WORD, Emitter, Number
+from replay.engine.compiling.kernels.values import STORED, Array, Record, combined
+
+KNOWN = 64  # sizes up to this are part of a kernel
+
+
+class Kept(NamedTuple):
+    """How an array lies in memory: NumPy's letter of its numbers, its sizes (None where they vary)."""
+
+    letter: str
+    shape: tuple[int | None, ...]
+    is_packed: bool
+
+
+_LETTERS: dict[str, str] = {np.dtype(stored).char: stored for stored in STORED}
+_LETTERS["q"] = _LETTERS["l"] = "<i8"
+_LETTERS["Q"] = _LETTERS["L"] = "<u8"
+# where NumPy's own structure of an array has what (PyArrayObject_fields), behind the head of an object
+_DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
+
+
+def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> None:
+    """Add what an argument is, for the kernel's key, and what it is at run time.
+
+    So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
+    """
+    if isinstance(value, np.ndarray):
+        flags, dtype = value.flags, value.dtype
+        is_usual = flags.aligned and dtype.isnative
+        kinds.append((dtype.char, value.ndim, value.shape[varies:], flags.c_contiguous, is_usual))
+        numbers.append(id(value))
+    elif isinstance(value, tuple):
+        kinds.append((type(value), len(value)))
+        own = getattr(value, "varies", None)
+        if own is None:
+            for each in value:
+                describe(each, varies, kinds, numbers)
+        else:
+            for each, axes in zip(value, own, strict=True):
+                describe(each, axes, kinds, numbers)
+    else:
+        kinds.append(type(value))
+        numbers.append(value)
+
+
+def with_types(value: Any, kinds: Iterator[Any]) -> Any:
+    """An argument in full, as `value_of` takes it: from what it is and its part of the key."""
+    kind = next(kinds)
+    if isinstance(value, tuple):
+        return type(value), tuple(with_types(each, kinds) for each in value)
+    if isinstance(value, np.ndarray):
+        letter, axes, known, is_packed, is_usual = kind
+        if letter not in _LETTERS or not is_usual:
+            why = "" if is_usual else ", unaligned or in another machine's order"
+            raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
+        shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
+        return Kept(letter, shape, is_packed)
+    for types, name in _SCALARS:
+        if issubclass(kind, types):
+            return name
+    raise BadInput(f"a kernel takes numbers, arrays and tuples of them, not a {kind.__name__}")
+
+
+_SCALARS: tuple[tuple[Any, str], ...] = (
+    ((bool, np.bool_), TRUTH),
+    (np.unsignedinteger, WORD),
+    ((int, np.integer), WHOLE),
+    ((float, np.floating), REAL),
+)
+
+
+def letters(kind: Any) -> str:
+    """How the numbers of an argument are packed into words."""
+    if isinstance(kind, Kept):
+        return "q"
+    if isinstance(kind, tuple):
+        return "".join(map(letters, kind[1]))
+    return {REAL: "d", WORD: "Q", TRUTH: "?7x"}.get(kind, "q")
+
+
+def value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
+    """The value that a described argument is in the kernel: loaded from its words."""
+    if isinstance(kind, Kept):
+        return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
+    if isinstance(kind, tuple):
+        parts = tuple(value_of(each, emitter, words) for each in kind[1])
+        return parts if kind[0] is tuple else Record(kind[0], parts)
+    if kind == TRUTH:
+        return emitter.number(TRUTH, f"icmp ne i64 {_word('i64', emitter, next(words))}, 0")
+    return Number(kind, _word(Number(kind, "").type, emitter, next(words)))
+
+
+def _word(kind: str, emitter: Emitter, place: int) -> str:
+    return _loaded_from(kind, emitter, "%words", 8 * place)
+
+
+def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
+    place, name = emitter.fresh(), emitter.fresh()
+    emitter.add(f"{place} = getelementptr inbounds i8, ptr {address}, i64 {offset}")
+    emitter.add(f"{name} = load {kind}, ptr {place}")
+    return name
+
+
+def _array_of(kind: Kept, emitter: Emitter, structure: str) -> Array:
+    """An array of NumPy's: where its numbers are, and the sizes that are not known."""
+    dtype = _LETTERS[kind.letter]
+    sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
+    shape: list[Any] = [
+        _loaded_from("i64", emitter, sizes, 8 * axis) if size is None else size
+        for axis, size in enumerate(kind.shape)
+    ]
+    strides: list[Any] = []
+    if kind.is_packed:
+        stride: Any = 1
+        for size in reversed(shape):
+            strides.insert(0, stride)
+            stride = combined(emitter, operator.mul, size, stride)
+    else:
+        steps = _loaded_from("ptr", emitter, structure, _STRIDES)
+        for axis in range(len(shape)):
+            step = _loaded_from("i64", emitter, steps, 8 * axis)
+            text = f"sdiv exact i64 {step}, {np.dtype(dtype).itemsize}"
+            strides.append(emitter.number(WHOLE, text).code)
+    data = _loaded_from("ptr", emitter, structure, _DATA)
+    return Array(dtype, data, tuple(shape), tuple(strides))

@@ -1,0 +1,437 @@
+"""Expressions of a kernel: what is known is worked out as Python would, the rest are instructions."""
+
+import ast
+import builtins
+import operator
+from collections.abc import Hashable, Iterator
+from itertools import count
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from replay.engine.compiling.kernels.functions import FUNCTIONS
+from replay.engine.compiling.kernels.known import (
+    OPERATORS,
+    as_python,
+    from_python,
+    is_in,
+    is_known,
+    is_not_in,
+)
+from replay.engine.compiling.kernels.numbers import (
+    REAL,
+    TRUTH,
+    WHOLE,
+    Emitter,
+    Number,
+    binary,
+    common_kind,
+    compare,
+    constant,
+    inverse,
+    is_static,
+    negative,
+)
+from replay.engine.compiling.kernels.program import Program, definition_of
+from replay.engine.compiling.kernels.values import Array, Record, entries, load, made, part_of, store
+
+# Functions that make arrays, and whether these are zero.
+_MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
+
+
+class Expressions:
+    """One function while its expressions are lowered."""
+
+    def __init__(self, program: Program, function: FunctionType) -> None:
+        self.program = program
+        self.emitter = Emitter(self.fault if program.is_checked else None)
+        self.function = function
+        self.line = 0
+        self.known: dict[str, Any] = {}
+        self._outside = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
+        self._globals = function.__globals__
+        self._labels = count()
+
+    def place_in_source(self) -> str:
+        """The file and the line at work."""
+        _, file, above = definition_of(self.function)
+        return f"{file}, line {above + self.line}"
+
+    def fault(self) -> int:
+        """The number that stands for an index of the line at work that is beyond its array."""
+        self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
+        return len(self.program.faults)
+
+    def label(self, stem: str) -> str:
+        """A name for a block."""
+        return f"{stem}{next(self._labels)}"
+
+    def lookup(self, name: str) -> Any:
+        """What a name stands for."""
+        if name in self.known:
+            return self.known[name]
+        if name in self._outside:
+            return from_python(self._outside[name].cell_contents)
+        if name in self._globals:
+            return from_python(self._globals[name])
+        if hasattr(builtins, name):
+            return getattr(builtins, name)
+        raise NameError(f"{name} is not defined here")
+
+    def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
+        """`yes if condition else no`."""
+        raise NotImplementedError
+
+    # --- expressions ---
+
+    def value(self, node: ast.expr) -> Any:
+        """What an expression gives."""
+        self.line = getattr(node, "lineno", self.line)
+        return getattr(self, f"of_{type(node).__name__}", self.unknown)(node)
+
+    def unknown(self, node: ast.expr) -> Any:
+        """Say that there are no such expressions in kernels."""
+        raise TypeError(f"a kernel has no {type(node).__name__}: {ast.unparse(node)}")
+
+    def of_Constant(self, node: ast.Constant) -> Any:  # noqa: N802
+        """A number or a text."""
+        return node.value
+
+    def of_Name(self, node: ast.Name) -> Any:  # noqa: N802
+        """A variable, a parameter, or something from outside."""
+        return self.lookup(node.id)
+
+    def of_Tuple(self, node: ast.Tuple) -> Any:  # noqa: N802
+        """A tuple."""
+        return tuple(self.listed(node.elts))
+
+    def listed(self, nodes: list[ast.expr]) -> Iterator[Any]:
+        """Entries or arguments, with `*others` among them."""
+        for node in nodes:
+            if isinstance(node, ast.Starred):
+                yield from self.iterated(node.value)
+            else:
+                yield self.value(node)
+
+    def of_GeneratorExp(self, node: ast.GeneratorExp) -> Any:  # noqa: N802
+        """Values for every one of what is known, as a tuple."""
+        before = dict(self.known)
+        found = tuple(self._generated(node, list(node.generators)))
+        self.known = before
+        return found
+
+    def _generated(self, node: Any, generators: list[ast.comprehension]) -> Iterator[Any]:
+        if not generators:
+            yield self.value(node.elt)
+            return
+        first, *others = generators
+        for each in self.iterated(first.iter):
+            self._bind(first.target, each)
+            if all(self.truth(self.value(test)) for test in first.ifs):
+                yield from self._generated(node, others)
+
+    def _bind(self, target: ast.expr, value: Any) -> None:
+        if isinstance(target, ast.Name):
+            self.known[target.id] = value
+        elif isinstance(target, ast.Tuple):
+            for each, part in zip(target.elts, entries(value) or (), strict=True):
+                self._bind(each, part)
+
+    def iterated(self, node: ast.expr) -> list[Any]:
+        """The values that a loop goes over, where they are known."""
+        found = self.value(node)
+        parts = entries(found)
+        if parts is not None:
+            return list(parts)
+        if isinstance(found, range | zip | enumerate | reversed | str):
+            return [from_python(each) for each in found]
+        raise TypeError("a loop goes over a range, or over a tuple")
+
+    def of_BinOp(self, node: ast.BinOp) -> Any:  # noqa: N802
+        """`a + b` and the like."""
+        return self.operation(node.op, self.value(node.left), self.value(node.right))
+
+    def operation(self, node: ast.operator, left: Any, right: Any) -> Any:
+        """The result of an operator."""
+        operation = OPERATORS[type(node)]
+        if is_known(left) and is_known(right):
+            both = as_python(left), as_python(right)
+            if operation is operator.truediv and both[1] == 0:
+                with np.errstate(all="ignore"):
+                    return float(np.float64(both[0]) / np.float64(both[1]))
+            return from_python(operation(*both))
+        parts, others = entries(left), entries(right)
+        if operation is operator.add and parts is not None and others is not None:
+            return parts + others
+        return binary(self.emitter, operation, self.scalar(left), self.scalar(right))
+
+    def scalar(self, value: Any) -> Any:
+        """A number; raises TypeError where it is none."""
+        if isinstance(value, Number) or is_static(value):
+            return value
+        if isinstance(value, Array) and not value.shape:
+            return load(self.emitter, value)
+        raise TypeError(f"a number is needed, not a {type(value).__name__}")
+
+    def of_UnaryOp(self, node: ast.UnaryOp) -> Any:  # noqa: N802
+        """`-a`, `not a`."""
+        value = self.value(node.operand)
+        if isinstance(node.op, ast.Not):
+            found = self.truth(value)
+            return inverse(self.emitter, found) if isinstance(found, Number) else not found
+        if isinstance(node.op, ast.USub):
+            return -value if is_static(value) else negative(self.emitter, self.scalar(value))
+        return value
+
+    def truth(self, value: Any) -> Any:
+        """Whether something holds: known, or a number at run time."""
+        if isinstance(value, Number):
+            return self.emitter.truth(value)
+        if isinstance(value, Array):
+            raise TypeError("an array is neither true nor false")
+        return bool(value)
+
+    def of_BoolOp(self, node: ast.BoolOp) -> Any:  # noqa: N802
+        """`a and b`: the second is looked at only where the first leaves it open."""
+        is_and = isinstance(node.op, ast.And)
+        first = self.truth(self.value(node.values[0]))
+        rest = node.values[1] if len(node.values) == 2 else ast.BoolOp(node.op, node.values[1:])
+        if not isinstance(first, Number):
+            return self.truth(self.value(rest)) if first == is_and else first
+        known = ast.Constant(not is_and)
+        return self.chosen(first, rest, known) if is_and else self.chosen(first, known, rest)
+
+    def of_Compare(self, node: ast.Compare) -> Any:  # noqa: N802
+        """`a < b`, `a < b < c`."""
+        left, found = self.value(node.left), None
+        for operation, right_node in zip(node.ops, node.comparators, strict=True):
+            right = self.value(right_node)
+            each = self.compared(OPERATORS[type(operation)], left, right)
+            if found is None or found is True:
+                found = each
+            elif each is not True:
+                found = binary(
+                    self.emitter, operator.and_, self.emitter.truth(found), self.emitter.truth(each)
+                )
+            left = right
+        return found
+
+    def compared(self, operation: Any, left: Any, right: Any) -> Any:
+        """The result of one comparison."""
+        if is_known(left) and is_known(right):
+            return bool(operation(as_python(left), as_python(right)))
+        if operation in (operator.is_, operator.is_not):
+            return operation is operator.is_not
+        parts, others = entries(left), entries(right)
+        if operation in (is_in, is_not_in):
+            alike = constant(False)
+            for each in others or ():
+                same = self.emitter.truth(self.compared(operator.eq, left, each))
+                alike = binary(self.emitter, operator.or_, alike, same)
+            return alike if operation is is_in else inverse(self.emitter, alike)
+        if parts is None or others is None:
+            return compare(self.emitter, operation, self.scalar(left), self.scalar(right))
+        if operation not in (operator.eq, operator.ne) or len(parts) != len(others):
+            raise TypeError("tuples are compared by == and !=, and of one length")
+        found: Any = operation is operator.eq
+        joined = operator.and_ if operation is operator.eq else operator.or_
+        for part, other in zip(parts, others, strict=True):
+            each = self.compared(operation, part, other)
+            found = binary(
+                self.emitter,
+                joined,
+                self.emitter.as_kind(found, TRUTH),
+                self.emitter.as_kind(each, TRUTH),
+            )
+        return found
+
+    def of_IfExp(self, node: ast.IfExp) -> Any:  # noqa: N802
+        """`a if condition else b`."""
+        condition = self.truth(self.value(node.test))
+        if isinstance(condition, Number):
+            return self.chosen(condition, node.body, node.orelse)
+        return self.value(node.body if condition else node.orelse)
+
+    def of_Attribute(self, node: ast.Attribute) -> Any:  # noqa: N802
+        """A field of a NamedTuple, the shape of an array, something of a module."""
+        return self.attribute(self.value(node.value), node.attr)
+
+    def attribute(self, owner: Any, name: str) -> Any:
+        """What something has under a name."""
+        if isinstance(owner, Record) and name in owner.type._fields:
+            return owner.get(name)
+        if isinstance(owner, Array):
+            if name == "T":
+                return owner.turned
+            if name == "shape":
+                return tuple(map(_whole, owner.shape))
+            if name == "size" and len(owner.shape) == 1:
+                return _whole(owner.shape[0])
+        elif not isinstance(owner, Number | Record):
+            return from_python(getattr(owner, name))
+        raise TypeError(f"a {type(owner).__name__} has no {name} in a kernel")
+
+    def of_Subscript(self, node: ast.Subscript) -> Any:  # noqa: N802
+        """A number of an array, a part of it, or an entry of a tuple."""
+        owner = self.value(node.value)
+        parts = entries(owner)
+        if parts is None:
+            found = self.element(node, owner)
+            return found if found.shape else load(self.emitter, found)
+        if isinstance(node.slice, ast.Slice):
+            bounds = (
+                None if each is None else self.value(each)
+                for each in (node.slice.lower, node.slice.upper)
+            )
+            return parts[slice(*bounds)]
+        index = self.value(node.slice)
+        return parts[int(index)] if is_static(index) else self.entry(parts, index)
+
+    def entry(self, parts: tuple[Any, ...], index: Number) -> Number:
+        """An entry of a tuple of numbers, by an index that is not known."""
+        if not all(isinstance(each, Number) or is_static(each) for each in parts):
+            raise TypeError("an entry of this tuple is found by an index that is known")
+        if all(map(is_static, parts)):
+            kept = self.program.table(np.array(parts))
+        else:
+            real = common_kind(*parts) == REAL
+            memory = self.emitter.memory(REAL if real else WHOLE, len(parts))
+            kept = Array("<f8" if real else "<i8", memory, (len(parts),), (1,))
+            for place, each in enumerate(parts):
+                store(self.emitter, part_of(self.emitter, kept, (place,)), each)
+        return load(self.emitter, part_of(self.emitter, kept, (index,)))
+
+    def element(self, node: ast.Subscript, owner: Any = None) -> Array:
+        """The place in an array, or the part of one, that a subscript stands for."""
+        owner = self.value(node.value) if owner is None else owner
+        if isinstance(owner, np.ndarray):
+            owner = self.constant_array(owner)
+        if not isinstance(owner, Array):
+            raise TypeError(f"{ast.unparse(node.value)} is no array")
+        index = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if len(index) > len(owner.shape):
+            raise TypeError(f"{ast.unparse(node)}: {len(index)} indices for {len(owner.shape)} axes")
+        return part_of(self.emitter, owner, tuple(self._index(each) for each in index))
+
+    def constant_array(self, array: np.ndarray) -> Array:
+        """An array from outside, which a kernel reads: one that nobody can write to."""
+        if array.flags.writeable:
+            raise TypeError("an array that could change is part of a kernel; pass it as an argument")
+        return self.program.table(array)
+
+    def _index(self, node: ast.expr) -> Any:
+        if not isinstance(node, ast.Slice):
+            return self.scalar(self.value(node))
+        if node.step is not None:
+            raise TypeError("slices have no steps here")
+        return slice(
+            *(
+                None if each is None else self.scalar(self.value(each))
+                for each in (node.lower, node.upper)
+            )
+        )
+
+    # --- calls ---
+
+    def of_Call(self, node: ast.Call) -> Any:  # noqa: N802
+        """A function, a NamedTuple, or something that writes its own instructions."""
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "_replace":
+            owner = self.value(node.func.value)
+            new = {each.arg: self.value(each.value) for each in node.keywords}
+            names = owner.type._fields
+            return Record(owner.type, tuple(new.get(name, owner.get(name)) for name in names))
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "copy":
+            return self.copied(self.value(node.func.value))
+        function = self.value(node.func)
+        arguments = list(self.listed(node.args))
+        named = {each.arg: self.value(each.value) for each in node.keywords if each.arg}
+        return self.called(function, arguments, named)
+
+    def called(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
+        """What a call gives."""
+        write = getattr(function, "lowered", None)
+        if write is not None:  # it knows how, see replay.tracing
+            return write(self.program, self.emitter, arguments)
+        if isinstance(function, Hashable) and function in _MAKERS:
+            return self.new_array(*arguments, is_zero=_MAKERS[function], **named)
+        is_number = isinstance(function, Hashable) and function in FUNCTIONS
+        if not is_number:  # what is compiled for Python as well is compiled with the rest here
+            function = getattr(function, "__wrapped__", function)
+        if function is getattr:
+            return self.attribute(*arguments)
+        if function is len:
+            return self._length(arguments[0])
+        if function in (tuple, list) and arguments:
+            return entries(arguments[0]) or tuple(from_python(each) for each in arguments[0])
+        if function in (zip, enumerate, reversed) and not all(map(is_known, arguments)):
+            return tuple(function(*(entries(each) for each in arguments)))
+        if isinstance(function, type) and hasattr(function, "_fields"):
+            names = function._fields[len(arguments) :]
+            return Record(function, (*arguments, *(named[name] for name in names)))
+        if all(map(is_known, (*arguments, *named.values()))):
+            try:
+                return self._worked_out(function, arguments, named)
+            except ArithmeticError:  # which no kernel raises: a division by zero gives infinity
+                pass
+        if is_number:
+            return FUNCTIONS[function](self.emitter, *map(self.scalar, arguments))
+        if isinstance(function, FunctionType) and not function.__module__.startswith("numpy"):
+            return self.program.call(self.emitter, function, _given(function, arguments, named))
+        name = getattr(function, "__name__", function)
+        raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
+
+    def new_array(self, like: Any, dtype: Any = float, *, is_zero: bool) -> Array:
+        """`np.empty`, `np.zeros` and the like, of known sizes: there until the function returns."""
+        shape = like.shape if isinstance(like, Array) else like if isinstance(like, tuple) else (like,)
+        if not all(is_static(size) for size in shape):
+            raise TypeError("an array that is made here has sizes that are known; pass it as scratch")
+        kept = like.dtype if isinstance(like, Array) else np.dtype(dtype).str
+        array = made(self.emitter, tuple(map(int, shape)), kept)
+        if is_zero:
+            self.fill(array, 0)
+        return array
+
+    def copied(self, array: Array) -> Array:
+        """`array.copy()`, of known sizes: there until the function returns."""
+        copy = self.new_array(array, is_zero=False)
+        self.fill(copy, array)
+        return copy
+
+    def fill(self, place: Array, value: Any) -> None:
+        """Write a number to every place of an array."""
+        raise NotImplementedError
+
+    def _worked_out(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
+        """The result of a function whose arguments are all known: Python has it."""
+        known = [as_python(each) for each in arguments]
+        with np.errstate(all="ignore"):
+            return from_python(
+                function(*known, **{name: as_python(each) for name, each in named.items()})
+            )
+
+    def _length(self, value: Any) -> Any:
+        parts = entries(value)
+        if isinstance(value, Array):
+            return _whole(value.shape[0])
+        return len(value if parts is None else parts)
+
+
+def _whole(size: int | str) -> Any:
+    return Number(WHOLE, size, natural=True) if isinstance(size, str) else size
+
+
+def _given(function: FunctionType, arguments: list[Any], named: dict[str, Any]) -> list[Any]:
+    """All arguments in their places, with defaults."""
+    code = function.__code__
+    names = code.co_varnames[: code.co_argcount]
+    defaults = dict(zip(names[::-1], (function.__defaults__ or ())[::-1], strict=False))
+    given = dict(zip(names, arguments, strict=False))
+    given |= named
+    missing = [name for name in names if name not in given and name not in defaults]
+    if missing or len(given) < len(named):
+        raise TypeError(f"{function.__name__} lacks {', '.join(missing)}")
+    return [
+        *(given.get(name, from_python(defaults.get(name))) for name in names),
+        *arguments[len(names) :],
+    ]

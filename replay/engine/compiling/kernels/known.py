@@ -1,0 +1,73 @@
+"""What is known while a kernel is lowered, as Python has it."""
+
+import ast
+import operator
+from typing import Any
+
+import numpy as np
+
+from replay.engine.compiling.kernels.numbers import Number
+from replay.engine.compiling.kernels.values import Array, Record, entries
+
+
+def is_in(x: Any, many: Any) -> bool:
+    """`x in many`."""
+    return x in many
+
+
+def is_not_in(x: Any, many: Any) -> bool:
+    """`x not in many`."""
+    return x not in many
+
+
+# Python's operators by their names in a source.
+OPERATORS: dict[type[ast.AST], Any] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.Pow: operator.pow,
+    ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
+    ast.LShift: operator.lshift,
+    ast.RShift: operator.rshift,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Is: operator.is_,
+    ast.IsNot: operator.is_not,
+    ast.In: is_in,
+    ast.NotIn: is_not_in,
+}
+
+
+def is_known(value: Any) -> bool:
+    """Whether nothing of a value exists at run time only."""
+    if isinstance(value, Number | Array):
+        return False
+    parts = entries(value)
+    return parts is None or all(map(is_known, parts))
+
+
+def as_python(value: Any) -> Any:
+    """What is known, as Python has it."""
+    if isinstance(value, Record):
+        return value.type(*map(as_python, value.values))
+    return tuple(map(as_python, value)) if isinstance(value, tuple) else value
+
+
+def from_python(value: Any) -> Any:
+    """What Python has, as it is known while lowering."""
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return Record(type(value), tuple(map(from_python, value)))
+    if isinstance(value, tuple | list):
+        return tuple(map(from_python, value))
+    if isinstance(value, np.generic):
+        return value if isinstance(value, np.unsignedinteger) else value.item()
+    return value

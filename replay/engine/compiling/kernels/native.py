@@ -1,0 +1,307 @@
+"""Kernels as machine code: made by LLVM, kept on disk, loaded, and called with arrays as they are.
+
+A kernel is compiled for the kinds and sizes of its arguments: of arrays that a core works in all sizes
+are known, of all others those behind the first axis, up to 64 (see `_described`). Its key is all that it
+is made of (`identity`), this room itself, LLVM, and the processor.
+"""
+
+import ctypes
+import gc
+import os
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from hashlib import sha256
+from itertools import count
+from pathlib import Path
+from struct import Struct
+from threading import Lock
+from types import FunctionType
+from typing import Any, cast
+
+import llvmlite
+import llvmlite.binding as llvm
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.compiling.cache import (
+    cache_folder,
+    in_turn,
+    is_private,
+    read_checked,
+    say_once,
+    write_checked,
+)
+from replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
+from replay.engine.compiling.kernels.identity import digest_of, identity
+from replay.engine.compiling.kernels.lowering import lower
+from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
+from replay.engine.compiling.kernels.program import Program
+from replay.engine.compiling.kernels.telling import compiling
+
+_ALL = 64  # axes that an array may have
+_MADE_BY = "a kernel that fuselog compiled"
+
+
+class Kernel:
+    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
+
+    `title` says what it is, to who waits for it.
+    """
+
+    def __init__(self, run_once: FunctionType, title: str = "") -> None:
+        self._function = run_once
+        self._title = title or f"{run_once.__module__}.{run_once.__name__}"
+        self._entries: dict[Any, tuple[Struct, Callable[..., Any]]] = {}
+        self._loaded: dict[Any, Callable[..., Any]] = {}
+        self._lock = Lock()
+
+    def of(
+        self, arguments: Sequence[Any], scratch: Sequence[Any] = (), varies: int = 1
+    ) -> Callable[[int, int], None]:
+        """The loop over the runs from `first` up to `end` for these arguments, which it holds.
+
+        So many first axes of arrays vary, none of those in `scratch`; see `describe`.
+        """
+        kinds: list[Any] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
+        numbers: list[Any] = []
+        for each in arguments:
+            describe(each, varies, kinds, numbers)
+        for each in scratch:
+            describe(each, 0, kinds, numbers)
+        key = tuple(kinds)
+        known = self._entries.get(key)
+        if known is None:
+            with self._lock:
+                known = self._entries.get(key) or self._entries.setdefault(
+                    key, self._entry((*arguments, *scratch), iter(key))
+                )
+        layout, entry = known
+        given = layout.pack(*numbers)
+
+        def loop(first: int, end: int, kept: Any = (arguments, scratch)) -> None:  # noqa: ARG001
+            entry(first, end, given)
+
+        return loop
+
+    def _entry(
+        self, arguments: Sequence[Any], kinds: Iterator[Any]
+    ) -> tuple[Struct, Callable[..., Any]]:
+        is_checked = next(kinds)
+        described = tuple(with_types(each, kinds) for each in arguments)
+        key = is_checked, described
+        if key not in self._loaded:
+            make = _checked_entry if is_checked else _entry
+            self._loaded[key] = make(self._function, described, self._title)
+        return Struct(f"={''.join(map(letters, described))}"), self._loaded[key]
+
+
+def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that makes no arrays, for Python; no size of the arrays that it is given is known.
+
+    It returns nothing, or a number of the kind that its annotation says.
+    """
+    said = function.__annotations__.get("return", "")
+    returned = said if isinstance(said, str) else getattr(said, "__name__", str(said))
+    if returned not in ("float", "int", "bool", "None"):
+        raise BadInput(
+            f"{function.__qualname__} does not say what it returns; annotate it with '-> float', "
+            "'-> int', '-> bool' or '-> None'"
+        )
+
+    def call(run: int, arguments: tuple[Any, ...]) -> None:  # noqa: ARG001
+        function(*arguments)
+
+    def evaluate(run: int, arguments: tuple[Any, ...], found: np.ndarray) -> None:
+        found[run] = function(*arguments)
+
+    once = call if returned == "None" else evaluate
+    once.__module__, once.__name__ = function.__module__, function.__name__
+    kernel = Kernel(cast(FunctionType, once))
+
+    def called(*arguments: Any) -> Any:
+        if returned == "None":
+            return kernel.of((arguments,), varies=_ALL)(0, 1)
+        found = np.empty(1, returned)
+        kernel.of((arguments, found), varies=_ALL)(0, 1)
+        return found[0].item()
+
+    return called
+
+
+# --- making -----------------------------------------------------------------------------------------
+
+
+def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool = False) -> Program:
+    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
+
+    It returns 0, or where indices are checked the number of the first fault.
+    """
+    program, emitter, words = Program(lower, is_checked=is_checked), Emitter(), count()
+    arguments = [value_of(kind, emitter, words) for kind in kinds]
+    body = Emitter()
+    body.fresh = emitter.fresh  # type: ignore[method-assign]
+    program.call(body, function, [Number(WHOLE, "%run"), *arguments])
+    stop = ["stop:", "  %why = load i64, ptr %fault", "  ret i64 %why"] if body.can_fail else []
+    lines = [
+        "define i64 @kernel(i64 %first, i64 %end, ptr %words) {",
+        "entry:",
+        *body.allocated,
+        *emitter.lines,
+        "  br label %loop",
+        "loop:",
+        "  %run = phi i64 [ %first, %entry ], [ %next, %following ]",
+        "  %more = icmp slt i64 %run, %end",
+        "  br i1 %more, label %body, label %done",
+        "body:",
+        *body.lines,
+        "  br label %following",
+        "following:",
+        "  %next = add nsw i64 %run, 1",
+        "  br label %loop",
+        "done:",
+        "  ret i64 0",
+        *stop,
+        "}",
+    ]
+    program.functions.append("\n".join(lines))
+    return program
+
+
+def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., None]:
+    """The kernel's entry, which raises IndexError where an index is beyond its array; it is not kept."""
+    with compiling(title):
+        program = program_of(function, kinds, is_checked=True)
+        kernel = _loaded(object_code(program.text()))
+
+    def checked(*arguments: Any) -> None:
+        fault = kernel(*arguments)
+        if fault:
+            raise IndexError(f"an index is beyond its array in {program.faults[fault - 1]}")
+
+    return checked
+
+
+def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
+    """The kernel's entry: kept, or made."""
+    known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
+    key = sha256(known.encode()).hexdigest()[:32]
+    path = None
+    with suppress(RuntimeError):  # a user without a home
+        path = cache_folder() / "kernels" / f"{function.__name__}-{key}.bin"
+    if path is not None and not is_private(path.parent):
+        path = None
+    code = None if path is None else _kept(path, key)
+    if code is None:
+        if path is None:
+            with compiling(title):
+                code = _made(function, kinds)
+        else:
+            with compiling(title), in_turn(path) as waited:
+                code = (_kept(path, key) if waited else None) or _made(function, kinds)
+                _keep(path, key.encode() + code)
+    return _loaded(code)
+
+
+def _kept(path: Path, key: str) -> bytes | None:
+    """The object code that a file holds; None where it is damaged, or another kernel's."""
+    found = read_checked(path)
+    own = key.encode()
+    return found.removeprefix(own) if found is not None and found.startswith(own) else None
+
+
+def _keep(path: Path, code: bytes) -> None:
+    try:
+        write_checked(path, code, _MADE_BY)
+    except BadInput as error:
+        why = str(error).removeprefix(f"{path}: ")
+        say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
+
+
+def _named(kinds: Any) -> Any:
+    """Kinds of arguments in words that are the same in every process."""
+    if isinstance(kinds, type):
+        return f"{kinds.__module__}.{kinds.__qualname__}", getattr(kinds, "_fields", ())
+    return tuple(map(_named, kinds)) if isinstance(kinds, tuple) else kinds
+
+
+@cache
+def _surroundings() -> str:
+    """What beside a kernel's own sources its code depends on."""
+    machine = _machine()
+    return "\n".join(
+        [
+            digest_of("replay.engine.compiling.kernels"),
+            platform.python_version(),
+            f"llvmlite {llvmlite.__version__}",
+            str(llvm.get_process_triple()),
+            *machine,
+        ]
+    )
+
+
+def _machine() -> tuple[str, str]:
+    """The processor and its features: this one's, or those that are asked for as numba's are."""
+    name = os.environ.get("NUMBA_CPU_NAME")
+    features = os.environ.get("NUMBA_CPU_FEATURES")
+    if features is None:
+        features = "" if name else llvm.get_host_cpu_features().flatten()
+    return name or llvm.get_host_cpu_name(), features
+
+
+def _new_target() -> Any:
+    """LLVM's description of the machine."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    name, features = _machine()
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    return target.create_target_machine(
+        cpu=name, features=features, opt=3, reloc="pic", codemodel="jitdefault"
+    )
+
+
+def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
+    """The kernel's object code."""
+    with _without_garbage():
+        return object_code(program_of(function, kinds).text())
+
+
+def object_code(text: str) -> bytes:
+    """Machine code of LLVM's text.
+
+    Without the SLP vectoriser, which costs as much as all else and gains these kernels nothing.
+    """
+    target = _new_target()
+    module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = target.triple, str(target.target_data)
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization, options.loop_vectorization = False, True
+    passes = llvm.create_pass_builder(target, options)
+    passes.getModulePassManager().run(module, passes)
+    return bytes(target.emit_object(module))
+
+
+_ENGINES: list[Any] = []  # what is loaded stays
+
+
+def _loaded(code: bytes) -> Callable[..., int]:
+    """The entry of a kernel's object code; the engine owns its target."""
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _ENGINES.append(engine)
+    entry = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p)
+    return entry(engine.get_function_address("kernel"))
+
+
+@contextmanager
+def _without_garbage() -> Iterator[None]:
+    """A compiler makes very many objects and little garbage: nobody looks for it meanwhile."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()

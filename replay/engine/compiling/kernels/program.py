@@ -1,0 +1,181 @@
+"""One kernel as LLVM's text: the functions that it is made of, each lowered once for its arguments."""
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import count
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
+from replay.engine.compiling.kernels.values import (
+    Array,
+    is_local,
+    leaves,
+    placed,
+    rebuilt,
+    signature,
+    table,
+)
+
+FEW = 30  # lines of a function that is always written where it is called
+
+
+class DoesNotCompile(BadInput):
+    """What a kernel cannot be made of, and in which line."""
+
+
+class Instance(NamedTuple):
+    """A function lowered for some arguments: its name, the type of what it returns, and that value.
+
+    One that `can_fail` returns the number of its fault too, 0 for none.
+    """
+
+    name: str
+    type: str
+    returned: Any
+    can_fail: bool
+
+
+class Program:
+    """The text of a kernel while it grows.
+
+    Where indices are checked, `faults` are the lines at which one can be beyond its array.
+    """
+
+    def __init__(
+        self,
+        lower: Callable[["Program", FunctionType, list[Any]], tuple[Emitter, Any]],
+        *,
+        is_checked: bool = False,
+    ) -> None:
+        self._lower = lower
+        self.is_checked = is_checked
+        self.faults: list[str] = []
+        self.functions: list[str] = []
+        self.declared: set[str] = set()
+        self.tables: dict[Any, tuple[str, Array]] = {}
+        self.instances: dict[Any, Instance] = {}
+        self._names = count()
+        self._open: list[int] = []
+        self._kept: list[Any] = []  # whose ids are keys
+
+    def text(self) -> str:
+        """The whole module."""
+        tables = [text for text, _ in self.tables.values()]
+        attributes = "attributes #0 = { nounwind willreturn memory(none) }"
+        return "\n".join([*tables, *self.functions, *sorted(self.declared), attributes, ""])
+
+    def name(self, stem: str) -> str:
+        """A name that no other function or table has."""
+        return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
+
+    def table(self, numbers: np.ndarray) -> Array:
+        """A constant array."""
+        key = numbers.dtype.str, numbers.shape, numbers.tobytes()
+        if key not in self.tables:
+            self.tables[key] = table(self.name("table"), numbers)
+        return self.tables[key][1]
+
+    def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Any]) -> Any:
+        """What a function returns for these arguments; it is lowered where that was not done yet."""
+        key = (id(function), *map(signature, arguments))
+        if key not in self.instances:
+            if id(function) in self._open:
+                raise DoesNotCompile(f"{function.__qualname__} calls itself, which a kernel cannot")
+            self._open.append(id(function))
+            self._kept.append((function, arguments))
+            parameters = [self._parameter(index, each) for index, each in enumerate(arguments)]
+            own, returned = self._lower(self, function, [value for value, _ in parameters])
+            self._open.pop()
+            types = [types for _, types in parameters]
+            self.instances[key] = self.define(function.__name__, own, types, returned)
+        result = called(emitter, self.instances[key], arguments)
+        return placed(result, is_local=True) if any(map(is_local, arguments)) else result
+
+    def define(
+        self, stem: str, body: Emitter, parameters: Sequence[Sequence[tuple[str, str]]], returned: Any
+    ) -> Instance:
+        """Add a function whose body ends before what it returns is given back."""
+        found = list(leaves(returned))
+        results = [*found, ("i64", "0")] if body.can_fail else found
+        kind = "{ " + ", ".join(each for each, _ in results) + " }" if results else "void"
+        name = self.name(stem)
+        given = ", ".join(f"{kind} {code}" for each in parameters for kind, code in each)
+        inlined = " alwaysinline" if len(body.lines) < FEW else ""
+        lines = [
+            f"define internal fastcc {kind} {name}({given}) nounwind{inlined} {{",
+            "entry:",
+            *body.allocated,
+            *body.lines,
+        ]
+        last = "undef"
+        for place, (each, code) in enumerate(results):
+            lines.append(f"  %out{place} = insertvalue {kind} {last}, {each} {code}, {place}")
+            last = f"%out{place}"
+        lines.append(f"  ret {kind} {last}" if results else "  ret void")
+        if body.can_fail:
+            lines += [
+                "stop:",
+                "  %why = load i64, ptr %fault",
+                f"  %stopped = insertvalue {kind} undef, i64 %why, {len(found)}",
+                f"  ret {kind} %stopped",
+            ]
+        self.functions.append("\n".join([*lines, "}"]))
+        self.declared |= body.declared
+        return Instance(name, kind, returned, body.can_fail)
+
+    def _parameter(self, index: int, value: Any) -> tuple[Any, list[tuple[str, str]]]:
+        """An argument as the function that it is given to knows it, and its leaves there."""
+        found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
+        known = placed(_unsure(value), is_local=False)
+        return rebuilt(known, iter([code for _, code in found])), found
+
+
+def _unsure(value: Any) -> Any:
+    """An integer that may be negative in another call of the function."""
+    return value._replace(natural=False) if isinstance(value, Number) else value
+
+
+def called(emitter: Emitter, instance: Instance, arguments: Sequence[Any]) -> Any:
+    """Call a function that has been lowered."""
+    given = ", ".join(f"{kind} {code}" for each in arguments for kind, code in leaves(each))
+    if instance.type == "void":
+        emitter.add(f"call fastcc void {instance.name}({given})")
+        return instance.returned
+    result = emitter.fresh()
+    emitter.add(f"{result} = call fastcc {instance.type} {instance.name}({given})")
+    names = []
+    for place, _ in enumerate(leaves(instance.returned)):
+        names.append(emitter.fresh())
+        emitter.add(f"{names[-1]} = extractvalue {instance.type} {result}, {place}")
+    if instance.can_fail:
+        fault = emitter.number(WHOLE, f"extractvalue {instance.type} {result}, {len(names)}")
+        emitter.stop_if(emitter.truth(fault), fault)
+    return rebuilt(instance.returned, iter(names))
+
+
+@cache
+def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
+    """A function's source, its file, and the line before its first one."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError) as error:
+        raise BadInput(
+            f"the source of {function.__qualname__} cannot be found ({error}); "
+            "define it as a function in a file"
+        ) from error
+    definition = tree.body[0]
+    if not isinstance(definition, ast.FunctionDef):
+        raise BadInput(
+            f"{function.__qualname__} is not a `def` function, of which kernels are made; write it as "
+            "one"
+        )
+    first = min([definition.lineno, *(each.lineno for each in definition.decorator_list)])
+    return definition, function.__code__.co_filename, function.__code__.co_firstlineno - first

@@ -1,0 +1,292 @@
+"""What a kernel's names stand for while it is lowered: numbers, arrays, tuples, and what is known.
+
+A value is a `Number`, an `Array`, a tuple of values, a `Record` (a NamedTuple of values), or anything of
+Python's that is known already: a number, a text, a function. Its leaves are what exists at run time:
+numbers and, of an array, where it is and the sizes that are not known before.
+"""
+
+import operator
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from replay.engine.compiling.kernels.numbers import (
+    REAL,
+    TRUTH,
+    WHOLE,
+    WORD,
+    Emitter,
+    Number,
+    Scalar,
+    binary,
+    compare,
+    constant,
+    is_static,
+)
+
+Size = int | str  # known, or the name of an integer
+Leaf = tuple[str, str]  # LLVM's type, and a name
+POINTER = "ptr"
+# how numbers of an array are stored, and the kind that they are read as
+STORED = {
+    "<f8": ("double", REAL),
+    "<i8": ("i64", WHOLE),
+    "<u8": ("i64", WORD),
+    "<u4": ("i32", WHOLE),
+    "<i4": ("i32", WHOLE),
+    "|b1": ("i8", TRUTH),
+    "|u1": ("i8", WHOLE),
+    "|i1": ("i8", WHOLE),
+}
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array: how its numbers are stored, where, and its sizes and strides, in numbers.
+
+    `is_local`: whether it is gone when the function that made it returns.
+    """
+
+    dtype: str
+    pointer: str
+    shape: tuple[Size, ...]
+    strides: tuple[Size, ...]
+    is_local: bool = False
+
+    @property
+    def turned(self) -> "Array":
+        """`array.T`."""
+        return Array(self.dtype, self.pointer, self.shape[::-1], self.strides[::-1], self.is_local)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A NamedTuple of values."""
+
+    type: type[Any]
+    values: tuple[Any, ...]
+
+    def get(self, name: str) -> Any:
+        """A field."""
+        return self.values[self.type._fields.index(name)]
+
+
+def entries(value: Any) -> tuple[Any, ...] | None:
+    """The values that a tuple or NamedTuple holds; None of anything else."""
+    if isinstance(value, Record):
+        return value.values
+    return value if isinstance(value, tuple) and not isinstance(value, Number) else None
+
+
+def leaves(value: Any) -> Iterator[Leaf]:
+    """What of a value exists at run time."""
+    if isinstance(value, Number):
+        yield value.type, value.code
+    elif isinstance(value, Array):
+        yield POINTER, value.pointer
+        for size in (*value.shape, *value.strides):
+            if isinstance(size, str):
+                yield WHOLE, size
+    else:
+        for entry in entries(value) or ():
+            yield from leaves(entry)
+
+
+def rebuilt(value: Any, names: Iterator[str]) -> Any:
+    """The same value with other names for its leaves."""
+    if isinstance(value, Number):
+        return Number(value.kind, next(names), value.natural)
+    if isinstance(value, Array):
+        pointer, axes = next(names), len(value.shape)
+        sizes = [next(names) if isinstance(size, str) else size for size in value.shape + value.strides]
+        return Array(value.dtype, pointer, tuple(sizes[:axes]), tuple(sizes[axes:]), value.is_local)
+    if isinstance(value, Record):
+        return Record(value.type, tuple(rebuilt(entry, names) for entry in value.values))
+    if isinstance(value, tuple):
+        return tuple(rebuilt(entry, names) for entry in value)
+    return value
+
+
+def signature(value: Any) -> Any:
+    """What a value is, but for the names of its leaves; what is known counts as it is."""
+    if isinstance(value, Number):
+        return value.kind
+    if isinstance(value, Array):
+        sizes = (None if isinstance(size, str) else size for size in (*value.shape, *value.strides))
+        return "array", value.dtype, len(value.shape), *sizes
+    if isinstance(value, Record):
+        return value.type, *map(signature, value.values)
+    if isinstance(value, tuple):
+        return "tuple", *map(signature, value)
+    if is_static(value) or isinstance(value, str | None):
+        return type(value), repr(value)
+    return "object", id(value)
+
+
+def at_run_time(value: Any) -> Any:
+    """The value with every number that is known as one at run time."""
+    if is_static(value):
+        return constant(value)
+    if isinstance(value, Record):
+        return Record(value.type, tuple(map(at_run_time, value.values)))
+    if isinstance(value, tuple) and not isinstance(value, Number):
+        return tuple(map(at_run_time, value))
+    return value
+
+
+# --- arrays -----------------------------------------------------------------------------------------
+
+
+def whole(size: Size | Scalar) -> Scalar:
+    """A size as a number."""
+    return Number(WHOLE, size, natural=True) if isinstance(size, str) else size
+
+
+def _size(number: Scalar) -> Size:
+    return number.code if isinstance(number, Number) else int(number)
+
+
+def combined(emitter: Emitter, operation: Any, left: Size, right: Size) -> Size:
+    """The sum, product or difference of two sizes."""
+    if isinstance(left, int) and isinstance(right, int):
+        return int(operation(left, right))
+    if operation is operator.mul and 1 in (left, right):
+        return right if left == 1 else left
+    if operation is not operator.mul and right == 0:
+        return left
+    return binary(emitter, operation, whole(left), whole(right)).code
+
+
+def place_in(emitter: Emitter, index: Scalar, size: Size) -> Size:
+    """Where an index points to, counted from the end where it is negative; checked if that is asked."""
+    place = _counted(emitter, index, size)
+    if emitter.fault is not None:
+        code, end = (emitter.as_kind(whole(each), WHOLE).code for each in (place, size))
+        is_beyond = emitter.number(TRUTH, f"icmp uge i64 {code}, {end}")
+        emitter.stop_if(is_beyond, constant(emitter.fault()))
+    return place
+
+
+def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
+    if not isinstance(index, Number):
+        return int(index) if index >= 0 else combined(emitter, operator.add, size, int(index))
+    number = emitter.as_kind(index, WHOLE) if index.kind == TRUTH else index
+    if number.natural or number.kind == WORD:
+        return number.code
+    is_below = compare(emitter, operator.lt, number, 0)
+    turned = emitter.as_kind(whole(combined(emitter, operator.add, number.code, size)), WHOLE)
+    return emitter.select(is_below, turned, number).code
+
+
+def part_of(emitter: Emitter, array: Array, index: tuple[Any, ...]) -> Array:
+    """A part of an array, by numbers and slices (pairs of bounds, None where open)."""
+    offset: Size = 0
+    shape: list[Size] = []
+    strides: list[Size] = []
+    for axis, each in enumerate(index):
+        size, stride = array.shape[axis], array.strides[axis]
+        if isinstance(each, slice):
+            start = 0 if each.start is None else _within(emitter, each.start, size)
+            stop = size if each.stop is None else _within(emitter, each.stop, size)
+            shape.append(combined(emitter, operator.sub, stop, start))
+            strides.append(stride)
+        else:
+            start = place_in(emitter, each, size)
+        offset = combined(emitter, operator.add, offset, combined(emitter, operator.mul, start, stride))
+    shape += array.shape[len(index) :]
+    strides += array.strides[len(index) :]
+    return Array(
+        array.dtype, _moved(emitter, array, offset), tuple(shape), tuple(strides), array.is_local
+    )
+
+
+def _within(emitter: Emitter, bound: Scalar, size: Size) -> Size:
+    """A bound of a slice: no further than the end."""
+    place = _counted(emitter, bound, size)
+    if isinstance(place, int) and isinstance(size, int):
+        return min(max(place, 0), size)
+    both = [emitter.as_kind(whole(each), WHOLE) for each in (place, size)]
+    return emitter.select(compare(emitter, operator.lt, *both), *both).code
+
+
+def _moved(emitter: Emitter, array: Array, offset: Size) -> str:
+    if offset == 0:
+        return array.pointer
+    stored = STORED[array.dtype][0]
+    name = emitter.fresh()
+    emitter.add(f"{name} = getelementptr inbounds {stored}, ptr {array.pointer}, i64 {offset}")
+    return name
+
+
+def load(emitter: Emitter, place: Array) -> Number:
+    """The number at a place: an array without axes."""
+    stored, kind = STORED[place.dtype]
+    found = emitter.number(kind, f"load {stored}, ptr {place.pointer}")
+    if stored == "i8" and kind == TRUTH:
+        return emitter.number(TRUTH, f"icmp ne i8 {found.code}, 0")
+    if stored in ("i8", "i32"):
+        natural = place.dtype[1] == "u"
+        return emitter.number(
+            WHOLE, f"{'z' if natural else 's'}ext {stored} {found.code} to i64"
+        )._replace(natural=natural)
+    return found
+
+
+def store(emitter: Emitter, place: Array, value: Scalar) -> None:
+    """Write a number to a place."""
+    stored, kind = STORED[place.dtype]
+    number = emitter.as_kind(value, kind)
+    if stored == "i8" and kind == TRUTH:
+        number = emitter.number(WHOLE, f"zext i1 {number.code} to i8")
+    elif stored in ("i8", "i32"):
+        number = emitter.number(WHOLE, f"trunc i64 {number.code} to {stored}")
+    emitter.add(f"store {stored} {number.code}, ptr {place.pointer}")
+
+
+# --- constants --------------------------------------------------------------------------------------
+
+
+def table(name: str, numbers: np.ndarray) -> tuple[str, Array]:
+    """LLVM's definition of an array that is known and never written to, and the array."""
+    dtype = numbers.dtype.str
+    stored, kind = STORED[dtype]
+    if stored == "i8" and kind == TRUTH:
+        numbers = numbers.astype(np.uint8)
+    flat = np.ascontiguousarray(numbers).ravel()
+    codes = ", ".join(f"{stored} {constant(each).code}" for each in flat)
+    text = f"{name} = private unnamed_addr constant [{flat.size} x {stored}] [{codes}]"
+    return text, Array(dtype, name, numbers.shape, packed(numbers.shape))
+
+
+def packed(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The strides of an array whose numbers lie close to each other."""
+    return tuple(prod(shape[axis + 1 :]) for axis in range(len(shape)))
+
+
+def made(emitter: Emitter, shape: tuple[int, ...], dtype: str) -> Array:
+    """Memory for an array of known sizes, until the function returns."""
+    memory = emitter.memory(STORED[dtype][0], max(1, prod(shape)))
+    return Array(dtype, memory, shape, packed(shape), is_local=True)
+
+
+def is_local(value: Any) -> bool:
+    """Whether there is an array in it that is gone when its function returns."""
+    if isinstance(value, Array):
+        return value.is_local
+    return any(map(is_local, entries(value) or ()))
+
+
+def placed(value: Any, *, is_local: bool) -> Any:
+    """The value with arrays that are, or are not, gone when the function at hand returns.
+
+    What a function is given stays when it returns, and may be part of what that is.
+    """
+    if isinstance(value, Array):
+        return replace(value, is_local=is_local)
+    if isinstance(value, Record):
+        return Record(value.type, tuple(placed(each, is_local=is_local) for each in value.values))
+    parts = entries(value)
+    return value if parts is None else tuple(placed(each, is_local=is_local) for each in parts)

@@ -1,0 +1,4 @@
+"""The replay itself: estimators, late messages, and what is watched meanwhile.
+
+Begin with `replaying`.
+"""

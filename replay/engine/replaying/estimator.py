@@ -1,0 +1,197 @@
+"""What an estimator is to a replay: its parameters, the topics it binds to, and what is asked of it.
+
+An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
+the blocks of its topics one after another and carries a state from block to block; a batch one gets
+whole streams and is done. The same call serves one run and many, so an ensemble's results are those of
+the runs replayed one by one, bit for bit.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, NamedTuple
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Topic
+from recorders.parameters import Parameters, ParametersType, build
+from recorders.registry import foreign_code, load
+from replay.engine.compiling.bundling import DoesNotCompile
+from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.sources import Source, ensemble_of
+from replay.engine.vectors.components import Components
+
+
+class Opened(NamedTuple):
+    """What is taken from the first messages of a log: whole topics to start from, and what is told."""
+
+    whole: dict[str, Ragged]
+    told: list[Ragged]
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How an estimator finds what a log does not state, such as where to begin.
+
+    Attributes:
+        topics: those whose first messages it is handed.
+        find: (first messages, the topics that `start` needs whole, clock) -> what there is to start
+            from; by the clock by which the replay stamps estimates.
+    """
+
+    topics: tuple[str, ...]
+    find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Opened]
+
+
+@dataclass(frozen=True)
+class Recursive:
+    """An estimator that goes through its topics in time.
+
+    Attributes:
+        name: what its output topics begin with, `/estimates/` + name.
+        streams: the topics that `run` is handed, in the order its `Events.topic` counts them.
+        whole: the topics that `start` needs whole, such as a map or a prior.
+        start: whole topics -> the state before the first block.
+        run: state and block -> the state after it, and the output streams. States are values: `run`
+            never changes the one it is handed.
+        priors: the whole topics that are Gaussian priors, and the components that are wanted of each.
+            `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
+            see `replay.engine.streams.priors`.
+        given: whole topics that are not read from the runs, see `pipeline.runs.initial_states`.
+        finish: the state after the last block -> the outputs that waited for messages which did not
+            come any more.
+        parameters: those that it was bound with, defaults included.
+        rewinding: the same estimator for a block's messages in the order in which they came, whose
+            stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
+            where its parameters do not let it.
+        opening: how it finds what a log does not state; None where that states all.
+        assumed: the parameters that are assumed, since the log does not state them.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    start: Callable[[dict[str, Ragged]], Any]
+    run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
+    finish: Callable[[Any], list[Ragged]] | None = None
+    parameters: Parameters | None = None
+    rewinding: "Callable[[int], Recursive] | None" = None
+    opening: Opening | None = None
+    assumed: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """An estimator that needs everything at once: `solve` turns its topics into output streams.
+
+    `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
+    """
+
+    name: str
+    streams: tuple[str, ...]
+    whole: tuple[str, ...]
+    solve: Callable[[dict[str, Ragged]], list[Ragged]]
+    priors: Mapping[str, Components] = field(default_factory=dict)
+    given: Mapping[str, Ragged] = field(default_factory=dict)
+    parameters: Parameters | None = None
+
+
+Bound = Recursive | Batch
+
+
+@dataclass(frozen=True)
+class Estimator(Generic[ParametersType]):
+    """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
+
+    `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
+    for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    """
+
+    summary: str
+    needs: str
+    parameters: type[ParametersType]
+    bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
+    variant: str | None = None
+
+    def __str__(self) -> str:
+        return self.summary
+
+
+def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
+    """The registered estimator of `name`, and the parameter that a `name:variant` sets.
+
+    Raises BadInput where there is none, or it has no variants.
+    """
+    kind, _, variant = name.partition(":")
+    estimator: Estimator[Any] = load("estimators", kind, Estimator)
+    return estimator, set_by_variant("estimator", kind, variant, estimator.variant)
+
+
+def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Any]:
+    """The parameter that the variant of a name sets; nothing where the name has none.
+
+    Raises BadInput where what is named, an estimator or a method of this kind, has no variants.
+    """
+    if not variant:
+        return {}
+    if parameter is None:
+        raise BadInput(f"{what} {kind} has no variants; give '{kind}' without ':{variant}'")
+    return {parameter: variant}
+
+
+def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
+    """The estimator of a label, and its parameters.
+
+    `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
+    estimator can be replayed with several settings at once. A `kind` may be an `Estimator` too, which
+    needs no name. The other settings are its parameters.
+
+    Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+    """
+    if not re.fullmatch(r"[\w:=-]+", label):
+        raise BadInput(
+            f"estimator '{label}': a label may have letters, digits and '-', '_', ':', '=' alone; "
+            "choose another"
+        )
+    values = dict(settings)
+    kind = values.pop("kind", label)
+    estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
+    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+
+
+@contextmanager
+def code_of(name: str) -> Iterator[None]:
+    """Around calls of an estimator's code: what it raises, and what does not compile, names it."""
+    try:
+        with foreign_code(f"estimator {name}"):
+            yield
+    except DoesNotCompile as error:
+        raise BadInput(f"estimator {name}: {error}") from error
+
+
+def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
+    """Bind an estimator to an ensemble; see `configure`.
+
+    Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
+    of them must be stated alike.
+    """
+    estimator, parameters = configure(label, settings)
+    first = sources[0]
+    try:
+        with code_of(label):
+            bound = estimator.bind(label, first.topics, parameters)
+    except BadInput as error:
+        raise BadInput(f"{first.name}: {error}") from error
+    if not bound:
+        raise BadInput(
+            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
+            f"the log has {', '.join(first.topics) or 'no topics'}"
+        )
+    read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
+    ensemble_of(sources).require_alike(read)
+    return [
+        each if each.parameters is not None else replace(each, parameters=parameters) for each in bound
+    ]

@@ -1,0 +1,280 @@
+"""Messages that come late: left out, waited for, or gone back for.
+
+In the order of arrival (log time) the stamps at which things were measured (publish time) go back
+wherever a message was late. `taking_late` makes of an estimator one that is handed its messages as they
+arrive and does one of three things about it:
+
+    drop            what is older than the newest message that was taken is left out
+    wait:SECONDS    a message is held back until so long after its stamp; then as drop
+    rewind:SECONDS  the estimator goes back, if not further than that; what is older still is left out
+
+What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
+was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput, choices
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Booleans, Integers
+from replay.engine.replaying.estimator import Bound, Recursive
+from replay.engine.streams.blocks import Block, Events, Ragged, join, last_of_equals
+from replay.engine.streams.failures import reason_stream
+
+POLICIES = ("drop", "wait", "rewind")
+OLDER = "older than what was used before"  # of every message that is left out for being late
+LONGEST_S = 1e9
+
+
+class Late(NamedTuple):
+    """What is done about messages that come late, and how long is waited or how far gone back."""
+
+    policy: str
+    window_ns: int
+
+    @property
+    def back_ns(self) -> int:
+        """How far the stamps go back that an estimator is handed."""
+        return self.window_ns if self.policy == "rewind" else 0
+
+
+def parse_late(text: str, *, arrival_order: bool) -> Late:
+    """What `drop`, `wait:SECONDS` or `rewind:SECONDS` says.
+
+    Raises BadInput where it says nothing, or messages are not taken in the order of their arrival.
+    """
+    policy, _, seconds = text.partition(":")
+    if policy not in POLICIES:
+        raise BadInput(
+            f"--late {text}: give drop, wait:SECONDS or rewind:SECONDS; {choices(policy, POLICIES)}"
+        )
+    if not arrival_order:
+        raise BadInput(
+            f"--late {text}: messages are late only in the order of their arrival; add --arrival-order "
+            "(in Python arrival_order=True)"
+        )
+    if policy == "drop":
+        if text != policy:
+            raise BadInput(f"--late {text}: drop takes no seconds; give --late drop")
+        return Late(policy, 0)
+    try:
+        window_s = float(seconds)
+    except ValueError:
+        window_s = np.nan
+    if not 0 <= window_s <= LONGEST_S:
+        raise BadInput(f"--late {text}: give seconds from zero on, as in {policy}:0.5")
+    return Late(policy, round(window_s * 1e9))
+
+
+def taking_late(bound: Bound, late: Late) -> Recursive:
+    """The estimator, handed its messages in the order of log time.
+
+    Raises BadInput where it is none that goes through its messages in time, or it cannot go back.
+    """
+    if not isinstance(bound, Recursive):
+        raise BadInput(
+            f"estimator {bound.name}: solves for all messages at once, so that none can be late; "
+            "leave out --late"
+        )
+    if late.policy == "rewind":
+        if bound.rewinding is None:
+            raise BadInput(
+                f"estimator {bound.name}: only an estimator made of a model and a method can go "
+                "back to a late message; give --late drop or --late wait:SECONDS"
+            )
+        bound = bound.rewinding(late.window_ns)
+    return replace(
+        bound,
+        start=partial(_start, bound),
+        run=partial(_run, bound, late),
+        finish=partial(_finish, bound, late),
+    )
+
+
+class _State(NamedTuple):
+    """What is carried from block to block.
+
+    Attributes:
+        inner: the estimator's own.
+        waiting: messages that are held back.
+        newest_ns, arrived_ns: (runs,) the newest stamps that were taken, and that have arrived; None
+            before the first block.
+    """
+
+    inner: Any
+    waiting: Mapping[str, Ragged]
+    newest_ns: Integers | None = None
+    arrived_ns: Integers | None = None
+
+
+def _start(bound: Recursive, whole: dict[str, Ragged]) -> _State:
+    return _State(bound.start(whole), {})
+
+
+def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_State, list[Ragged]]:
+    return _take(bound, late, state, block.streams, is_over=False)
+
+
+def _finish(bound: Recursive, late: Late, state: _State) -> list[Ragged]:
+    """What was held back to the end, and what the estimator itself still has to say."""
+    made: list[Ragged] = []
+    if state.waiting:
+        nothing = {
+            topic: Ragged(held.stream.take(slice(0, 0)), np.zeros_like(held.offsets))
+            for topic, held in state.waiting.items()
+        }
+        state, made = _take(bound, late, state, nothing, is_over=True)
+    return made + (bound.finish(state.inner) if bound.finish is not None else [])
+
+
+def _take(
+    bound: Recursive, late: Late, state: _State, streams: dict[str, Ragged], *, is_over: bool
+) -> tuple[_State, list[Ragged]]:
+    arrivals = _arrivals(late, streams, state.waiting)
+    ready = np.ones(len(arrivals.run), bool)
+    if late.policy == "wait" and not is_over:
+        ready = arrivals.moment_ns < _reached(streams)[arrivals.run]
+    newest_ns, behind_ns = _find_behind(arrivals, ready, state.newest_ns)
+    is_late = behind_ns > late.back_ns
+    told = [_skipped(bound.name, arrivals, is_late, late)]
+    arrived_ns = state.arrived_ns
+    if late.policy == "wait":
+        arrived_ns, waited = _waited(bound.name, streams, arrived_ns, late)
+        told.append(waited)
+    inner, made = bound.run(state.inner, _block(arrivals, ready & ~is_late))
+    waiting = {} if ready.all() else _block(arrivals, ~ready).streams
+    return _State(inner, waiting, newest_ns, arrived_ns), [*told, *made]
+
+
+class _Arrivals(NamedTuple):
+    """Messages of all topics in the order in which they are taken, run by run.
+
+    Attributes:
+        streams: the topics.
+        run, topic, row: (n,) whose they are: of which run, of which topic by number, and where in it.
+        stamp_ns, moment_ns: (n,) when they were measured, and when they are taken.
+        position: (n,) in the file.
+    """
+
+    streams: dict[str, Ragged]
+    run: Integers
+    topic: Integers
+    row: Integers
+    stamp_ns: Integers
+    moment_ns: Integers
+    position: Integers
+
+    @property
+    def runs(self) -> int:
+        """How many runs there are, empty ones included."""
+        return next(iter(self.streams.values())).runs
+
+
+def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragged]) -> _Arrivals:
+    """The next messages, and those that were held back; at the same moment in the file's order."""
+    if waiting:
+        streams = {topic: join([waiting[topic], streams[topic]]) for topic in streams}
+    columns = [
+        (
+            np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+            np.full(len(ragged), topic),
+            np.arange(len(ragged)),
+            ragged.stream.publish_time_ns,
+            ragged.stream.log_time_ns,
+            ragged.stream.position,
+        )
+        for topic, ragged in enumerate(streams.values())
+    ]
+    run, topic, row, stamp_ns, moment_ns, position = map(np.concatenate, zip(*columns, strict=True))
+    if late.policy == "wait":
+        moment_ns = np.maximum(moment_ns, stamp_ns + late.window_ns)
+    order = np.lexsort((position, moment_ns, run))
+    found = (column[order] for column in (run, topic, row, stamp_ns, moment_ns, position))
+    return _Arrivals(streams, *found)
+
+
+def _reached(streams: dict[str, Ragged]) -> Integers:
+    """When the last message of every run (runs,) arrived; zero where there is none."""
+    reached = []
+    for ragged in streams.values():
+        last = np.maximum(ragged.offsets[1:], 1) - 1
+        arrived = np.append(ragged.stream.log_time_ns, 0)[last]
+        reached.append(np.where(np.diff(ragged.offsets) > 0, arrived, 0))
+    return np.max(reached, axis=0)
+
+
+def _find_behind(
+    arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
+) -> tuple[Integers, Integers]:
+    """The newest stamps (runs,) after those that are taken, and by how much (n,) each was behind them.
+
+    Zero for a message that is not behind what was taken before it, and for one that is not ready.
+    """
+    newest_ns = np.zeros(arrivals.runs, np.int64) if before_ns is None else before_ns.copy()
+    behind_ns, rows = np.zeros(len(ready), np.int64), np.flatnonzero(ready)
+    ends = np.searchsorted(arrivals.run[rows], np.arange(len(newest_ns) + 1))
+    for run in np.flatnonzero(np.diff(ends)):
+        own = rows[ends[run] : ends[run + 1]]
+        newest = np.maximum.accumulate(np.append(newest_ns[run], arrivals.stamp_ns[own]))
+        behind_ns[own] = np.maximum(newest[:-1] - arrivals.stamp_ns[own], 0)
+        newest_ns[run] = newest[-1]
+    return newest_ns, behind_ns
+
+
+def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
+    """The chosen messages, every topic in the order in which they are taken."""
+    run, topic, row = (column[chosen] for column in (arrivals.run, arrivals.topic, arrivals.row))
+    streams: dict[str, Ragged] = {}
+    source, before = np.empty(len(run), np.int64), 0
+    for number, (name, ragged) in enumerate(arrivals.streams.items()):
+        own = np.flatnonzero(topic == number)
+        offsets = np.searchsorted(run[own], np.arange(arrivals.runs + 1))
+        streams[name] = Ragged(ragged.stream.take(row[own]), offsets)
+        source[own] = before + np.arange(len(own))
+        before += len(own)
+    stamp_ns, moment_ns, position = (
+        column[chosen] for column in (arrivals.stamp_ns, arrivals.moment_ns, arrivals.position)
+    )
+    offsets = np.searchsorted(run, np.arange(arrivals.runs + 1))
+    is_last = last_of_equals(offsets, stamp_ns, moment_ns)
+    events = Events(offsets, stamp_ns, topic, source, is_last)
+    return Block(streams, events, np.stack([moment_ns, position], axis=1))
+
+
+def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> Ragged:
+    """The messages that were left out."""
+    by = f"more than {late.back_ns * 1e-9:g} s " if late.back_ns else ""
+    reasons = [f"topic {topic}: it is {by}{OLDER}" for topic in arrivals.streams]
+    stream = reason_stream(
+        f"/estimates/{name}/skipped",
+        schemas.SKIPPED,
+        arrivals.stamp_ns[is_late],
+        arrivals.topic[is_late],
+        reasons,
+    )
+    offsets = np.searchsorted(arrivals.run[is_late], np.arange(arrivals.runs + 1))
+    return Ragged(replace(stream, log_time_ns=arrivals.moment_ns[is_late]), offsets)
+
+
+def _waited(
+    name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
+) -> tuple[Integers, Ragged]:
+    """The newest stamps (runs,) that have arrived, and the late messages that newer ones wait for."""
+    arrivals = _arrivals(Late("drop", 0), streams, {})
+    everything = np.ones(len(arrivals.run), bool)
+    arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)
+    in_time = (behind_ns > 0) & (arrivals.moment_ns <= arrivals.stamp_ns + late.window_ns)
+    stream = make_stream(
+        f"/estimates/{name}/waited",
+        schemas.WAITED,
+        arrivals.stamp_ns[in_time],
+        log_time_ns=arrivals.moment_ns[in_time],
+        behind_s=behind_ns[in_time] * 1e-9,
+    )
+    offsets = np.searchsorted(arrivals.run[in_time], np.arange(arrivals.runs + 1))
+    return arrived_ns, Ragged(stream, offsets)

@@ -1,0 +1,185 @@
+"""What became of the measurements that an estimator was given: used, gated, skipped, or nothing at all.
+
+It is counted from what goes in and comes out, for any estimator: messages by topic, innovations, and
+what the estimator says that it skipped.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+
+# What drives a motion is no measurement, and has no innovation.
+CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}
+INNOVATION, SKIPPED = schemas.INNOVATION.full_name, schemas.SKIPPED.full_name
+LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
+
+
+class Row(NamedTuple):
+    """A line of the table `coverage`.
+
+    Attributes:
+        estimator: its label.
+        topic: the measurements; several where innovations do not say which of them they are of.
+        messages: how many there were.
+        used, gated: how many gave an innovation that was taken, and one that was refused; None where
+            the estimator states no innovations.
+        skipped: how many of them the estimator says that it left out.
+        why: of those that were not used, in words.
+    """
+
+    estimator: str
+    topic: str
+    messages: int
+    used: int | None
+    gated: int | None
+    skipped: int
+    why: str
+
+    @property
+    def unused(self) -> int:
+        """How many came to nothing, though they were not gated."""
+        return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
+
+    @property
+    def sentence(self) -> str:
+        """What is said of them; empty where all came to something, or the estimator says why not."""
+        if self.unused > self.skipped or (self.unused > 0 and not self.used):
+            share = f"{self.unused} of {self.messages}"
+            return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
+        return f"{self.estimator}: {self.topic}: {self.why}" if self.why and not self.skipped else ""
+
+
+@dataclass
+class Usage:
+    """Counts of one bound estimator, over all runs.
+
+    Attributes:
+        name: the bound estimator's.
+        given: messages by topic.
+        measured: the topics of measurements among these.
+        facts: by topic, how many messages there is something to say of.
+        used, gated: innovations.
+        skipped: what was left out, by reason.
+        speaks: whether it gives innovations.
+        doubtful: what to say of a topic that it begins with.
+    """
+
+    name: str
+    given: Counter[str] = field(default_factory=Counter)
+    measured: set[str] = field(default_factory=set)
+    facts: dict[str, Counter[str]] = field(default_factory=dict)
+    used: int = 0
+    gated: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    speaks: bool = False
+    doubtful: dict[str, str] = field(default_factory=dict)
+
+    def note_start(self, whole: Mapping[str, Ragged]) -> None:
+        """Look at the streams that the estimator begins with."""
+        for topic, ragged in whole.items():
+            if ragged.stream.schema.full_name == LANDMARK:
+                for run in range(ragged.runs):
+                    self._note_map(topic, ragged.of_run(run))
+
+    def _note_map(self, topic: str, stream: Stream) -> None:
+        """Say where a landmark is at two places."""
+        order = np.argsort(stream["landmark_id"], kind="stable")
+        number, place = stream["landmark_id"][order], stream["position_m"][order]
+        apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)
+        if apart_m.any():
+            worst = int(np.argmax(apart_m))
+            self.doubtful[topic] = (
+                f"landmark {number[worst]} is stated at two places, {apart_m[worst]:.3g} m apart"
+            )
+
+    def note_given(self, streams: Mapping[str, Ragged], whole: Mapping[str, Ragged]) -> None:
+        """Count a block of messages; `whole` are the streams that the estimator began with."""
+        for topic, ragged in streams.items():
+            stream = ragged.stream
+            self.given[topic] += len(stream)
+            if stream.schema.full_name in CONTROLS:
+                continue
+            self.measured.add(topic)
+            facts = self.facts.setdefault(topic, Counter())
+            facts["are infinite"] += int(_infinite(stream).sum())
+            facts["repeat the message before"] += int(_repeated(stream).sum())
+            maps = [each.stream for each in whole.values() if each.stream.schema.full_name == LANDMARK]
+            if maps and "target_id" in stream.columns:
+                known = np.concatenate([each["landmark_id"] for each in maps])
+                facts["are of targets that the map lacks"] += int(
+                    (~np.isin(stream["target_id"], known)).sum()
+                )
+
+    def note_outputs(self, outputs: Sequence[Ragged]) -> None:
+        """Count a block of what the estimator gave."""
+        for stream in (each.stream for each in outputs):
+            if stream.schema.full_name == INNOVATION:
+                accepted = int((stream["accepted"] != 0).sum())
+                self.used += accepted
+                self.gated += len(stream) - accepted
+                self.speaks = True
+            elif stream.schema.full_name == SKIPPED and len(stream):
+                self.skipped.update(sentences_of(stream))
+
+    def merge(self, other: "Usage") -> None:
+        """Take in what was counted over other runs."""
+        self.given.update(other.given)
+        self.measured |= other.measured
+        for topic, facts in other.facts.items():
+            self.facts.setdefault(topic, Counter()).update(facts)
+        self.used += other.used
+        self.gated += other.gated
+        self.skipped.update(other.skipped)
+        self.speaks |= other.speaks
+        self.doubtful = other.doubtful | self.doubtful
+
+    def rows(self) -> Iterator[Row]:
+        """What became of its measurements: of each topic, or of all where innovations are of several."""
+        label, topics = self.name.partition("/")[0], sorted(self.measured)
+        for topic, why in self.doubtful.items():
+            yield Row(label, topic, self.given[topic], None, None, 0, why)
+        groups = [topics] if self.speaks and topics else [[topic] for topic in topics]
+        for group in groups:
+            facts = [
+                f"{count} {fact}" if len(group) == 1 else f"{count} of {topic} {fact}"
+                for topic in group
+                for fact, count in self.facts[topic].items()
+                if count
+            ]
+            told = [f"{count} skipped: {why}" for why, count in self.skipped.items()]
+            messages = sum(self.given[topic] for topic in group)
+            used, gated = (self.used, self.gated) if self.speaks else (None, None)
+            row = Row(label, " + ".join(group), messages, used, gated, self.skipped.total(), "")
+            if row.unused > 0 and not facts and not told:
+                told = ["they gave no innovation"]
+            yield row._replace(why="; ".join([*told, *facts]))
+
+
+def _infinite(stream: Stream) -> np.ndarray:
+    found = np.zeros(len(stream), bool)
+    for column in stream.columns.values() if len(stream) else ():
+        if column.dtype.kind == "f":
+            found |= np.isinf(column).reshape(len(column), -1).any(axis=1)
+    return found
+
+
+def _repeated(stream: Stream) -> np.ndarray:
+    """The messages that are in all the same as the one before; NaN is as good as NaN."""
+    found = np.zeros(len(stream), bool)
+    if len(stream) > 1:
+        same = np.diff(stream.publish_time_ns) == 0
+        for column in stream.columns.values() if same.any() else ():
+            flat = column.reshape(len(column), -1)
+            equal = flat[1:] == flat[:-1]
+            if column.dtype.kind == "f":
+                equal |= np.isnan(flat[1:]) & np.isnan(flat[:-1])
+            same &= equal.all(axis=1)
+        found[1:] = same
+    return found

@@ -1,0 +1,198 @@
+"""Ragged columns: the streams of many runs laid end to end, and their merged order of events."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import compress
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Clock, Stream
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.failures import join_streams
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """One topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream."""
+
+    stream: Stream
+    offsets: NDArray[np.int64]
+
+    def __getitem__(self, name: str) -> NDArray:
+        """The column of one field, all runs end to end."""
+        return self.stream.columns[name]
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    @property
+    def runs(self) -> int:
+        """How many runs there are, empty ones included."""
+        return len(self.offsets) - 1
+
+    def of_run(self, run: int) -> Stream:
+        """The rows of one run, without a copy."""
+        return self.stream.take(slice(int(self.offsets[run]), int(self.offsets[run + 1])))
+
+
+class Events(NamedTuple):
+    """The messages of several topics in time order: run r owns offsets[r]:offsets[r + 1].
+
+    Event e is of the topic with index `topic[e]`, and message number `source[e]` of all topics laid end
+    to end. `is_last[e]` says that no later event of the run has its stamp: the moment for an estimate.
+    """
+
+    offsets: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    topic: NDArray[np.int64]
+    source: NDArray[np.int64]
+    is_last: NDArray[np.bool_]
+
+
+CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
+
+
+class Block(NamedTuple):
+    """What an estimator gets at once: a span of its topics, in all runs.
+
+    `came` (n, 2) says of every event when it was taken and its place in the file, where that is not its
+    stamp's order alone; see `replay.engine.replaying.late`.
+    """
+
+    streams: dict[str, Ragged]
+    events: Events
+    came: NDArray[np.int64] | None = None
+
+    def column(self, *names: str, missing: float = np.nan) -> NDArray:
+        """One field of every event: the first of `names` that its topic has, else `missing`."""
+        parts = []
+        for ragged in self.streams.values():
+            found = [name for name in names if name in ragged.stream.columns]
+            parts.append(ragged[found[0]] if found else np.full(len(ragged), missing))
+        return np.concatenate(parts)[self.events.source]
+
+
+def copied(carried: CarriedType) -> CarriedType:
+    """A NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
+    columns: Any = carried
+    made: Any = type(carried)
+    return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
+
+
+def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
+    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
+
+    An entry may be such a NamedTuple itself.
+    """
+    columns: Any = carried
+    made: Any = type(carried)
+    return made(
+        *(of_runs(column, runs) if isinstance(column, tuple) else column[runs] for column in columns)
+    )
+
+
+def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The offsets that the chosen rows of ragged columns have, laid end to end."""
+    if chosen.all():
+        return offsets
+    return np.concatenate([[0], np.cumsum(chosen)])[offsets]
+
+
+def filled_rows(
+    offsets: NDArray[np.int64], end: NDArray[np.int64]
+) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
+    """What is filled of ragged columns whose run r goes from offsets[r] to end[r]: rows, and offsets."""
+    if np.array_equal(end, offsets[1:]):
+        return slice(None), offsets
+    run = np.repeat(np.arange(len(end)), np.diff(offsets))
+    filled = np.arange(len(run)) < end[run]
+    return np.flatnonzero(filled), ragged_rows(filled, offsets)
+
+
+def gather(parts: Sequence[Stream]) -> Ragged:
+    """Lay the runs' streams of one topic end to end."""
+    counts = [len(part) for part in parts]
+    offsets = np.zeros(len(parts) + 1, np.int64)
+    np.cumsum(counts, out=offsets[1:])
+    filled = parts if all(counts) else [*compress(parts, counts)] or parts[:1]
+    return Ragged(join_streams(filled), offsets)
+
+
+def join(parts: Sequence[Ragged]) -> Ragged:
+    """Join blocks of one topic, each run's rows together."""
+    if len(parts) == 1:
+        return parts[0]
+    run = np.concatenate([np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts])
+    stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = sum((part.offsets for part in parts), np.zeros(1, np.int64))
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
+
+
+def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
+    """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
+    everything = list(streams.values())
+    if len(everything) == 1:
+        return _in_order(everything[0], order)
+    times_ns = np.concatenate([ragged.stream.times(order) for ragged in everything])
+    positions = np.concatenate([ragged.stream.position for ragged in everything])
+    starts = np.cumsum([0, *(len(ragged) for ragged in everything[:-1])])
+    bounds = np.stack([ragged.offsets for ragged in everything]) + starts[:, None]
+    offsets = sum((ragged.offsets for ragged in everything), np.zeros(1, np.int64))
+    count = len(times_ns)
+    topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
+    events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
+    heads = partial(np.empty, len(everything), np.int64)
+    _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
+    return events
+
+
+def _in_order(ragged: Ragged, order: Clock) -> Events:
+    """The messages of the only topic."""
+    times_ns, offsets, count = ragged.stream.times(order), ragged.offsets, len(ragged)
+    is_last = last_of_equals(offsets, times_ns)
+    return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
+
+
+def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether a row (n,) is the last of its run, or the next one differs in one of the columns."""
+    is_last = np.zeros(len(columns[0]), bool)
+    for column in columns:
+        is_last[:-1] |= column[1:] != column[:-1]
+    is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
+    return is_last
+
+
+@lru_cache(maxsize=1)
+def _merge() -> Callable[..., None]:
+    return compile_over_runs(merge_run, allocates=False)
+
+
+def merge_run(
+    run: int,
+    bounds: NDArray[np.int64],
+    times_ns: NDArray[np.int64],
+    positions: NDArray[np.int64],
+    events: Events,
+    heads: NDArray[np.int64],
+) -> None:
+    """Merge the sorted topics of one run: topic k has the messages bounds[k, run]:bounds[k, run + 1]."""
+    for k in range(len(heads)):
+        heads[k] = bounds[k, run]
+    for event in range(events.offsets[run], events.offsets[run + 1]):
+        first = -1
+        for k in range(len(heads)):
+            if heads[k] < bounds[k, run + 1]:
+                if first < 0:
+                    first = k
+                later_ns = times_ns[heads[k]] - times_ns[heads[first]]
+                if later_ns < 0 or (later_ns == 0 and positions[heads[k]] < positions[heads[first]]):
+                    first = k
+        time_ns = times_ns[heads[first]]
+        if event > events.offsets[run] and time_ns == events.time_ns[event - 1]:
+            events.is_last[event - 1] = False
+        events.time_ns[event], events.is_last[event] = time_ns, True
+        events.topic[event], events.source[event] = first, heads[first]
+        heads[first] += 1

@@ -1,0 +1,105 @@
+"""Geodetic fixes as positions in the log's plane: east, north and up from one origin.
+
+The origin is what the log's channels state, else a run's first fix.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Stream, Topic, schemas
+from recorders.models.geodesy import into_tangent_plane, tangent_axes
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.channels import stated
+
+Floats = NDArray[np.float64]
+GEODETIC = schemas.GEODETIC_FIX.full_name
+LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
+    "origin_latitude_deg",
+    "origin_longitude_deg",
+    "origin_altitude_m",
+)
+
+
+def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:
+    """Latitude and longitude in deg and altitude in m (3,) that a log's channels state; else None.
+
+    An altitude that is not stated is zero. Raises BadInput where channels state different origins, or
+    one states half of one.
+    """
+    found: dict[str, tuple[float, ...]] = {}
+    for topic in topics.values():
+        if LATITUDE in topic.metadata or LONGITUDE in topic.metadata:
+            place = (stated([topic], LATITUDE), stated([topic], LONGITUDE))
+            found[topic.name] = (*place, np.nan_to_num(stated([topic], ALTITUDE, needed=False)))
+    _refuse_different(found)
+    return np.array(next(iter(found.values()))) if found else None
+
+
+def _refuse_different(found: Mapping[str, tuple[float, ...]]) -> None:
+    (first, origin), *others = found.items() or [("", ())]
+    for topic, other in others:
+        if other != origin:
+            raise BadInput(
+                f"topics {first} and {topic} state different origins of the plane: {_in_words(origin)} "
+                f"and {_in_words(other)} (latitude and longitude in deg, altitude in m); import the log "
+                "again with one origin"
+            )
+
+
+def _in_words(origin: Iterable[float]) -> str:
+    return ", ".join(f"{number:.9g}" for number in origin)
+
+
+def origins_of(fixes: Ragged) -> Floats:
+    """The first fix (runs, 3) of every run, in deg, deg and m; NaN where a run has none."""
+    has_one = np.diff(fixes.offsets) > 0
+    rows = fixes.offsets[:-1][has_one]
+    origins = np.full((fixes.runs, 3), np.nan)
+    origins[has_one, 0] = fixes["latitude_deg"][rows]
+    origins[has_one, 1] = fixes["longitude_deg"][rows]
+    origins[has_one, 2] = np.nan_to_num(fixes["altitude_m"][rows])
+    return origins
+
+
+def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
+    """A topic of geodetic fixes as one of positions (n, 3) about the origins (runs, 3).
+
+    What a fix lacks (its altitude, say) is NaN. Covariances (n, 9) are turned from the axes of the fix
+    to those of the origin; a log may have them diagonal or full, of east and north alone or with up.
+    """
+    stream = fixes.stream
+    origin = origins[np.repeat(np.arange(fixes.runs), np.diff(fixes.offsets))]
+    place = stream["latitude_deg"], stream["longitude_deg"]
+    is_flat = np.isnan(stream["altitude_m"])
+    altitude = np.where(is_flat, origin[:, 2], stream["altitude_m"])
+    position = np.stack(into_tangent_plane((*place, altitude), tuple(origin.T)), axis=1)
+    position[is_flat, 2] = np.nan
+    columns = {
+        "sensor_time_ns": stream["sensor_time_ns"],
+        "position_m": position,
+        "covariance_m2": _turned(stream, tangent_axes(*origin.T[:2]), tangent_axes(*place)),
+    }
+    return Ragged(replace(stream, schema=schemas.POSITION_FIX, columns=columns), fixes.offsets)
+
+
+def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
+    """The fixes' covariances (n, 9) in other axes (n, 3, 3) than their own; NaN where they lack them."""
+    given = stream.columns.get("covariance_m2", np.empty((len(stream), 0)))
+    size = {0: 0, 2: 2, 3: 3, 4: 2, 9: 3}.get(given.shape[1])
+    if size is None:
+        raise BadInput(
+            f"topic {stream.topic}: covariance_m2 has {given.shape[1]} numbers; 2 or 4 are needed for "
+            "east and north, 3 or 9 with up"
+        )
+    covariance = np.full((len(stream), 3, 3), np.nan)
+    if size:
+        is_full = given.shape[1] == size**2
+        own_axes = given.reshape(-1, size, size) if is_full else given[:, :, None] * np.eye(size)
+        covariance[:, :size, :size] = own_axes
+    turn, unknown = axes @ own.transpose(0, 2, 1), np.isnan(covariance)
+    turned = turn @ np.where(unknown, 0.0, covariance) @ turn.transpose(0, 2, 1)
+    return np.where(unknown, np.nan, turned).reshape(-1, 9)

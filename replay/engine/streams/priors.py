@@ -1,0 +1,147 @@
+"""The prior rule: components by name, and a run without a usable prior fails alone."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from math import isqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.results import gaussian_stream
+from replay.engine.vectors.components import (
+    Components,
+    match_components,
+    match_tangent,
+    stated_components,
+)
+from replay.engine.vectors.covariances import is_positive_definite
+from replay.engine.vectors.tangent import Kind, tangent_components
+
+MISSING = "there is no prior message"
+NOT_FINITE = "the prior is not finite"
+NOT_POSITIVE_DEFINITE = "the prior's covariance is not positive definite"
+
+
+class Priors(NamedTuple):
+    """The first Gaussian of every run, its components in the order in which they were wanted.
+
+    Attributes:
+        time_ns: (runs,) stamps.
+        mean: (runs, d).
+        covariance: (runs, t, t) in the tangent space.
+        reasons: (runs,) why a prior cannot be used, "" where it can; then its numbers are NaN.
+    """
+
+    time_ns: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    reasons: tuple[str, ...]
+
+
+def priors_of(prior: Ragged, components: Components) -> Priors:
+    """The priors of all runs; see `Priors`.
+
+    Raises BadInput where the channel does not state the components (see `match_components`), or the
+    vectors have other widths than it states.
+    """
+    stream, runs = prior.stream, prior.runs
+    where = f"topic {stream.topic}"
+    names, kinds = (stream.metadata.get(name, "") for name in ("components", "kinds"))
+    layout = _layout(names, kinds, tuple(components.items()), where)
+    size = layout.tangent
+    present = np.flatnonzero(np.diff(prior.offsets))
+    first = prior.offsets[present]
+    time_ns, mean, covariance, _ = no_priors(runs, components, MISSING)
+    reasons = [""] * runs
+    if len(present):
+        widths = stream["mean"].shape[1], stream["covariance"].shape[1]
+        if widths != (layout.stated, size**2):
+            raise BadInput(
+                f"{where}: {layout.stated} components are stated, mean and covariance have {widths[0]} "
+                f"and {widths[1]} numbers; {layout.stated} and {size**2} are needed"
+            )
+        time_ns[present] = stream.publish_time_ns[first]
+        mean[present] = stream["mean"][first][:, layout.columns]
+        whole = stream["covariance"][first].reshape(-1, size, size)
+        covariance[present] = whole[:, layout.rows][:, :, layout.rows]
+    finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
+    usable = finite & is_positive_definite(covariance)
+    if not usable.all():
+        mean[~usable], covariance[~usable] = np.nan, np.nan
+        wanted = f"no prior of {len(components)} components ({', '.join(components)}) can be used"
+        for run in np.flatnonzero(~usable).tolist():
+            reason = NOT_POSITIVE_DEFINITE if finite[run] else NOT_FINITE
+            reasons[run] = f"{where}: {wanted}: {reason if run in present else MISSING}"
+    return Priors(time_ns, mean, covariance, tuple(reasons))
+
+
+class _Layout(NamedTuple):
+    """How many components a channel states, of the tangent space too, and where the wanted stand."""
+
+    stated: int
+    tangent: int
+    columns: list[int]
+    rows: list[int]
+
+
+@lru_cache(maxsize=256)
+def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
+    """The layout of a channel that states these names and kinds; raises BadInput as `read_priors`."""
+    metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
+    stated = stated_components(metadata, components, where)
+    return _Layout(
+        len(stated),
+        len(match_tangent(metadata, stated, where)),
+        match_components(metadata, components, where),
+        match_tangent(metadata, components, where),
+    )
+
+
+def no_priors(runs: int, components: Components, reason: str) -> Priors:
+    """Priors that cannot be used, all for one reason."""
+    size = len(tangent_components(list(components), list(components.values())))
+    return Priors(
+        np.zeros(runs, np.int64),
+        np.full((runs, len(components)), np.nan),
+        np.full((runs, size, size), np.nan),
+        (reason,) * runs,
+    )
+
+
+def start_of_runs(
+    whole: Mapping[str, Ragged], priors: Mapping[str, Components]
+) -> tuple[dict[str, Ragged], dict[int, str]]:
+    """What an estimator starts from, and why some runs cannot start.
+
+    Args:
+        whole: whole topics of all runs.
+        priors: which of them are priors, and the components that are wanted of each.
+
+    Returns the topics, where a prior is now one message for every run, of the wanted components in their
+    order, NaN where the run cannot start; and the reasons by run, which may be all of them.
+    Raises BadInput where a topic is no such prior, see `priors_of`.
+    """
+    found, failed = dict(whole), dict[int, str]()
+    for topic, components in priors.items():
+        read = priors_of(whole[topic], components)
+        for run, reason in enumerate(read.reasons):
+            if reason:
+                failed.setdefault(run, reason)
+        stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
+        found[topic] = Ragged(stream, np.arange(len(read.reasons) + 1))
+    return found, failed
+
+
+def gaussians(
+    prior: Ragged,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """What an estimator starts from a prior of `start_of_runs`.
+
+    Stamps (runs,), means (runs, d), covariances (runs, t, t), to be changed at will.
+    """
+    size = isqrt(prior["covariance"].shape[1])
+    covariance = prior["covariance"].reshape(-1, size, size)
+    return prior.stream.publish_time_ns.copy(), prior["mean"].copy(), covariance.copy()

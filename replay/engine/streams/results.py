@@ -1,0 +1,128 @@
+"""What estimators say, as streams: states, innovations, what was passed over, and who failed."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, make_stream, schemas
+from recorders.log.streams import stream_of
+from recorders.models.planar import wrap_angle
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import Failure, failure_stream, reason_stream
+from replay.engine.vectors.components import Components
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+ALL_WELL = -1  # of a run; what is not negative counts in a list of reasons
+
+
+def named(components: Mapping[str, str]) -> dict[str, str]:
+    """Components and their kinds as a channel states them."""
+    return {"components": ",".join(components), "kinds": ",".join(components.values())}
+
+
+def state_stream(
+    topic: str,
+    time_ns: Integers,
+    components: Components,
+    truth: str | None,
+    mean: Floats,
+    covariance: Floats,
+) -> Stream:
+    """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
+
+    `truth` is the topic that they are compared with; None where there is nothing to compare.
+    """
+    angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
+    if angular:
+        mean = mean.copy()
+        angles = mean[:, angular]  # those in range stay as they are, to the last bit
+        mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
+    metadata = named(components) if truth is None else {**named(components), "truth": truth}
+    return gaussian_stream(topic, time_ns, mean, covariance, metadata)
+
+
+def gaussian_stream(
+    topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
+) -> Stream:
+    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `supervision`."""
+    columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
+    schema = schemas.GAUSSIAN_ESTIMATE
+    return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
+
+
+def states_in(
+    rows: Integers,
+    topic: str,
+    time_ns: Integers,
+    offsets: Integers,
+    components: Components,
+    truth: str | None,
+    mean: Floats,
+    covariance: Floats,
+) -> Ragged:
+    """The states in some rows, in order, of columns in which run r owns offsets[r]:offsets[r + 1]."""
+    stream = state_stream(topic, time_ns[rows], components, truth, mean[rows], covariance[rows])
+    return Ragged(stream, np.searchsorted(rows, offsets))
+
+
+def innovation_stream(
+    topic: str,
+    time_ns: Integers,
+    components: Mapping[str, str],
+    truth: str,
+    *,
+    target_id: Any,
+    accepted: Any,
+    innovation: Floats,
+    covariance: Floats,
+    squared: Floats,
+    log_likelihood: Floats | None = None,
+) -> Stream:
+    """Innovations (n, m) with their covariances (n, m, m), NIS (n,) and, where known, log-likelihood."""
+    if log_likelihood is None:
+        log_likelihood = np.full(len(time_ns), np.nan)
+    return make_stream(
+        topic,
+        schemas.INNOVATION,
+        time_ns,
+        metadata={**named(components), "truth": truth},
+        target_id=target_id,
+        accepted=accepted,
+        innovation=innovation,
+        covariance=_flat(covariance),
+        normalised_innovation_squared=squared,
+        log_likelihood=log_likelihood,
+    )
+
+
+def _flat(covariance: Floats) -> Floats:
+    """Matrices (n, m, m) as rows (n, m m)."""
+    return covariance.reshape(len(covariance), covariance.shape[1] * covariance.shape[2])
+
+
+def failures_of(
+    topic: str, before: Integers, after: Integers, time_ns: Integers, reasons: Sequence[str]
+) -> Ragged:
+    """The runs that failed in a block, on `topic`/failure; one message each, at its own time.
+
+    Args:
+        topic: the estimator's, /estimates/NAME and its case.
+        before: ALL_WELL or an index of `reasons` for every run up to the block, (runs,).
+        after: the same with the block.
+        time_ns: when, (runs,).
+        reasons: a sentence for each index.
+    """
+    failed = np.flatnonzero((after >= 0) & (before == ALL_WELL))
+    stream = reason_stream(f"{topic}/failure", schemas.FAILURE, time_ns[failed], after[failed], reasons)
+    return Ragged(stream, np.searchsorted(failed, np.arange(len(after) + 1)))
+
+
+def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> Ragged:
+    """The failures of some of the runs, by their numbers, on `topic`/failure."""
+    failed = sorted(failures)
+    stream = failure_stream(f"{topic}/failure", [failures[run] for run in failed])
+    return Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))

@@ -1,0 +1,378 @@
+"""Where a replay reads from: log files, or recordings that are still in memory; one run or many."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import zip_longest
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from recorders.errors import BadInput, UnknownName, choices
+from recorders.log import (
+    Clock,
+    Log,
+    RunMetadata,
+    Stream,
+    Topic,
+    read_blocks,
+    read_empty,
+    read_span,
+    read_streams,
+)
+from recorders.recording import Recording
+from replay.engine.streams.blocks import Ragged, gather
+
+
+class Source(Protocol):
+    """One run, as replay and evaluation see it."""
+
+    @property
+    def name(self) -> str:
+        """What to call the run in a message."""
+
+    @property
+    def run(self) -> RunMetadata | None:
+        """What the run was."""
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+
+    @property
+    def start_ns(self) -> int | None:
+        """Where the replayed span begins, by the clock of the replay; None where the run begins."""
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """What it holds."""
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order."""
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
+
+    def whole(self) -> "Source":
+        """The run without a span."""
+
+
+def is_sensed(source: Source, topic: str) -> bool:
+    """Whether a topic is the run's own, and columns: no estimates, no images."""
+    if topic.startswith("/estimates/"):
+        return False
+    try:
+        source.empty(topic)
+    except BadInput:
+        return False
+    return True
+
+
+class _Readable(Mapping[str, Stream]):
+    """A source as a person reads it: whole streams by topic.
+
+    A topic that is not there raises `UnknownName`.
+    """
+
+    def __getitem__(self: Source, topic: str) -> Stream:
+        if topic not in self.topics:
+            raise UnknownName(f"{self.name}: no topic {topic}; {choices(topic, self.topics)}")
+        return self.read([topic])[topic]
+
+    def __contains__(self: Source, topic: object) -> bool:
+        return topic in self.topics
+
+    def __iter__(self: Source) -> Iterator[str]:
+        return iter(self.topics)
+
+    def __len__(self: Source) -> int:
+        return len(self.topics)
+
+    def __repr__(self: Source) -> str:
+        run = self.run
+        of = f": {run.scenario}, seed {run.seed}, run {run.run}" if run else ""
+        width = max(map(len, self.topics), default=0)
+        rows = [
+            f"  {name:{width}} {topic.messages:9} {topic.schema_name}"
+            for name, topic in self.topics.items()
+        ]
+        return "\n".join([self.name + of, *rows])
+
+
+@dataclass(frozen=True, repr=False)
+class LogSource(_Readable):
+    """A log file, read lazily; it maps its topics to their streams."""
+
+    log: Log
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The log's path."""
+        return str(self.log.path)
+
+    @property
+    def run(self) -> RunMetadata | None:
+        """The log's run metadata."""
+        return self.log.run
+
+    @cached_property
+    def epoch_ns(self) -> int:
+        """The run's time zero; where the log does not say, its first publish stamp."""
+        return self.zero_ns("publish_time")
+
+    def zero_ns(self, clock: Clock) -> int:
+        """What times in seconds count from, by one of the two clocks.
+
+        It is the epoch that the log states; without one the first stamp of that clock, for the two may
+        have nothing in common (simulated and wall time, say).
+        """
+        return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
+
+    def extent(self, clock: Clock) -> tuple[int, int]:
+        """The first and the last stamp in ns by one of the two clocks."""
+        return read_span(self.log, clock)
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """The log's topics."""
+        return self.log.topics
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order, whatever the source's span."""
+        return read_streams(self.log, topics)
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+        return read_empty(self.log, topic)
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Blocks of the source's span."""
+        return read_blocks(
+            self.log,
+            topics,
+            order=order,
+            start_ns=self.start_ns,
+            end_ns=self.end_ns,
+            block_messages=block_messages,
+        )
+
+    def whole(self) -> "LogSource":
+        """The whole log."""
+        return LogSource(self.log)
+
+
+@dataclass(frozen=True, repr=False)
+class MemorySource(_Readable):
+    """A recording in memory: read and replayed as if it had been written and read back."""
+
+    streams: Mapping[str, Stream]
+    run: RunMetadata
+    name: str
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+        return self.run.epoch_ns
+
+    def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
+        """What times in seconds count from: the epoch, by either clock."""
+        return self.epoch_ns
+
+    def extent(self, clock: Clock) -> tuple[int, int]:
+        """The first and the last stamp in ns by one of the two clocks; zeros where there are none."""
+        times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
+        first_ns = min((int(each.min()) for each in times), default=0)
+        return first_ns, max((int(each.max()) for each in times), default=0)
+
+    @cached_property
+    def topics(self) -> Mapping[str, Topic]:
+        """The recording's topics."""
+        return {
+            topic: Topic(topic, stream.schema.full_name, "protobuf", (), stream.metadata, len(stream))
+            for topic, stream in self.streams.items()
+        }
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order."""
+        return {topic: self.in_order(topic, "publish_time") for topic in topics}
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+        return self.streams[topic].take(slice(0, 0))
+
+    def blocks(
+        self,
+        topics: Sequence[str],
+        order: Clock,
+        block_messages: int,  # noqa: ARG002
+    ) -> Iterator[dict[str, Stream]]:
+        """The source's span in one block, unless there is nothing: everything is in memory already."""
+        spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
+        block = {topic: stream for topic, stream in spans.items() if len(stream)}
+        if block:
+            yield block
+
+    def whole(self) -> "MemorySource":
+        """The whole recording."""
+        return replace(self, start_ns=None, end_ns=None)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there is no span."""
+        return self.start_ns is None and self.end_ns is None
+
+    def _within(self, stream: Stream, order: Clock) -> Stream:
+        """The messages of the source's span, of a stream in order."""
+        if self.is_whole:
+            return stream
+        times_ns = stream.times(order)
+        start = 0 if self.start_ns is None else np.searchsorted(times_ns, self.start_ns)
+        end = len(stream) if self.end_ns is None else np.searchsorted(times_ns, self.end_ns)
+        return stream.take(slice(int(start), int(end)))
+
+    def in_order(self, topic: str, order: Clock) -> Stream:
+        """A topic by one of the clocks; equal stamps as in the file."""
+        stream = self.stream_of(topic)
+        if is_in_order(gather([stream]), order):
+            return stream
+        return stream.take(np.lexsort((stream.position, stream.times(order))))
+
+    def stream_of(self, topic: str) -> Stream:
+        """A topic as it was recorded; raises BadInput where it is not there."""
+        if topic not in self.streams:
+            raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
+        return self.streams[topic]
+
+
+def is_in_order(runs: Ragged, order: Clock) -> bool:
+    """Whether the messages of every run go by one of the clocks, and by their places in the file."""
+    clock, position = runs.stream.times(order), runs.stream.position
+    ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
+    if ordered.all():
+        return True
+    begins = runs.offsets[1:-1]  # where another run begins, or none is left
+    ordered[begins[(begins > 0) & (begins < len(clock))] - 1] = True
+    return bool(ordered.all())
+
+
+def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
+    """A recording with the positions that a log of it would have: merged by log time, ties in order."""
+    streams = recording.streams
+    ranks = np.empty(sum(map(len, streams)), np.int64)
+    times = [stream.log_time_ns for stream in streams]
+    ranks[np.argsort(np.concatenate(times), kind="stable")] = np.arange(len(ranks))
+    cuts = np.cumsum([len(stream) for stream in streams])[:-1]
+    placed = [
+        replace(stream, position=rank)
+        for stream, rank in zip(streams, np.split(ranks, cuts), strict=True)
+    ]
+    return MemorySource(
+        {stream.topic: stream for stream in placed}, run, f"run {run.run} of {run.scenario}"
+    )
+
+
+SourceType = TypeVar("SourceType", bound=Source)
+
+
+class Ensemble(list[SourceType]):
+    """Runs that are replayed together: they hold the same topics.
+
+    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept;
+    no run may be added to it or taken from it.
+    """
+
+    def __init__(self, sources: Iterable[SourceType]) -> None:
+        super().__init__(sources)
+        self._kept: dict[tuple[str, Clock], Ragged] = {}
+        self._alike: set[str] = set()
+
+    @cached_property
+    def starts_ns(self) -> dict[int, int]:
+        """Where the replayed spans begin, by run; of those that do not begin with their run."""
+        starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
+        return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
+
+    def require_alike(self, topics: Iterable[str]) -> None:
+        """Raise BadInput where a run does not hold these topics as the first one does."""
+        first = self[0]
+        for topic in topics:
+            if topic in self._alike:
+                continue
+            here = first.topics[topic]
+            stated = here.schema_name, here.metadata
+            for source in self:
+                there = source.topics.get(topic)
+                if there is None or (there.schema_name, there.metadata) != stated:
+                    raise BadInput(
+                        f"{source.name}: topic {topic} differs from that of {first.name}; the runs of "
+                        "an "
+                        "ensemble have the same topics and types, so replay this one on its own"
+                    )
+            self._alike.add(topic)
+
+    def read(self, topics: Sequence[str]) -> dict[str, Ragged]:
+        """Whole topics, in publish-time order."""
+        if self._recordings:
+            return self._laid_out(topics, "publish_time")
+        runs = [source.read(topics) for source in self]
+        return {topic: gather([run[topic] for run in runs]) for topic in topics}
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Ragged]]:
+        """The next block of every run, until all runs are at their end.
+
+        The runs need not be at the same time: each has its own state. Recordings are one block.
+        """
+        if not topics:
+            return
+        if self._are_whole:
+            block = self._laid_out(topics, order)
+            if any(len(ragged) for ragged in block.values()):
+                yield block
+            return
+        empty = {topic: self[0].empty(topic) for topic in topics}
+        ended: dict[str, Stream] = {}
+        runs = [source.blocks(topics, order, block_messages) for source in self]
+        for blocks in zip_longest(*runs, fillvalue=ended):
+            yield {
+                topic: gather([block.get(topic, nothing) for block in blocks])
+                for topic, nothing in empty.items()
+            }
+
+    @cached_property
+    def _recordings(self) -> list[MemorySource]:
+        """The runs, where all are in memory."""
+        found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
+        return found if len(found) == len(self) else []
+
+    @cached_property
+    def _are_whole(self) -> bool:
+        """Whether all runs are in memory, without spans."""
+        return bool(self._recordings) and all(run.is_whole for run in self._recordings)
+
+    def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
+        """Topics of recordings, each run by one of the clocks."""
+        for topic in topics:
+            if (topic, order) not in self._kept:
+                together = gather([source.stream_of(topic) for source in self._recordings])
+                if not is_in_order(together, order):
+                    together = gather([source.in_order(topic, order) for source in self._recordings])
+                self._kept[topic, order] = together
+        return {topic: self._kept[topic, order] for topic in topics}
+
+
+def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:
+    """The ensemble of these runs, which may be one already."""
+    return sources if isinstance(sources, Ensemble) else Ensemble(sources)

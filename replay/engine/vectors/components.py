@@ -1,0 +1,74 @@
+"""A vector's components by the names that its channel states; their order never matters."""
+
+from collections.abc import Mapping, Sequence
+from typing import cast
+
+from recorders.errors import BadInput
+from recorders.models.states import state_metadata
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, things
+
+Components = Mapping[str, Kind]
+
+
+def components_of(names: Sequence[str]) -> Components:
+    """Names with their kinds: an angle is a component in rad that wraps, others are linear."""
+    return stated_components(state_metadata(names), {}, "components")
+
+
+def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
+    """Where the wanted components stand among those that a channel states.
+
+    Args:
+        stated: the channel's metadata: names as `components`, with or without their `kinds`.
+        wanted: names and kinds, in the order in which they are wanted.
+        where: what to call the channel in a sentence, such as `topic /prior`.
+
+    Raises BadInput where the channel names its components badly, lacks one that is wanted, or states
+    that one is of another kind.
+    """
+    kinds = stated_components(stated, wanted, where)
+    names = list(kinds)
+    for name, kind in wanted.items():
+        if name not in kinds:
+            raise BadInput(
+                f"{where}: no component {name}: its channel states "
+                f"{', '.join(names) or 'no components'}; {', '.join(wanted)} are needed, in any order; "
+                "name them in the channel's metadata"
+            )
+        if kinds[name] != kind:
+            raise BadInput(f"{where}: component {name} is stated as {kinds[name]}; it must be {kind}")
+    return [names.index(name) for name in wanted]
+
+
+def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
+    """Which rows and columns of a stated covariance are those of the wanted components, in their order.
+
+    A covariance is in the tangent space: one row for an axis, three for a quaternion, see
+    `replay.engine.vectors.tangent`. Args and errors as `match_components`.
+    """
+    columns = match_components(stated, wanted, where)
+    rows_of: list[range] = []
+    end = 0
+    for kind, numbers in things(list(stated_components(stated, wanted, where).values())):
+        begin, end = end, end + TANGENT_WIDTHS[kind]
+        rows_of += [range(begin, end)] * (numbers.stop - numbers.start)
+    return [
+        row for _, numbers in things(list(wanted.values())) for row in rows_of[columns[numbers.start]]
+    ]
+
+
+def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
+    """Names and kinds as a channel states them, in its order; empty where it names none.
+
+    A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
+    where a name stands twice, or the kinds are none or not one for each name.
+    """
+    names = [name for name in stated.get("components", "").split(",") if name]
+    listed = stated.get("kinds", "")
+    kinds = listed.split(",") if listed else [wanted.get(name, "linear") for name in names]
+    if len(set(names)) < len(names) or len(kinds) != len(names) or not are_kinds(kinds):
+        raise BadInput(
+            f"{where}: components '{stated.get('components', '')}' with kinds '{listed}': give each "
+            "component a name of its own and a kind; an axis has two in a row, a quaternion four"
+        )
+    return dict(zip(names, cast("list[Kind]", kinds), strict=True))

@@ -1,0 +1,1 @@
+"""Fusion of biometric scores; begin with `biometrics`."""

@@ -1,0 +1,466 @@
+"""Fusion of biometric scores: rules, classifiers and mixture models, as batch estimators.
+
+Zheng & Blasch, "An exploration of the impacts of three factors in multimodal biometric score fusion",
+JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case each, into the stream
+`/estimates/NAME/CASE/fused`, and learns from other users than those that it judges.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveInt
+from threadpoolctl import threadpool_limits
+
+from recorders.errors import BadInput, choices
+from recorders.log import Stream, Topic, make_stream, schemas
+from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
+from recorders.parameters import Parameters
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged, gather
+from replay.estimators.biometrics.mixture_hmm import Fit, fit, log_likelihood
+
+Scorer = Callable[[Floats], Floats]
+Learner = Callable[[Floats, Booleans, np.random.Generator], Scorer]
+
+NEEDS = f"a stream {TOPIC} of at least two matchers' score vectors"
+TANH_SCALE = 0.01
+LEAST_PROBABILITY = 1e-300
+LOG_LIKELIHOOD_RATIO = "log_likelihood_ratio"
+LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
+IMPOSTORS_PER_USER = 2
+
+
+class Pairs(NamedTuple):
+    """Which comparisons are fused: probe and gallery user (n,) of each, and their fold (users,).
+
+    Without folds (None) nothing is learnt.
+    """
+
+    probe: Integers
+    gallery: Integers
+    fold: Integers | None = None
+
+
+class Subsets(Parameters):
+    """Which subsets of the matchers to fuse: names of `subsets_of`, all where none is given."""
+
+    subsets: list[str] = []
+
+
+class RuleParameters(Subsets):
+    """A normalisation of the scores over all comparisons (or per gallery entry), and a rule."""
+
+    normalisation: Literal["none", "z", "min-max", "tanh", "column-min-max"] = "column-min-max"
+    rule: Literal["mean", "sum", "product", "minimum", "maximum", "median"] = "mean"
+
+
+class LearnerParameters(Subsets):
+    """What a fusion learns from, and what it judges.
+
+    `pairs`: the paper's trimmed database (all genuine, two random impostors per user), or all. Failures
+    to enrol count as scored, as in the paper, or as missing. `logarithmic` names the modalities whose
+    scores go through log(1 + score) first.
+    """
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    folds: Annotated[int, Field(ge=2)] = 10
+    pairs: Literal["trimmed", "all"] = "trimmed"
+    failures: Literal["as-scored", "missing"] = "as-scored"
+    logarithmic: list[str] = []
+    impostor_limit: PositiveInt = 20_000
+
+
+class ClassifierParameters(LearnerParameters):
+    """A classifier of scikit-learn; `calibrated` puts a logistic curve over its output."""
+
+    classifier: Literal["qda", "lda", "knn", "svm", "logistic"] = "qda"
+    neighbours: PositiveInt = 3
+    calibrated: bool = False
+
+
+class MixtureParameters(LearnerParameters):
+    """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
+
+    `joint` takes all scores as one vector of one state: a Gaussian mixture.
+    """
+
+    topology: Literal["left-right", "ergodic", "joint"] = "left-right"
+    genuine_components: PositiveInt = 3
+    impostor_components: PositiveInt = 3
+    components_of: dict[str, PositiveInt] = {}
+    covariance_floor: NonNegativeFloat = 0.01
+    iterations: PositiveInt = 20
+    tolerance: NonNegativeFloat = 0.0
+
+
+def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
+    """The three factors' subsets: each modality, the k-th matcher of every modality, all, singles.
+
+    A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
+    the larger ones.
+    """
+    by_modality: dict[str, list[int]] = {}
+    for index, matcher in enumerate(matchers):
+        by_modality.setdefault(matcher.modality, []).append(index)
+    subsets = {name: indices for name, indices in by_modality.items() if len(indices) > 1}
+    if len(by_modality) > 1:
+        ranks = min(map(len, by_modality.values()))
+        if ranks > 1:
+            for rank in range(ranks):
+                subsets[f"matcher-{rank + 1}"] = [of[rank] for of in by_modality.values()]
+        subsets["all"] = list(range(len(matchers)))
+    return subsets | {matcher.name: [index] for index, matcher in enumerate(matchers)}
+
+
+def normalise(scores: Floats, how: str) -> Floats:
+    """Scores (users, users, matchers) on a common scale; missing ones (NaN) stay missing.
+
+    `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
+    column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
+    """
+    match how:
+        case "z" | "tanh":
+            z = (scores - np.nanmean(scores, axis=(0, 1))) / _deviations(scores)
+            return z if how == "z" else 0.5 * (np.tanh(TANH_SCALE * z) + 1)
+        case "min-max" | "column-min-max":
+            over = (0, 1) if how == "min-max" else (0,)
+            low = np.nanmin(scores, axis=over, keepdims=True)
+            width = np.nanmax(scores, axis=over, keepdims=True) - low
+            return np.where(width > 0, (scores - low) / np.where(width > 0, width, 1.0), 0.0)
+    return scores
+
+
+def _deviations(scores: Floats) -> Floats:
+    """The standard deviation (matchers,) of each matcher's scores, missing ones left out."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviations = np.nanstd(scores, axis=(0, 1), ddof=1)
+    unusable = ~(np.isfinite(deviations) & (deviations > 0))
+    if unusable.any():
+        raise BadInput(
+            f"topic {TOPIC}: the scores of matcher {np.argmax(unusable) + 1} of {len(unusable)} have a "
+            f"standard deviation of {deviations[unusable][0]:g}; leave the matcher out, or scale it"
+        )
+    return deviations
+
+
+RULES: dict[str, Callable[..., Floats]] = {
+    "mean": np.nanmean,
+    "sum": np.nansum,
+    "product": np.nanprod,
+    "minimum": np.nanmin,
+    "maximum": np.nanmax,
+    "median": np.nanmedian,
+}
+
+
+def all_pairs(users: int) -> Pairs:
+    """Every probe with every gallery entry."""
+    return Pairs(np.repeat(np.arange(users), users), np.tile(np.arange(users), users))
+
+
+def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
+    """The paper's trimmed database: the genuine comparisons, two random other probes per gallery user.
+
+    The probe is the same for all matchers: one for each would inflate the results.
+    """
+    gallery = np.repeat(np.arange(users), IMPOSTORS_PER_USER)
+    step = np.argsort(rng.random((users, users - 1)), axis=1)[:, :IMPOSTORS_PER_USER] + 1
+    impostor = (gallery + step.ravel()) % users
+    return Pairs(
+        np.concatenate([np.arange(users), impostor]), np.concatenate([np.arange(users), gallery])
+    )
+
+
+def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
+    """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
+    if users < 2 * folds:
+        fewer = f", or at most {users // 2} folds" if users >= 4 else ""
+        raise BadInput(
+            f"{users} users are too few for {folds} folds; give at least {2 * folds} users{fewer}"
+        )
+    return rng.permutation(users) % folds
+
+
+def cross_validate(
+    vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
+) -> Floats:
+    """Fused scores (n,) of vectors (n, m), each learnt without the users of its gallery user's fold.
+
+    `limit` bounds how many impostor vectors are learnt from.
+    """
+    fused = np.empty(len(vectors))
+    genuine = pairs.probe == pairs.gallery
+    assert pairs.fold is not None
+    for fold in range(pairs.fold.max() + 1):
+        judged = pairs.fold[pairs.gallery] == fold
+        learnt = ~judged & (pairs.fold[pairs.probe] != fold)
+        impostors = rng.permutation(np.flatnonzero(learnt & ~genuine))[:limit]
+        rows = np.concatenate([np.flatnonzero(learnt & genuine), np.sort(impostors)])
+        fused[judged] = learner(vectors[rows], genuine[rows], rng)(vectors[judged])
+    return fused
+
+
+def learn_classifier(
+    parameters: ClassifierParameters,
+    vectors: Floats,
+    genuine: Booleans,
+    rng: np.random.Generator,
+) -> Scorer:
+    """A classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
+
+    QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
+    """
+    from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
+
+    vectors = np.nan_to_num(vectors)
+    model = _classifier(parameters, int(rng.integers(2**31)))
+    if parameters.calibrated:
+        model = CalibratedClassifierCV(model, method="sigmoid", cv=3)
+    try:
+        if parameters.classifier == "knn" and parameters.neighbours > len(vectors):
+            raise ValueError(f"{parameters.neighbours} neighbours")
+        model.fit(vectors, genuine)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise BadInput(
+            f"classifier {parameters.classifier} cannot be fitted to {len(vectors)} score vectors "
+            f"({error}); give more users, other matchers, or another classifier"
+        ) from error
+    if parameters.calibrated or parameters.classifier == "logistic":
+        prior = np.log(genuine.sum() / (~genuine).sum())
+        return lambda scores: _log_odds(model.predict_proba(np.nan_to_num(scores))) - prior
+    if parameters.classifier == "knn":
+        return lambda scores: model.predict_proba(np.nan_to_num(scores))[:, 1] - 0.5
+    return lambda scores: model.decision_function(np.nan_to_num(scores))
+
+
+def _log_odds(probabilities: Floats) -> Floats:
+    """Of the second class, from the probabilities (n, 2) of both; finite."""
+    logarithms = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
+    return logarithms[:, 1] - logarithms[:, 0]
+
+
+def _classifier(parameters: ClassifierParameters, seed: int) -> Any:
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.neighbors import KNeighborsClassifier
+    from sklearn.svm import SVC
+
+    match parameters.classifier:
+        case "qda":
+            return QuadraticDiscriminantAnalysis(priors=[0.5, 0.5])
+        case "lda":
+            return LinearDiscriminantAnalysis(priors=[0.5, 0.5])
+        case "knn":
+            return KNeighborsClassifier(parameters.neighbours)
+        case "svm":
+            return SVC(class_weight="balanced", random_state=seed)
+    return LogisticRegression(max_iter=1000)
+
+
+def learn_mixture(
+    parameters: MixtureParameters,
+    components: tuple[int, int],
+    sequence: tuple[int, int],
+    vectors: Floats,
+    genuine: Booleans,
+    rng: np.random.Generator,
+) -> Scorer:
+    """The log-likelihood ratio of two HMMs, eq. 5 with eta 0.
+
+    Args:
+        parameters: how the models are fitted.
+        components: Gaussians per state of the genuine and of the impostor model.
+        sequence: (n, m), what a vector of n * m scores is cut into.
+        vectors: the training scores, (rows, n * m).
+        genuine: (rows,) which of them are of the same user.
+        rng: for the k-means.
+    """
+    models = []
+    for of_class, count in zip((genuine, ~genuine), components, strict=True):
+        is_left_right = parameters.topology == "left-right"
+        how = Fit(
+            count,
+            is_left_right,
+            parameters.covariance_floor,
+            parameters.iterations,
+            parameters.tolerance,
+        )
+        models.append(fit(vectors[of_class].reshape(-1, *sequence), how, rng))
+    same, other = models
+
+    def ratio(scores: Floats) -> Floats:
+        cut = scores.reshape(-1, *sequence)
+        return log_likelihood(same, cut) - log_likelihood(other, cut)
+
+    return ratio
+
+
+def _bind_rule(name: str, topics: Mapping[str, Topic], parameters: RuleParameters) -> list[Bound]:
+    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
+        values = normalise(compared.scores[:, :, chosen], parameters.normalisation)
+        fused = RULES[parameters.rule](values, axis=2)
+        return fused_stream(compared, all_pairs(len(fused)), fused.ravel(), {})
+
+    return _bind(name, topics, parameters, fuse)
+
+
+def _bind_classifier(
+    name: str, topics: Mapping[str, Topic], parameters: ClassifierParameters
+) -> list[Bound]:
+    is_ratio = parameters.calibrated or parameters.classifier in LIKELIHOOD_RATIOS
+
+    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
+        return _learnt(compared, chosen, parameters, partial(learn_classifier, parameters), is_ratio)
+
+    return _bind(name, topics, parameters, fuse)
+
+
+def _bind_mixture(name: str, topics: Mapping[str, Topic], parameters: MixtureParameters) -> list[Bound]:
+    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
+        sequence = _sequence(compared.matchers, chosen, parameters)
+        both = parameters.components_of.get(case)
+        components = (both or parameters.genuine_components, both or parameters.impostor_components)
+        learner = partial(learn_mixture, parameters, components, sequence)
+        return _learnt(compared, chosen, parameters, learner, True)
+
+    return _bind(name, topics, parameters, fuse, parameters.components_of)
+
+
+def _sequence(
+    matchers: tuple[Matcher, ...], chosen: list[int], parameters: MixtureParameters
+) -> tuple[int, int]:
+    """(n, m) of a subset; raises BadInput where its modalities have different numbers of matchers."""
+    modalities = [matchers[index].modality for index in chosen]
+    counts = {modalities.count(each) for each in modalities}
+    if parameters.topology == "joint":
+        return 1, len(chosen)
+    if len(counts) > 1:
+        raise BadInput(
+            f"{', '.join(modalities)}: an HMM needs the same number of matchers of every modality; "
+            'choose another subset, or topology = "joint"'
+        )
+    return len(chosen) // counts.pop(), modalities.count(modalities[0])
+
+
+def _learnt(
+    compared: Comparisons,
+    chosen: list[int],
+    parameters: LearnerParameters,
+    learner: Learner,
+    is_ratio: bool,
+) -> Stream:
+    """The cross-validated fusion of the chosen matchers."""
+    users = len(compared.scores)
+    rng = np.random.default_rng(parameters.seed)
+    fold = user_folds(users, parameters.folds, rng)
+    chosen_pairs = trimmed_pairs(users, rng) if parameters.pairs == "trimmed" else all_pairs(users)
+    pairs = chosen_pairs._replace(fold=fold)
+    scores = _prepared(compared, parameters)[:, :, chosen]
+    vectors = scores[pairs.probe, pairs.gallery]
+    # the problems are small: on a busy machine, threads of the libraries only wait for one another
+    with threadpool_limits(1):
+        fused = cross_validate(vectors, pairs, learner, parameters.impostor_limit, rng)
+    metadata = {"fold_of_user": ",".join(map(str, fold)), "threshold": "0"}
+    if is_ratio:
+        metadata["components"] = LOG_LIKELIHOOD_RATIO
+    return fused_stream(compared, pairs, fused, metadata)
+
+
+def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
+    """Scores (users, users, matchers) in global z units, some modalities as logarithms."""
+    scores = compared.scores
+    if parameters.failures == "missing":
+        scores = np.where(compared.failed, np.nan, scores)
+    known = {matcher.modality for matcher in compared.matchers}
+    for name in parameters.logarithmic:
+        if name not in known:
+            raise BadInput(f"logarithmic: no modality '{name}'; {choices(name, known)}")
+    of_logarithm = [matcher.modality in parameters.logarithmic for matcher in compared.matchers]
+    if np.nanmin(scores[:, :, of_logarithm], initial=0.0) < 0:
+        raise BadInput(
+            f"logarithmic: {', '.join(parameters.logarithmic)} has scores below zero; leave it out"
+        )
+    shifted = np.where(of_logarithm, scores, 0.0)
+    return normalise(np.where(of_logarithm, np.log1p(shifted), scores), "z")
+
+
+def fused_stream(
+    compared: Comparisons, pairs: Pairs, fused: Floats, metadata: Mapping[str, str]
+) -> Stream:
+    """Fused scores (n,) as score vectors of one, in the order of arrival; topic and name come later."""
+    order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
+    return make_stream(
+        "",
+        schemas.SCORE_VECTOR,
+        compared.arrival_ns[pairs.probe[order]],
+        metadata={"components": "score", **metadata},
+        probe_id=pairs.probe[order],
+        gallery_id=pairs.gallery[order],
+        scores=fused[order, None],
+    )
+
+
+def _bind(
+    name: str,
+    topics: Mapping[str, Topic],
+    parameters: Subsets,
+    fuse: Callable[[Comparisons, str, list[int]], Stream],
+    named: Collection[str] = (),
+) -> list[Bound]:
+    """A batch estimator of all chosen subsets; none where the log has no scores to fuse.
+
+    `named` are subsets that other parameters speak of.
+    """
+    if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
+        return []
+    subsets = subsets_of(matchers_of(topics[TOPIC].metadata))
+    for case in (*parameters.subsets, *named):
+        if case not in subsets:
+            raise BadInput(f"estimator {name}: no subset '{case}' of matchers; {choices(case, subsets)}")
+    cases = parameters.subsets or [case for case, chosen in subsets.items() if len(chosen) > 1]
+    if not cases:
+        return []
+
+    def solve(streams: dict[str, Ragged]) -> list[Ragged]:
+        runs = [streams[TOPIC].of_run(run) for run in range(streams[TOPIC].runs)]
+        compared = [comparisons_of(run) for run in runs]
+        users = {len(each.scores) for each in compared}
+        if len(users) > 1:
+            raise BadInput(
+                f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its "
+                "own"
+            )
+        return [
+            gather(
+                [
+                    replace(fuse(each, case, subsets[case]), topic=f"/estimates/{name}/{case}/fused")
+                    for each in compared
+                ]
+            )
+            for case in cases
+        ]
+
+    return [Batch(name, (TOPIC,), (), solve)]
+
+
+RULE = Estimator(
+    "normalise scores and combine them by a rule", NEEDS, RuleParameters, _bind_rule, "rule"
+)
+CLASSIFIER = Estimator(
+    "classify score vectors, cross-validated by user",
+    NEEDS,
+    ClassifierParameters,
+    _bind_classifier,
+    "classifier",
+)
+MIXTURE = Estimator(
+    "likelihood ratio of HMMs with Gaussian mixtures, cross-validated by user",
+    NEEDS,
+    MixtureParameters,
+    _bind_mixture,
+    "topology",
+)

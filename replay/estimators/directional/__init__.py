@@ -1,0 +1,1 @@
+"""Filters of axes, orientations and pairs of angles; begin with `directional`."""

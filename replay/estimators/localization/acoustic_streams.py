@@ -1,0 +1,105 @@
+"""Estimator `shooter:MODE`: where the shots of a log came from, shot by shot (Osborne et al. 2014)."""
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Topic, schemas
+from recorders.models.acoustic import Medium, Noise
+from recorders.parameters import Parameters
+from replay.engine.arrays import Floats
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.channels import numbered
+from replay.engine.streams.measurements import PLANE, read_vectors
+from replay.estimators.localization.acoustic import Detections, Mode, Setting, estimate, parameter_names
+from replay.estimators.localization.solutions import (
+    Batches,
+    batches_of,
+    positive,
+    solution_streams,
+    table_of,
+)
+
+
+class ShooterParameters(Parameters):
+    """What the sensors send, and whether their own positions are estimated too."""
+
+    mode: Mode = Mode.NATIVE_MEASUREMENTS
+    estimate_sensors: bool = True
+    cross_covariances: bool = False
+
+
+HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s")
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> list[Bound]:
+    sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
+    streams = [f"/sensor{s}/detections" for s in sensors]
+    whole = [f"/sensor{s}/position" for s in sensors]
+    if not sensors or not set(whole) <= set(topics):
+        return []
+    worlds = {_world(topics[f"/sensor{s}/detections"]) for s in sensors}
+    if len(worlds) > 1:
+        raise BadInput(
+            f"estimator {name}: the sensors state different noise or air temperature; give all the same"
+        )
+    noise, medium = worlds.pop()
+    setting = Setting(
+        parameters.mode, noise, medium, parameters.estimate_sensors, parameters.cross_covariances
+    )
+    return [Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, setting))]
+
+
+def _world(topic: Topic) -> tuple[Noise, Medium]:
+    return (
+        Noise(*(positive(topic, f"sigma_{field}") for field in Noise._fields)),
+        Medium(*(positive(topic, field) for field in Medium._fields)),
+    )
+
+
+def _solve(name: str, sensors: list[int], setting: Setting, streams: dict[str, Ragged]) -> list[Ragged]:
+    batches, heard = gather_detections(
+        [streams[f"/sensor{s}/detections"] for s in sensors],
+        [streams[f"/sensor{s}/position"] for s in sensors],
+    )
+    components = parameter_names(setting, sensors)
+    return solution_streams(
+        f"/estimates/{name}/shooter", "/shooter/truth", components, batches, estimate(setting, heard)
+    )
+
+
+def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tuple[Batches, Detections]:
+    """Lay out what all sensors heard shot by shot, with the latest fix that each sensor then had."""
+    table = table_of(detections, ["shot_id", *HEARD])
+    batches, shot = batches_of(table, "shot_id", detections[0].runs)
+    heard = np.full((3, len(batches.run), len(detections)), np.nan)
+    heard[:, shot, table["sensor"]] = table[list(HEARD)].T
+    muzzle_blast, shockwave, time_difference = heard
+    places = [_latest(ragged, batches) for ragged in positions]
+    return batches, Detections(muzzle_blast, shockwave, time_difference, np.stack(places, axis=1))
+
+
+def _latest(positions: Ragged, batches: Batches) -> Floats:
+    """The latest fix (batches, 2) of a sensor at the end of each batch, NaN where it had none."""
+    times = positions.stream.publish_time_ns
+    latest = np.full(len(batches.run), -1)
+    for run in np.unique(batches.run):
+        first, end = positions.offsets[run : run + 2]
+        rows = np.flatnonzero(batches.run == run)
+        found = np.searchsorted(times[first:end], batches.time_ns[rows], side="right") - 1
+        latest[rows] = np.where(found < 0, -1, first + found)
+    known = read_vectors(positions.stream, "position_m", PLANE)
+    fixes = np.concatenate([known, np.full((1, 2), np.nan)])
+    return fixes[latest]
+
+
+SHOOTER = Estimator(
+    "where a shot came from; MODE: bearings-only, local-estimates or native-measurements",
+    "per sensor N /sensorN/detections and /sensorN/position",
+    ShooterParameters,
+    _bind,
+    variant="mode",
+)

@@ -1,0 +1,136 @@
+"""Estimators `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
+
+What is solved together, a batch, holds each line of sight once: where a sensor sees a target again the
+next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on one with
+biases, and scheme 3 `los-biases`.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Topic, schemas
+from recorders.models.optical import ANGLES
+from recorders.parameters import Parameters
+from replay.engine.arrays import Floats
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.channels import numbered
+from replay.engine.streams.measurements import check_width
+from replay.estimators.localization.optical import Scene, estimate, parameter_names
+from replay.estimators.localization.solutions import (
+    Batches,
+    batches_of,
+    positive,
+    solution_streams,
+    table_of,
+)
+
+NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/attitude"
+
+
+class PositionsParameters(Parameters):
+    """There are none: all biases are taken as zero."""
+
+
+class BiasesParameters(Parameters):
+    """Biases in deg that are known, such as `sensor_2_roll = 0`; all others are estimated."""
+
+    known_bias_deg: dict[str, float] = {}
+
+
+class Sightings(NamedTuple):
+    """Batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
+
+    batches: Batches
+    targets: list[int]
+    measured: Floats
+
+
+def gather_sightings(streams: list[Ragged]) -> Sightings:
+    """Lay out the lines of sight of all sensors batch by batch."""
+    table = table_of(streams, ["target_id", "azimuth_rad", "elevation_rad"])
+    table["look"] = table.groupby(["run", "sensor", "target_id"]).cumcount()
+    batches, batch = batches_of(table, "look", streams[0].runs)
+    targets, target = np.unique(table["target_id"], return_inverse=True)
+    measured = np.full((len(batches.run), len(targets), len(streams), 2), np.nan)
+    measured[batch, target, table["sensor"]] = table[["azimuth_rad", "elevation_rad"]]
+    return Sightings(batches, targets.tolist(), measured)
+
+
+def _bind(
+    name: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
+) -> list[Bound]:
+    sensors = list(numbered(topics, "sensor", "line_of_sight", schemas.LINE_OF_SIGHT))
+    streams = [f"/sensor{s}/line_of_sight" for s in sensors]
+    whole = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
+    if not sensors or not set(whole) <= set(topics):
+        return []
+    sigma = [
+        [
+            positive(topics[f"/sensor{s}/line_of_sight"], f"sigma_{angle}_rad")
+            for angle in ("azimuth", "elevation")
+        ]
+        for s in sensors
+    ]
+    known = known_biases(sensors, parameters)
+    return [
+        Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, np.array(sigma), known))
+    ]
+
+
+def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
+    """The known biases (sensors, 3) in rad, NaN where wanted."""
+    if not isinstance(parameters, BiasesParameters):
+        return np.zeros((len(sensors), 3))
+    names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]
+    unknown = set(parameters.known_bias_deg) - set(names)
+    if unknown:
+        raise BadInput(f"known_bias_deg: no bias '{min(unknown)}'; there are: {', '.join(names)}")
+    known = [parameters.known_bias_deg.get(name, np.nan) for name in names]
+    return np.radians(known).reshape(-1, 3)
+
+
+def _solve(
+    name: str, sensors: list[int], sigma_rad: Floats, known_rad: Floats, streams: dict[str, Ragged]
+) -> list[Ragged]:
+    position = [_constant(streams[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
+    turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
+    nominal = Rotation.from_quat(turned, scalar_first=True).inv().as_euler("ZYX")
+    scene = Scene(np.array(position), nominal, sigma_rad, known_rad)
+    seen = gather_sightings([streams[f"/sensor{s}/line_of_sight"] for s in sensors])
+    components = parameter_names(scene, seen.targets, sensors)
+    return solution_streams(
+        f"/estimates/{name}", "/truth", components, seen.batches, estimate(scene, seen.measured)
+    )
+
+
+def _constant(ragged: Ragged, field: str, width: int) -> Floats:
+    """The one value (width,) that a stream has in all runs."""
+    check_width(ragged.stream, field, width)
+    values: Floats = ragged[field]
+    if len(values) == 0 or (values != values[:1]).any():
+        raise BadInput(
+            f"topic {ragged.stream.topic}: {field} must be the same in all messages and runs; replay "
+            "logs of other sensors on their own"
+        )
+    return values[0]
+
+
+LOS_POSITIONS = Estimator(
+    "target positions from lines of sight, biases taken as zero: schemes 1 and 2",
+    NEEDS,
+    PositionsParameters,
+    _bind,
+)
+LOS_BIASES = Estimator(
+    "target positions and attitude biases from lines of sight: scheme 3",
+    NEEDS,
+    BiasesParameters,
+    _bind,
+)

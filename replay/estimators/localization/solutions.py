@@ -1,0 +1,104 @@
+"""What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from recorders.errors import BadInput
+from recorders.log import Stream, Topic, make_stream, schemas
+from replay.engine.arrays import Booleans, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.channels import stated
+from replay.engine.streams.failures import reason_stream
+from replay.engine.streams.results import state_stream
+from replay.engine.vectors.components import components_of
+from replay.estimators.localization.least_squares import SENTENCES, Solution
+
+
+class Batches(NamedTuple):
+    """Which measurements are solved together: the run of each batch, in order, and its last stamp."""
+
+    runs: int
+    run: Integers
+    time_ns: Integers
+
+    def ragged(self, stream: Stream, rows: Booleans) -> Ragged:
+        """An output stream with a message for each of these batches."""
+        return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
+
+
+def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
+    """The messages of all sensors in one table: run, sensor (its place among them), time_ns, fields."""
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets)),
+                    "sensor": sensor,
+                    "time_ns": ragged.stream.publish_time_ns,
+                    **{field: ragged[field] for field in fields},
+                }
+            )
+            for sensor, ragged in enumerate(streams)
+        ],
+        ignore_index=True,
+    )
+
+
+def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integers]:
+    """The batches of a table, one for each value of `key` in each run, and which one each row is of.
+
+    A run's batches are in the order of their last stamps, whatever their keys.
+    """
+    groups = table.groupby(["run", key])
+    last = groups["time_ns"].max()
+    run = last.index.get_level_values("run").to_numpy()
+    in_order = np.lexsort((last, run))
+    place = np.argsort(in_order)
+    return Batches(runs, run[in_order], last.to_numpy()[in_order]), place[groups.ngroup()]
+
+
+def solution_streams(
+    topic: str, truth: str, components: Sequence[str], batches: Batches, solution: Solution
+) -> list[Ragged]:
+    """The streams TOPIC/state, TOPIC/solution and TOPIC/failure of one solution for each batch.
+
+    A batch that failed has no state; its failure is one of `SENTENCES`.
+    """
+    found, time_ns = solution.converged, batches.time_ns
+    state = state_stream(
+        f"{topic}/state",
+        time_ns[found],
+        components_of(components),
+        truth,
+        solution.parameters[found],
+        solution.covariance[found],
+    )
+    ended = make_stream(
+        f"{topic}/solution",
+        schemas.SOLUTION,
+        time_ns,
+        metadata={"parameters": str(len(components))},
+        iterations=solution.iterations,
+        converged=found,
+        rank=solution.rank,
+        cost=np.nan_to_num(solution.cost, nan=0.0, posinf=np.finfo(float).max),
+    )
+    failure = reason_stream(
+        f"{topic}/failure", schemas.FAILURE, time_ns[~found], solution.status[~found], SENTENCES.values()
+    )
+    return [
+        batches.ragged(state, found),
+        batches.ragged(ended, np.ones(len(found), bool)),
+        batches.ragged(failure, ~found),
+    ]
+
+
+def positive(topic: Topic, name: str) -> float:
+    """A positive number that the channel's metadata states; raises BadInput where it does not."""
+    value = stated([topic], name)
+    if not 0.0 < value < np.inf:
+        raise BadInput(f"topic {topic.name} states {name} = {value:g}, which must be positive")
+    return value

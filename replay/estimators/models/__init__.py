@@ -1,0 +1,1 @@
+"""Models for every recursive method, one file a system; begin with `landmarks`."""

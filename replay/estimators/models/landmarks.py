@@ -1,0 +1,272 @@
+"""Localization of robots in the plane from odometry and whatever else there is.
+
+Sightings of mapped landmarks, position fixes, poses, headings; a gyro may say how fast the robot turns
+in place of its wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the
+next one. Thrun, Burgard and Fox, Probabilistic Robotics, chapters 3 and 7.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.log import Stream, schemas
+from recorders.models.orientation import heading
+from recorders.models.planar import Components, drive, range_bearing
+from replay.engine.arrays import Floats
+from replay.engine.streams.measurements import PLANE
+from replay.engine.vectors.tangent import Kind
+from replay.inference.all_methods import modelled
+from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor, Start
+
+POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
+LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)
+
+
+class DeadReckoningParameters(ModelParameters):
+    """What odometry errs by; None takes what the log's channels state.
+
+    A noise density is the standard deviation of the readings times the root of the step between them:
+    0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
+    """
+
+    forward_noise_density: NonNegativeFloat | None = None
+    """Noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times the root of the step."""
+    turn_noise_density: NonNegativeFloat | None = None
+    """Noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the root of the step."""
+    forward_scale: float = 1.0
+    """The robot drives so many times what the odometry says."""
+    turn_bias_radps: float = 0.0
+    """The robot turns faster by so much than the odometry says, in rad/s."""
+
+
+class LocalizationParameters(DeadReckoningParameters):
+    """Noise and bias of the sensors.
+
+    Poses and headings that do not state their covariance have `sigma_fix_m` and `sigma_heading_rad`.
+    """
+
+    sigma_heading_rad: PositiveFloat | None = None
+    """Standard deviation, in rad, of a pose's or a heading's angle that does not state it."""
+    sigma_range_m: PositiveFloat | None = None
+    """Standard deviation of a range, in m."""
+    sigma_bearing_rad: PositiveFloat | None = None
+    """Standard deviation of a bearing, in rad."""
+    bias_range_m: float = 0.0
+    """Ranges are too long by so much, in m."""
+    bias_bearing_rad: float = 0.0
+    """Bearings are too large by so much, in rad."""
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
+    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
+
+
+def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
+    """The pose at the end of an arc."""
+    forward, turn = velocity
+    true = parameters.forward_scale * forward, turn + parameters.turn_bias_radps
+    return drive(pose, true, duration_s)
+
+
+def velocity_noise(duration_s: Any, parameters: Any) -> Components:
+    """The mean of white noise over a time T has the variance density^2 / T."""
+    return (
+        parameters.forward_noise_density**2 / duration_s,
+        parameters.turn_noise_density**2 / duration_s,
+    )
+
+
+def sight(pose: Components, place: Components) -> Components:
+    """Range and bearing of a place; NaN on the very spot, where neither has a derivative."""
+    distance, bearing = range_bearing(pose, place)
+    # 0, or NaN where the distance is 0: numba has no np.where for numbers
+    defined = np.minimum(np.inf * (distance > 0.0), 0.0)
+    return distance + defined, bearing + defined
+
+
+def see(pose: Components, landmark: Components, parameters: Any) -> Components:
+    """Range and bearing of a landmark, with the sensor's bias."""
+    distance, bearing = sight(pose, landmark)
+    return distance + parameters.bias_range_m, bearing + parameters.bias_bearing_rad
+
+
+def see_range(pose: Components, landmark: Components, parameters: Any) -> Components:
+    """The range alone."""
+    return (see(pose, landmark, parameters)[0],)
+
+
+def see_bearing(pose: Components, landmark: Components, parameters: Any) -> Components:
+    """The bearing alone."""
+    return (see(pose, landmark, parameters)[1],)
+
+
+def sight_noise(parameters: Any) -> Components:
+    """Variances of range and bearing."""
+    return parameters.sigma_range_m**2, parameters.sigma_bearing_rad**2
+
+
+def range_noise(parameters: Any) -> Components:
+    """Variance of the range."""
+    return (parameters.sigma_range_m**2,)
+
+
+def bearing_noise(parameters: Any) -> Components:
+    """Variance of the bearing."""
+    return (parameters.sigma_bearing_rad**2,)
+
+
+def be_there(pose: Components, about: Any, parameters: Any) -> Components:
+    """The pose itself."""
+    return pose[0], pose[1], pose[2]
+
+
+def pose_noise(parameters: Any) -> Components:
+    """Variances of a pose that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
+
+
+def be_turned(pose: Components, about: Any, parameters: Any) -> Components:
+    """The heading alone."""
+    return (pose[2],)
+
+
+def heading_noise(parameters: Any) -> Components:
+    """Variance of a heading that does not state it."""
+    return (parameters.sigma_heading_rad**2,)
+
+
+def read_pose(stream: Stream) -> Floats:
+    """Poses in the plane (n, 3) of those in space."""
+    return np.column_stack([stream["position_m"][:, :2], heading(stream["quaternion"])])
+
+
+def read_pose_covariance(stream: Stream) -> Floats:
+    """Their covariances (n, 3, 3): x, y and a turn about z, of the frame's axes."""
+    return stream["covariance"].reshape(-1, 6, 6)[:, PLANAR][:, :, PLANAR]
+
+
+def read_heading(stream: Stream) -> Floats:
+    """Headings (n, 1) of orientations."""
+    return heading(stream["quaternion"])[:, None]
+
+
+def read_heading_covariance(stream: Stream) -> Floats:
+    """Their variances (n, 1, 1), which the channel states for all, about x, y and z."""
+    stated = [float(each) for each in stream.metadata.get("covariance_rad2", "nan").split(",")]
+    return np.full((len(stream), 1, 1), stated[-1])
+
+
+def align(
+    path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
+) -> tuple[Floats, Floats] | None:
+    """The pose at the last of some fixes: the path, turned and shifted to them by least squares.
+
+    To the covariance of the solution is added what the odometry errs by: the mean of a random walk over
+    a span, seen from its end, has a third of the variance that it has grown to. None while the heading
+    is less sure than `COURSE_SIGMA_RAD`. See `model.Start`.
+    """
+    weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
+    middle, centre = (np.average(each, axis=0, weights=weight) for each in (path[:, :2], places))
+    a, b = path[:, :2] - middle, places - centre
+    across, along = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)
+    turn = np.arctan2(weight @ across, weight @ along)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    turned = a @ rotation.T
+    arms = turned - turned[-1]
+    rows = np.zeros((len(path), 2, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[:, 0, 2], rows[:, 1, 2] = -arms[:, 1], arms[:, 0]
+    information = np.einsum("kia,kij,kjb->ab", rows, np.linalg.inv(covariances), rows)
+    if np.linalg.matrix_rank(information) < 3:
+        return None
+    covariance = np.linalg.inv(information)
+    densities = parameters.forward_noise_density, parameters.turn_noise_density
+    forward, turning = (density**2 * span_s / 3.0 for density in densities)
+    covariance += np.diag([forward, forward, turning])
+    if covariance[2, 2] > COURSE_SIGMA_RAD**2:
+        return None
+    return np.array([*(centre + turned[-1]), path[-1, 2] + turn]), covariance
+
+
+def read_turn_rate(stream: Stream) -> Floats:
+    """Turn rates about the vertical (n, 1) of a gyro that is mounted upright."""
+    return stream["turn_rate_radps"][:, 2:]
+
+
+COURSE_SIGMA_RAD = 0.1  # of a heading that is good enough to linearise at
+PLANAR = [0, 1, 5]  # x, y and the turn about z among the six of a pose
+RANGE: Mapping[str, Kind] = {"range_m": "linear"}
+BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
+DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps": "linear"}
+SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
+MOTION = Motion(move, control_noise=velocity_noise)
+TURN_RATE = Control("turn_rate", schemas.INERTIAL_SAMPLE, ("turn_radps",), read_turn_rate)
+ODOMETRY = Control(
+    "odometry",
+    schemas.ODOMETRY,
+    ("forward_mps", "turn_radps"),
+    estimates=True,
+    instead=(TURN_RATE,),
+)
+# Of logs that were not made for this model: wheels that slip as an indoor robot's may.
+START = Start(
+    {"x_m": 1000.0, "y_m": 1000.0, "heading_rad": np.pi / np.sqrt(3.0)},
+    {"forward_noise_density": 0.05, "turn_noise_density": 0.05},
+    align,
+)
+ROBOT = Model(
+    "robot pose from odometry, mapped landmarks, fixes and poses",
+    POSE,
+    LocalizationParameters,
+    (
+        Sensor(
+            "range_bearing",
+            schemas.RANGE_BEARING,
+            {**RANGE, **BEARING},
+            see,
+            sight_noise,
+            about=LANDMARKS,
+        ),
+        Sensor("range", schemas.RANGE, RANGE, see_range, range_noise, about=LANDMARKS),
+        Sensor("bearing", schemas.BEARING, BEARING, see_bearing, bearing_noise, about=LANDMARKS),
+        Sensor(
+            "pose",
+            schemas.POSE,
+            POSE,
+            be_there,
+            pose_noise,
+            read=read_pose,
+            covariance=read_pose_covariance,
+            linear=True,
+        ),
+        Sensor(
+            "heading",
+            schemas.ORIENTATION,
+            {"heading_rad": "angle"},
+            be_turned,
+            heading_noise,
+            read=read_heading,
+            covariance=read_heading_covariance,
+            linear=True,
+        ),
+    ),
+    MOTION,
+    control=ODOMETRY,
+    output="pose",
+    estimable={**SIGHT_ERRORS, **DRIVE_ERRORS},
+    start=START,
+)
+RECKONING = Model(
+    "robot pose from odometry alone",
+    POSE,
+    DeadReckoningParameters,
+    (),
+    MOTION,
+    control=ODOMETRY,
+    output="pose",
+    needs_sensor=False,
+    estimable=DRIVE_ERRORS,
+    start=START,
+    takes_fixes=False,
+)
+DEAD_RECKONING = modelled(RECKONING, "ekf")

@@ -1,0 +1,1 @@
+"""Inertial navigation: its model, its sensors, its alignment; begin with `navigation`."""

@@ -1,0 +1,446 @@
+"""Where inertial navigation starts from: levelled at rest, its heading from the course.
+
+Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
+section 5.6: roll and pitch from the specific force, of which gravity is all while nothing accelerates;
+the gyro's bias from what it says at rest; the heading from the first course that is worth one. How well
+each is known the same samples say, unless it is given.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.models.inertial import (
+    EARTH_RATE_RADPS,
+    from_mounting,
+    into_body,
+    into_plane,
+    product,
+    rotation,
+)
+from recorders.models.planar import Components, wrap_angle
+from recorders.models.states import NAVIGATION
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.measurements import SPACE, read_fixes
+from replay.engine.vectors.components import components_of
+from replay.inference.model.model import ModelParameters, Started
+from replay.inference.run.initialization import WIDER
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
+SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
+LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
+USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
+USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
+SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
+PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
+VELOCITY = components_of(NAVIGATION[3:6])
+_NS = 1e-9
+
+
+class AlignmentParameters(ModelParameters):
+    """How the unit is mounted and delayed, and how the state at the start is found.
+
+    Tilt comes from the first `level_s` seconds. The body is assumed to rest until `rest_margin_s`
+    before it first moves faster than `still_mps`. The heading is the course at the first speed above
+    `course_mps`, less the turn of the gyro until then; without such a speed it is unknown. The standard
+    deviations of the start are `start_sigma_m` of the position, `start_sigma_mps` of a velocity that is
+    measured and `unmeasured_sigma_mps` of one that is not, `tilt_sigma_rad`, `heading_sigma_rad`, and
+    those of the biases. Those that are not given come from the data: position and velocity start so
+    uncertain that their first messages, used like any other, decide; the tilt is as uncertain as the
+    accelerometer's bias and the motion make it; the gyro's bias as its mean over the rest; the heading
+    as much as the course of the first `course_s` differs from the turn of the gyro.
+
+    The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
+    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias. A message
+    was measured its topic's delay before its stamp.
+    """
+
+    mounting_roll_rad: float = 0.0
+    mounting_pitch_rad: float = 0.0
+    mounting_yaw_rad: float = 0.0
+    force_scale_x: float = 0.0
+    force_scale_y: float = 0.0
+    force_scale_z: float = 0.0
+    gyro_scale_x: float = 0.0
+    gyro_scale_y: float = 0.0
+    gyro_scale_z: float = 0.0
+    fix_delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    inertial_delay_s: float = 0.0
+    level_s: PositiveFloat = 1.0
+    still_mps: PositiveFloat = 0.2
+    rest_margin_s: NonNegativeFloat = 1.0
+    course_mps: PositiveFloat = 1.0
+    course_s: PositiveFloat = 10.0
+    start_sigma_m: PositiveFloat | None = None
+    start_sigma_mps: PositiveFloat | None = None
+    unmeasured_sigma_mps: PositiveFloat = 10.0
+    tilt_sigma_rad: PositiveFloat | None = None
+    heading_sigma_rad: PositiveFloat | None = None
+    gyro_bias_sigma_radps: PositiveFloat | None = None
+    force_bias_sigma_mps2: PositiveFloat = 0.3
+
+
+class _Samples(NamedTuple):
+    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
+
+    time_ns: Integers
+    force: Floats
+    rate: Floats
+
+
+class _Moving(NamedTuple):
+    """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
+
+    topic: str
+    time_ns: Integers
+    mps: Floats
+    covariance: Floats
+
+    def first_above(self, row: int, limit_mps: float) -> int | None:
+        """The first row from this one on with a greater horizontal speed."""
+        faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
+        return row + int(faster[0]) if len(faster) else None
+
+
+def mounted(sample: Any, parameters: Any) -> Any:
+    """What the unit measures, in the body's axes; three components, or columns of them."""
+    roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
+    return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
+
+
+def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
+    """The specific force of the body by samples of the unit, force and rate, of this bias."""
+    x, y, z = mounted(samples[:3], parameters)
+    sx, sy, sz = parameters.force_scale_x, parameters.force_scale_y, parameters.force_scale_z
+    return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
+
+
+def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
+    """The turn rate of the body, see `specific_force`."""
+    x, y, z = mounted(samples[3:], parameters)
+    sx, sy, sz = parameters.gyro_scale_x, parameters.gyro_scale_y, parameters.gyro_scale_z
+    return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
+
+
+def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
+    """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
+
+    Args:
+        streams: `inertial` samples, `fix`, positions in the plane (east, north, up), and perhaps
+            `velocity`, velocities there.
+        parameters: `AlignmentParameters`.
+
+    Raises BadInput where there is no such fix, no gravity to level by, or numbers of another unit.
+    """
+    samples, topic = _samples(streams["inertial"], parameters), streams["inertial"].topic
+    if "fix" not in streams:
+        raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
+    start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
+    moving, how = _moving(streams, parameters), "levelled, its heading unknown"
+    mean, covariance = np.zeros(16), np.zeros((15, 15))
+    mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
+    covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
+    roll, pitch = _tilt(samples, topic, parameters)
+    tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
+    heading, heading_sigma, bias_sigma = 0.0, np.pi, USUAL_BIAS_RADPS
+    if moving is not None:
+        row = int(np.argmin(np.abs(moving.time_ns - start_ns)))
+        spread = moving.covariance[row]
+        mean[3:6], covariance[3:6, 3:6] = moving.mps[row], _wide(parameters.start_sigma_mps, spread)
+        mean[10:13], bias_sigma = _bias(samples, topic, moving, row, parameters)
+        turning = _turned(samples, start_ns, tilted, mean[10:13])
+        found = _heading(turning, start_ns, moving, row, parameters)
+        if found is not None:
+            heading, heading_sigma = found[0], _given(parameters.heading_sigma_rad, found[1])
+            how = "levelled, its heading the course"
+            how += _mounting(samples, turning, start_ns, moving, tilted, heading, parameters)
+        how += _leap(samples, moving, row, parameters)
+    mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
+    up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
+    covariance[9:12, 9:12] = _given(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
+    unsteadiness_mps2 = _unsteadiness(samples, moving, parameters)
+    tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
+    covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
+    covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
+    return Started(start_ns, mean, covariance, how)
+
+
+def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
+    """What looks wrong in the first samples of a body whose start is known.
+
+    It is what `align` refuses, and only said here: the body may begin in motion.
+
+    Args:
+        streams: see `align`.
+        parameters: `AlignmentParameters`.
+    """
+    topic, found = streams["inertial"].topic, []
+    if not len(streams["inertial"]):
+        return []
+    try:
+        samples = _samples(streams["inertial"], parameters)
+        _tilt(samples, topic, parameters)
+    except BadInput as error:
+        return [str(error)]
+    moving = _moving(streams, parameters)
+    if moving is not None:
+        try:
+            _bias(samples, topic, moving, 0, parameters)
+        except BadInput as error:
+            found.append(str(error))
+        found.append(_leap(samples, moving, 0, parameters).removeprefix("; "))
+    return [each for each in found if each]
+
+
+def _samples(inertial: Stream, parameters: Any) -> _Samples:
+    """The finite samples at the times at which they were measured."""
+    columns = [
+        np.stack(mounted(inertial[name].T, parameters), axis=1)
+        for name in ("specific_force_mps2", "turn_rate_radps")
+        if len(inertial)
+    ]
+    finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
+    if not finite.any():
+        raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
+    time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / _NS)
+    force, rate = (column[finite] for column in columns)
+    return _Samples(time_ns, force, rate)
+
+
+def _given(sigma: float | None, otherwise: Any) -> Any:
+    """A parameter that may not be given, which is None, or NaN among the numbers that a filter has."""
+    return otherwise if sigma is None or np.isnan(sigma) else sigma
+
+
+def _wide(sigma: float | None, covariance: Floats) -> Floats:
+    """The covariance (3, 3) of a start at a message of this one, which is used once more."""
+    given = _given(sigma, None)
+    return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
+
+
+def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
+    """Of the tilt and the accelerometer's bias (6, 6), in the body's axes, where `up` is up.
+
+    Where the tilt's is not given they go together: a bias is levelled away, and the body leans by as
+    much as the bias is of gravity.
+    """
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
+    tilt_sigma = _given(parameters.tilt_sigma_rad, None)
+    if tilt_sigma is not None:
+        covariance[:3, :3] = tilt_sigma**2 * (np.eye(3) - np.outer(up, up))
+        return covariance
+    lean = np.cross(up, np.eye(3)).T / STANDARD_GRAVITY_MPS2
+    covariance[:3, :3] = lean @ (force + unsteadiness_mps2**2 * np.eye(3)) @ lean.T
+    covariance[:3, 3:] = lean @ force
+    covariance[3:, :3] = covariance[:3, 3:].T
+    return covariance
+
+
+def _first_place(
+    fix: Stream, samples: _Samples, topic: str, parameters: Any
+) -> tuple[int, Floats, Floats]:
+    """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
+
+    One in the plane has the height of the origin. Raises BadInput where there is none.
+    """
+    sigma = _given(parameters.sigma_fix_m, USUAL_SIGMA_M)
+    places = read_fixes(fix, "position_m", "covariance_m2", SPACE, sigma)
+    time_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
+    within = (time_ns >= samples.time_ns[0]) & (time_ns <= samples.time_ns[-1])
+    usable = np.flatnonzero(within & np.isfinite(places.value[:, :2]).all(axis=1))
+    if not len(usable):
+        later_s = (time_ns[0] - samples.time_ns[0]) * _NS if len(fix) else np.nan
+        raise BadInput(
+            f"no message of {fix.topic} within the span of {topic}, and it begins "
+            f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
+        )
+    first = usable[0]
+    return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
+
+
+def _moving(streams: Mapping[str, Stream], parameters: Any) -> _Moving | None:
+    """The velocities that are finite; None where there are none."""
+    stream = streams.get("velocity")
+    if stream is None:
+        return None
+    sigma = _given(parameters.sigma_velocity_mps, USUAL_SIGMA_MPS)
+    found = read_fixes(stream, "velocity_mps", "covariance_m2ps2", VELOCITY, sigma)
+    finite = np.isfinite(found.value).all(axis=1)
+    if not finite.any():
+        return None
+    time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / _NS)
+    return _Moving(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
+
+
+def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]:
+    """Roll and pitch, rad, under which the mean of the first specific forces points up.
+
+    Raises BadInput where that is not gravity in m/s2, or points down.
+    """
+    until_ns = samples.time_ns[0] + round(parameters.level_s / _NS)
+    x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
+    length = float(np.sqrt(x * x + y * y + z * z))
+    if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
+        in_g = "; it looks like g: import it with that unit" if 0.8 < length < 1.25 else ""
+        raise BadInput(
+            f"topic {topic}: gravity reads {length:.3g} m/s2 in the first {parameters.level_s:g} s, "
+            f"where it is 9.8{in_g}"
+        )
+    if z < -0.5 * length:
+        raise BadInput(
+            f"topic {topic}: the specific force of the first {parameters.level_s:g} s points down "
+            f"(z = {z:.3g} m/s2): is the unit mounted upside down? mounting_roll_rad=3.14159 turns it"
+        )
+    return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
+
+
+def _unsteadiness(samples: _Samples, moving: _Moving | None, parameters: Any) -> float:
+    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
+
+    It is as much as they differ among themselves, and as the velocity changes meanwhile.
+    """
+    begin_ns = samples.time_ns[0]
+    until_ns = begin_ns + round(parameters.level_s / _NS)
+    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
+    changed = np.zeros(3)
+    if moving is not None:
+        ends = np.interp([begin_ns, until_ns], moving.time_ns, np.arange(len(moving.time_ns)))
+        first, last = np.rint(ends).astype(int)
+        changed = (moving.mps[last] - moving.mps[first]) / parameters.level_s
+    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
+    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
+
+
+def _bias(
+    samples: _Samples, topic: str, moving: _Moving, row: int, parameters: Any
+) -> tuple[Floats, float]:
+    """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
+
+    The means of single stretches of `level_s` differ by noise and unrest; the earth turns too.
+
+    Raises BadInput where it is more than a gyro errs.
+    """
+    moved = moving.first_above(row, parameters.still_mps)
+    end_ns = samples.time_ns[-1] if moved is None else moving.time_ns[moved]
+    at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / _NS)
+    if not at_rest.any():
+        return np.zeros(3), USUAL_BIAS_RADPS
+    bias = samples.rate[at_rest].mean(axis=0)
+    largest = float(np.abs(bias).max())
+    if largest > LARGEST_BIAS_RADPS:
+        raise BadInput(
+            f"topic {topic}: at rest it turns by {largest:.3g} rad/s, more than the error of any gyro; "
+            "it looks "
+            "like deg/s: import it with that unit"
+        )
+    since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * _NS
+    _, stretch, count = np.unique(since_s // parameters.level_s, return_inverse=True, return_counts=True)
+    if len(count) < 3:
+        return bias, USUAL_BIAS_RADPS
+    means = np.stack([np.bincount(stretch, each) for each in samples.rate[at_rest].T]) / count
+    sigma = means.var(axis=1, ddof=1).mean() / len(count)
+    return bias, float(np.sqrt(sigma + EARTH_RATE_RADPS**2))
+
+
+def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
+    """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
+    moved = moving.first_above(row, parameters.still_mps)
+    level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / _NS)
+    if moved is None:
+        return ""
+    change = samples.force - samples.force[level].mean(axis=0)
+    noise = 5.0 * change[level].std(axis=0) + SMALLEST_CHANGE_MPS2
+    sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
+    if not len(sets_off):
+        return ""
+    later_s = float(moving.time_ns[moved] - samples.time_ns[sets_off[0]]) * _NS
+    if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
+        return ""
+    shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
+    return (
+        f"; {moving.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
+        f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
+        f"inertial_delay_s={shift_s:g} moves the unit's"
+    )
+
+
+def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
+    """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
+    since = samples.time_ns >= start_ns
+    since_s = np.asarray((samples.time_ns[since] - start_ns) * _NS, float)
+    up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
+    rate = (samples.rate[since] - bias) @ up
+    return since_s, _integral(rate, since_s)
+
+
+def _integral(values: NDArray, times_s: Floats) -> NDArray:
+    """What values (n,) come to from the first time on, by the trapezoid rule."""
+    from scipy.integrate import cumulative_trapezoid  # which takes long to import
+
+    return np.asarray(cumulative_trapezoid(values, times_s, initial=0.0))
+
+
+def _heading(
+    turning: tuple[Floats, Floats], start_ns: int, moving: _Moving, row: int, parameters: Any
+) -> tuple[float, float] | None:
+    """The heading at the start, rad, and its standard deviation; None where nothing moves.
+
+    It is the first course, less what the body turned about up until then. A body that looks where it
+    goes has the same of all later courses; how much they differ is how far it may be off.
+    """
+    fast = moving.first_above(row, parameters.course_mps)
+    if fast is None:
+        return None
+    until_ns = moving.time_ns[fast] + round(parameters.course_s / _NS)
+    rows = np.arange(fast, np.searchsorted(moving.time_ns, until_ns))
+    rows = rows[np.hypot(*moving.mps[rows, :2].T) > parameters.course_mps]
+    east, north, _ = moving.mps[rows].T
+    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * _NS, *turning)
+    apart = wrap_angle(heading - heading[0])
+    noise = moving.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
+    return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
+
+
+def _mounting(
+    samples: _Samples,
+    turning: tuple[Floats, Floats],
+    start_ns: int,
+    moving: _Moving,
+    tilted: Components,
+    heading: float,
+    parameters: Any,
+) -> str:
+    """What to say where the body accelerates in another direction than its velocity changes.
+
+    Both are compared over the intervals of the velocities, in the plane and as complex numbers.
+    """
+    since_s, turned = turning
+    fast = moving.first_above(0, parameters.course_mps)
+    end_s = (
+        since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * _NS + parameters.course_s
+    )
+    stamps_s = (moving.time_ns - start_ns) * _NS
+    rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
+    if len(rows) < 3:
+        return ""
+    ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
+    gained = _integral((ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s)
+    felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
+    seen = np.diff(moving.mps[rows, 0] + 1j * moving.mps[rows, 1])
+    together = np.vdot(felt, seen)
+    apart = float(np.angle(together))
+    if abs(together) < ALIKE * np.linalg.norm(felt) * np.linalg.norm(seen) or abs(apart) < SIDEWAYS_RAD:
+        return ""
+    yaw = wrap_angle(parameters.mounting_yaw_rad + apart)
+    return (
+        f"; it speeds up {np.degrees(abs(apart)):.0f} deg to the {'left' if apart > 0 else 'right'} of "
+        f"where it seems to: is the unit mounted otherwise? mounting_yaw_rad={yaw:.2f} would fit"
+    )

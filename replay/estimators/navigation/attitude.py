@@ -1,0 +1,193 @@
+"""Orientation of a body that is carried about, from a gyro, an accelerometer and a magnetometer.
+
+The state is the rotation, the gyro's bias, the velocity, and the magnetic field of the place. The
+accelerometer drives the velocity, which stays small: what is carried about does not get away. So gravity
+is told from motion by how long each lasts, as by the average over seconds of Laidig and Seel, "VQF",
+Information Fusion 91, 2023, and its uncertainty is known. The gate keeps out a field that is disturbed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import Stream
+from recorders.models.inertial import into_body, into_plane, product, rotation
+from recorders.models.planar import Components
+from replay.engine.arrays import Booleans, Floats
+from replay.engine.vectors.tangent import Kind
+from replay.estimators.navigation.alignment import STANDARD_GRAVITY_MPS2
+from replay.estimators.navigation.navigation import UNIT as CARRIED
+from replay.estimators.orientation.inertial import triad
+from replay.estimators.orientation.orientation import ORIENTATION
+from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Start, Started
+
+PERIOD_NS = 1_000_000_000
+BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}
+VELOCITY: Mapping[str, Kind] = {f"v{axis}_mps": "linear" for axis in "xyz"}
+PLACE: Mapping[str, Kind] = {"field_north_ut": "linear", "field_up_ut": "linear"}
+FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
+
+
+class AttitudeParameters(ModelParameters):
+    """Noise of the unit and of the body's motion, and the uncertainty at the start.
+
+    Noise densities are per square root of hertz (rad/s and m/s^2) and cover errors of scale while the
+    body moves. Densities of random walks are per square root of a second: of the gyro's bias in rad/s,
+    of the magnetic field in uT. That the velocity is about zero and the field about constant is used
+    once a second, with `sigma_velocity_mps` and `sigma_field_ut`, since their errors last about as
+    long. The body rests for its first `rest_s`. If the unit is silent for longer than `inertial_gap_s`,
+    the body may turn at `gap_turn_radps` meanwhile.
+    """
+
+    gyro_noise_density: NonNegativeFloat = 0.002
+    force_noise_density: NonNegativeFloat = 0.05
+    gyro_bias_density: NonNegativeFloat = 2e-5
+    field_density_ut: NonNegativeFloat = 0.01
+    gravity_mps2: PositiveFloat = STANDARD_GRAVITY_MPS2
+    sigma_velocity_mps: PositiveFloat = 1.0
+    sigma_field_ut: PositiveFloat = 2.0
+    inertial_gap_s: PositiveFloat = 0.1
+    gap_turn_radps: PositiveFloat = 1.0
+    rest_s: PositiveFloat = 1.0
+    start_sigma_rad: PositiveFloat = 0.03
+    gyro_bias_sigma_radps: PositiveFloat = 0.01
+    start_sigma_mps: PositiveFloat = 0.05
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
+
+
+def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """The state after a step with the mean of both ends' samples."""
+    qw, qx, qy, qz, bx, by, bz, vx, vy, vz, north, up = state
+    fx, fy, fz, wx, wy, wz = control
+    half_s = 0.5 * duration_s
+    half = rotation((wx - bx) * half_s, (wy - by) * half_s, (wz - bz) * half_s)
+    middle = product((qw, qx, qy, qz), half)
+    ax, ay, az = into_plane(middle, (fx, fy, fz))
+    qw, qx, qy, qz = product(middle, half)
+    vx, vy = vx + duration_s * ax, vy + duration_s * ay
+    vz = vz + duration_s * (az - parameters.gravity_mps2)
+    return qw, qx, qy, qz, bx, by, bz, vx, vy, vz, north, up
+
+
+def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that a step adds."""
+    turned = parameters.gyro_noise_density**2 * duration_s
+    bias = parameters.gyro_bias_density**2 * duration_s
+    moved = parameters.force_noise_density**2 * duration_s
+    field = parameters.field_density_ut**2 * duration_s
+    return turned, turned, turned, bias, bias, bias, moved, moved, moved, field, field
+
+
+def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that a gap of the unit adds."""
+    turned, moved = (parameters.gap_turn_radps * duration_s) ** 2, parameters.sigma_velocity_mps**2
+    return turned, turned, turned, 0.0, 0.0, 0.0, moved, moved, moved, 0.0, 0.0
+
+
+def velocity(state: Components, about: Any, parameters: Any) -> Components:
+    """The velocity, which is zero on average."""
+    _, _, _, _, _, _, _, vx, vy, vz, _, _ = state
+    return vx, vy, vz
+
+
+def velocity_noise(parameters: Any) -> Components:
+    """The variances of how fast it is carried about."""
+    variance = parameters.sigma_velocity_mps**2
+    return variance, variance, variance
+
+
+def feel_north(state: Components, about: Any, parameters: Any) -> Components:
+    """The magnetic field in the body's axes: that of the place has no part to the east."""
+    qw, qx, qy, qz, _, _, _, _, _, _, north, up = state
+    return into_body((qw, qx, qy, qz), (0.0, north, up))
+
+
+def field_noise(parameters: Any) -> Components:
+    """The variances of a field that is not disturbed."""
+    variance = parameters.sigma_field_ut**2
+    return variance, variance, variance
+
+
+def first_of_periods(stream: Stream) -> Booleans:
+    """Which samples (n,) are the first of a second of the clock, whatever block they come in."""
+    rate_hz = stream.metadata.get("rate_hz")
+    steps_ns = np.diff(stream.publish_time_ns)
+    step_ns = 1e9 / float(rate_hz) if rate_hz else np.median(steps_ns[steps_ns > 0])
+    return stream.publish_time_ns % PERIOD_NS < step_ns
+
+
+def read_velocity(stream: Stream) -> Floats:
+    """No velocity (n, 3), once a period."""
+    return np.where(first_of_periods(stream)[:, None], np.zeros(3), np.nan)
+
+
+def read_field(stream: Stream) -> Floats:
+    """The field (n, 3), once a period."""
+    return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
+
+
+def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
+    """Orientation and field by the means of the rest, in which force is up and the field is north.
+
+    Raises BadInput where there is no magnetometer, or both point the same way.
+    """
+    stream = streams["inertial"]
+    begin_ns = int(stream.publish_time_ns[0])
+    rest = stream.take(stream.publish_time_ns <= begin_ns + round(parameters.rest_s * 1e9))
+    force, field = (
+        np.nanmean(rest[name], axis=0) if np.isfinite(rest[name]).any() else np.full(3, np.nan)
+        for name in ("specific_force_mps2", "magnetic_field_ut")
+    )
+    if not np.isfinite(field).all():
+        raise BadInput(
+            f"topic {stream.topic}: has no magnetic field in its first {parameters.rest_s:g} s, by "
+            "which "
+            "the heading begins; make rest_s longer, or give the log a prior"
+        )
+    with np.errstate(invalid="ignore"):
+        orientation = triad(force, field)
+    if not np.isfinite(orientation).all():
+        raise BadInput(
+            f"topic {stream.topic}: specific force and magnetic field are parallel at the start, which "
+            "determines no heading; give the log a prior"
+        )
+    _, north, up = into_plane(tuple(orientation), tuple(field))
+    mean = np.concatenate([orientation, np.zeros(6), [north, up]])
+    sigma = np.repeat(
+        [
+            parameters.start_sigma_rad,
+            parameters.gyro_bias_sigma_radps,
+            parameters.start_sigma_mps,
+            parameters.sigma_field_ut,
+        ],
+        [3, 3, 3, 2],
+    )
+    return Started(begin_ns, mean, np.diag(sigma**2), "at rest, levelled, north by its magnetometer")
+
+
+UNIT = replace(CARRIED, delay="", estimates=True)  # its own clock is the only one
+ATTITUDE = Model(
+    "orientation of a body with a gyro, an accelerometer and a magnetometer",
+    {**ORIENTATION, **BIAS, **VELOCITY, **PLACE},
+    AttitudeParameters,
+    (
+        Sensor(
+            UNIT.topic,
+            UNIT.schema,
+            VELOCITY,
+            velocity,
+            velocity_noise,
+            read=read_velocity,
+            linear=True,
+        ),
+        Sensor(UNIT.topic, UNIT.schema, FIELD, feel_north, field_noise, read=read_field),
+    ),
+    Motion(move, move_noise, lost=lost),
+    control=UNIT,
+    start=Start({}, find=find),
+    by_name=True,
+)

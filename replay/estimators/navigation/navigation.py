@@ -1,0 +1,212 @@
+"""Inertial navigation, corrected by what a log has of position and velocity.
+
+The state of 15 components, with an inertial unit for its control: position and velocity in a local
+plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro
+and accelerometer. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems,
+2nd edition, 2013, chapter 14; the error of the orientation is one in the body's axes.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.log import Stream, schemas
+from recorders.models.inertial import cross, into_plane, strapdown
+from recorders.models.planar import Components
+from recorders.models.states import NAVIGATION
+from replay.engine.arrays import Floats
+from replay.engine.vectors.components import components_of
+from replay.engine.vectors.tangent import Kind
+from replay.estimators.navigation.alignment import (
+    AlignmentParameters,
+    align,
+    specific_force,
+    suspect,
+    turn_rate,
+)
+from replay.estimators.navigation.sensors import carried_sensors
+from replay.estimators.navigation.turning import WITH_HEADING
+from replay.inference.model.model import Control, Model, Motion, Sensor, Start
+
+LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
+MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
+SCALES: Mapping[str, Kind] = {
+    f"{of}_scale_{axis}": "linear" for of in ("force", "gyro") for axis in "xyz"
+}
+WHEEL: Mapping[str, Kind] = {"wheel_scale": "linear", **{f"axle_{axis}_m": "linear" for axis in "xyz"}}
+STATE = components_of(NAVIGATION)
+POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6])
+
+
+class NavigationParameters(AlignmentParameters):
+    """Noise of the inertial unit and the other sensors, where they are mounted, and gaps.
+
+    Noise densities are per square root of hertz (m/s^2 and rad/s), those of the biases' random walks
+    per square root of a second; the biases are those of the body's axes. The lever arm is the position
+    of the antenna, the axle that of the wheels, both from the unit in the body's axes. The magnetic
+    field is that of the place along east, north, up. Gravity and the rotation of the earth are those of
+    the plane's origin.
+
+    If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes unknown: the body
+    may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
+    """
+
+    force_noise_density: NonNegativeFloat | None = None
+    gyro_noise_density: NonNegativeFloat | None = None
+    force_bias_density: NonNegativeFloat | None = None
+    gyro_bias_density: NonNegativeFloat | None = None
+    origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    origin_altitude_m: float | None = None
+    inertial_gap_s: PositiveFloat = 1.0
+    gap_acceleration_mps2: PositiveFloat = 2.0
+    gap_turn_radps: PositiveFloat = 0.2
+    gap_tilt_rad: PositiveFloat = 0.1
+    lever_x_m: float = 0.0
+    lever_y_m: float = 0.0
+    lever_z_m: float = 0.0
+    axle_x_m: float | None = None
+    axle_y_m: float | None = None
+    axle_z_m: float | None = None
+    wheel_scale: float = 0.0
+    field_east_ut: float | None = None
+    field_north_ut: float | None = None
+    field_up_ut: float | None = None
+    range_delay_s: float = 0.0
+    standing_delay_s: float = 0.0
+    sigma_velocity_mps: PositiveFloat | None = None
+    sigma_heading_rad: PositiveFloat | None = None
+    sigma_height_m: PositiveFloat | None = None
+    sigma_wheel_mps: PositiveFloat | None = None
+    sigma_slip_mps: PositiveFloat = 0.1
+    sigma_standing_mps: PositiveFloat = 0.01
+    sigma_field_ut: PositiveFloat | None = None
+    sigma_range_m: PositiveFloat | None = None
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.9999986
+    gate_reopens_s: PositiveFloat | None = 1.0
+
+
+def read_inertial(stream: Stream) -> Floats:
+    """Specific force and turn rate (n, 6) of inertial samples."""
+    return np.hstack([stream["specific_force_mps2"], stream["turn_rate_radps"]])
+
+
+def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
+    """The state after a step with the mean of both ends' samples."""
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
+    moved = strapdown(
+        (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
+        specific_force(control, (bx, by, bz), parameters),
+        turn_rate(control, (gx, gy, gz), parameters),
+        duration_s,
+        (parameters.origin_latitude_deg, parameters.origin_altitude_m),
+    )
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz = moved
+    return px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz
+
+
+def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that white noise of the samples, and the walks of their biases, add."""
+    force = parameters.force_noise_density**2 * duration_s
+    rate = parameters.gyro_noise_density**2 * duration_s
+    gyro_bias = parameters.gyro_bias_density**2 * duration_s
+    force_bias = parameters.force_bias_density**2 * duration_s
+    placed, moved, turned = (0.0, 0.0, 0.0), (force, force, force), (rate, rate, rate)
+    gyro, accelerometer = (gyro_bias, gyro_bias, gyro_bias), (force_bias, force_bias, force_bias)
+    return placed + moved + turned + gyro + accelerometer
+
+
+def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+    """The variances that a gap of the unit adds: of where it may have gone and turned meanwhile."""
+    speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
+    gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
+    moved = (speed_squared + 0.25 * gained) * duration_s**2
+    tilted = parameters.gap_tilt_rad**2
+    turned = (parameters.gap_turn_radps * duration_s) ** 2
+    return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
+
+
+def position(state: Components, about: Any, parameters: Any) -> Components:
+    """Where the end of the lever arm is."""
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    x, y, z = into_plane((qw, qx, qy, qz), lever)
+    return px + x, py + y, pz + z
+
+
+def velocity(state: Components, samples: Components, parameters: Any) -> Components:
+    """How fast the end of the lever arm moves, which turns with the body."""
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
+    rate = turn_rate(samples, (gx, gy, gz), parameters)
+    lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
+    x, y, z = into_plane((qw, qx, qy, qz), cross(rate, lever))
+    return vx + x, vy + y, vz + z
+
+
+def fix_noise(parameters: Any) -> Components:
+    """The variances of a fix that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
+
+
+def velocity_noise(parameters: Any) -> Components:
+    """The variances of a velocity that does not state them."""
+    variance = parameters.sigma_velocity_mps**2
+    return variance, variance, variance
+
+
+# Of a log that was not made for this model: a small unit that is carried about, somewhere on earth.
+HANDHELD = {
+    "force_noise_density": 0.05,
+    "gyro_noise_density": 0.001,
+    "force_bias_density": 3e-4,
+    "gyro_bias_density": 2e-6,
+    "origin_latitude_deg": 45.0,
+    "origin_altitude_m": 0.0,
+    "axle_x_m": 0.0,
+    "axle_y_m": 0.0,
+    "axle_z_m": 0.0,
+}
+UNIT = Control(
+    "inertial",
+    schemas.INERTIAL_SAMPLE,
+    tuple(f"force_{axis}_mps2" for axis in "xyz") + tuple(f"rate_{axis}_radps" for axis in "xyz"),
+    read_inertial,
+    interpolated=True,
+    gap="inertial_gap_s",
+    delay="inertial_delay_s",
+)
+INERTIAL = Model(
+    "position, velocity and orientation from an inertial unit, and its biases",
+    STATE,
+    NavigationParameters,
+    (
+        Sensor(
+            "fix",
+            schemas.POSITION_FIX,
+            POSITION,
+            position,
+            fix_noise,
+            vector="position_m",
+            covariance="covariance_m2",
+            delay="fix_delay_s",
+        ),
+        Sensor(
+            "velocity",
+            schemas.VELOCITY_FIX,
+            VELOCITY,
+            velocity,
+            velocity_noise,
+            vector="velocity_mps",
+            covariance="covariance_m2ps2",
+            delay="velocity_delay_s",
+            control=UNIT,
+        ),
+        *carried_sensors(UNIT),
+    ),
+    Motion(move, move_noise, lost=lost),
+    control=UNIT,
+    start=Start({}, HANDHELD, find=align, suspect=suspect),
+    correct=WITH_HEADING,
+    estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
+)

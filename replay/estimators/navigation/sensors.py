@@ -1,0 +1,203 @@
+"""What a body may carry beside an inertial unit and GNSS: compass, barometer, wheels, radio tags.
+
+Sensors of the state of `navigation`, each on a topic of its own that a log may lack. Groves, Principles
+of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters 6 and 15.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from recorders.models.inertial import cross, into_body, into_plane
+from recorders.models.orientation import heading
+from recorders.models.planar import Components
+from replay.engine.arrays import Floats
+from replay.estimators.models.ranging import ANCHORS, RANGE, TAGS, distance
+from replay.estimators.navigation.alignment import turn_rate
+from replay.inference.model.model import Control, Sensor
+
+
+def be_headed(state: Components, about: Any, parameters: Any) -> Components:
+    """The direction of the body's forward axis in the plane, from east to north."""
+    _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    east, north, _ = into_plane((qw, qx, qy, qz), (1.0, 0.0, 0.0))
+    return (np.arctan2(north, east),)
+
+
+def be_high(state: Components, about: Any, parameters: Any) -> Components:
+    """The height over the plane's origin."""
+    _, _, pz, _, _, _, _, _, _, _, _, _, _, _, _, _ = state
+    return (pz,)
+
+
+def roll_along(state: Components, samples: Components, parameters: Any) -> Components:
+    """The velocity of the wheels, forward, left, up: they neither slip sideways nor leave the ground."""
+    _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
+    wx, wy, wz = turn_rate(samples, (gx, gy, gz), parameters)
+    axle = parameters.axle_x_m, parameters.axle_y_m, parameters.axle_z_m
+    x, y, z = into_body((qw, qx, qy, qz), (vx, vy, vz))
+    a, b, c = cross((wx, wy, wz), axle)
+    return (1.0 + parameters.wheel_scale) * (x + a), y + b, z + c
+
+
+def stand(state: Components, about: Any, parameters: Any) -> Components:
+    """The velocity, which is zero where the body stands."""
+    _, _, _, vx, vy, vz, _, _, _, _, _, _, _, _, _, _ = state
+    return vx, vy, vz
+
+
+def stay_on_wheels(state: Components, samples: Components, parameters: Any) -> Components:
+    """The velocity of the axle to the left and up, see `roll_along`."""
+    _, left, up = roll_along(state, samples, parameters)
+    return left, up
+
+
+def feel_north(state: Components, about: Any, parameters: Any) -> Components:
+    """The magnetic field in the body's axes."""
+    _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    field = parameters.field_east_ut, parameters.field_north_ut, parameters.field_up_ut
+    return into_body((qw, qx, qy, qz), field)
+
+
+def see_anchor(state: Components, about: Components, parameters: Any) -> Components:
+    """The range of an anchor from a tag on the body, which `about` has behind the anchor."""
+    px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
+    ax, ay, az, tx, ty, tz = about
+    x, y, z = into_plane((qw, qx, qy, qz), (tx, ty, tz))
+    return (distance((px + x, py + y, pz + z), (ax, ay, az)),)
+
+
+def heading_noise(parameters: Any) -> Components:
+    """The variance of a heading."""
+    return (parameters.sigma_heading_rad**2,)
+
+
+def height_noise(parameters: Any) -> Components:
+    """The variance of a height."""
+    return (parameters.sigma_height_m**2,)
+
+
+def wheel_noise(parameters: Any) -> Components:
+    """The variances of a wheel's speed, and of its slip to the side and up."""
+    slip = parameters.sigma_slip_mps**2
+    return parameters.sigma_wheel_mps**2, slip, slip
+
+
+def standing_noise(parameters: Any) -> Components:
+    """The variances of a velocity that is zero."""
+    variance = parameters.sigma_standing_mps**2
+    return variance, variance, variance
+
+
+def slip_noise(parameters: Any) -> Components:
+    """The variances of the slip of wheels, to the side and up."""
+    variance = parameters.sigma_slip_mps**2
+    return variance, variance
+
+
+def field_noise(parameters: Any) -> Components:
+    """The variances of a field that does not state them."""
+    variance = parameters.sigma_field_ut**2
+    return variance, variance, variance
+
+
+def range_noise(parameters: Any) -> Components:
+    """The variance of a range."""
+    return (parameters.sigma_range_m**2,)
+
+
+def read_heading(stream: Stream) -> Floats:
+    """Headings (n, 1) of orientations."""
+    return heading(stream["quaternion"])[:, None]
+
+
+def read_height(stream: Stream) -> Floats:
+    """Heights (n, 1)."""
+    return stream["value"][:, :1]
+
+
+def read_wheels(stream: Stream) -> Floats:
+    """Velocities of the wheels (n, 3): forward as measured, no other."""
+    forward = stream["forward_mps"]
+    return np.stack([forward, np.zeros(len(forward)), np.zeros(len(forward))], axis=1)
+
+
+def read_standing(stream: Stream) -> Floats:
+    """No velocity (n, 3) where the value is not zero, nothing where it is: the body may move."""
+    stands = stream["value"][:, :1] != 0.0
+    return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
+
+
+def read_rolling(stream: Stream) -> Floats:
+    """No velocity to the side and up (n, 2) where the value is not zero, nothing where it is."""
+    return read_standing(stream)[:, :2]
+
+
+def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
+    """The sensors of a body that this inertial unit drives."""
+    return (
+        Sensor(
+            "heading",
+            schemas.ORIENTATION,
+            {"heading_rad": "angle"},
+            be_headed,
+            heading_noise,
+            read=read_heading,
+        ),
+        Sensor(
+            "height",
+            schemas.VECTOR_MEASUREMENT,
+            {"z_m": "linear"},
+            be_high,
+            height_noise,
+            read=read_height,
+            linear=True,
+        ),
+        Sensor(
+            "wheel",
+            schemas.ODOMETRY,
+            {f"{axis}_mps": "linear" for axis in ("forward", "left", "up")},
+            roll_along,
+            wheel_noise,
+            read=read_wheels,
+            control=unit,
+        ),
+        Sensor(
+            "standing",
+            schemas.VECTOR_MEASUREMENT,
+            {f"v{axis}_mps": "linear" for axis in "xyz"},
+            stand,
+            standing_noise,
+            read=read_standing,
+            linear=True,
+            delay="standing_delay_s",
+        ),
+        Sensor(
+            "rolling",
+            schemas.VECTOR_MEASUREMENT,
+            {"left_mps": "linear", "up_mps": "linear"},
+            stay_on_wheels,
+            slip_noise,
+            read=read_rolling,
+            control=unit,
+        ),
+        Sensor(
+            "magnetic_field",
+            schemas.MAGNETIC_FIELD,
+            {f"field_{axis}_ut": "linear" for axis in "xyz"},
+            feel_north,
+            field_noise,
+            vector="magnetic_field_ut",
+            covariance="covariance_ut2",
+        ),
+        Sensor(
+            "ranges",
+            schemas.ANCHOR_RANGE,
+            RANGE,
+            see_anchor,
+            range_noise,
+            about=(ANCHORS, TAGS),
+            delay="range_delay_s",
+        ),
+    )

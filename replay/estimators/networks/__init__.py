@@ -1,0 +1,1 @@
+"""Networks of nodes and robots that share estimates; begin with `networks`."""

@@ -1,0 +1,660 @@
+"""Replay of a sensor network: every node filters with its own sensor and fuses what arrives from others.
+
+Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
+prediction (not x*) with the x* received, by a rule of `covariance_intersection`; update with the own
+measurement again. The log says which message was sent when and where it arrived; what was in it is this
+replay's output, so that one run is replayed with any rule. The state is (positions, velocities).
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.errors import BadInput
+from recorders.log import Topic, schemas
+from recorders.models.constant_velocity import noise_moments
+from recorders.parameters import Parameters
+from replay.distributions import chi2
+from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.channels import numbered
+from replay.engine.streams.priors import gaussians
+from replay.engine.streams.results import ALL_WELL, failures_of, states_in
+from replay.engine.vectors.components import components_of
+from replay.estimators.networks.covariance_intersection import (
+    Estimate,
+    Memory,
+    blend,
+    determinant,
+    fuse_by,
+    inverted,
+    memory_for,
+    one_of,
+    rule_number,
+)
+from replay.inference.linear_algebra.gaussian import coast, copy_gaussian
+
+ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
+Rule = Literal[
+    "alone",
+    "centralised",
+    "naive",
+    "ci-trace",
+    "ci-determinant",
+    "niehsen",
+    "franken",
+    "split-ci",
+    "inverse-ci",
+    "own-again",
+]
+FAILURES = ("a covariance is singular or no longer finite",)
+
+
+class NetworkParameters(Parameters):
+    """The fusion rule, what nodes send, and a node that sends false estimates.
+
+    The rule "alone" fuses nothing, "centralised" is one filter with all sensors and no links, and
+    "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses its measurement a
+    second time. `tolerance` is how exactly weights are optimised.
+
+    A node sends at most once in `send_interval_s`, and only when its estimate differs from its last
+    message by a Kullback-Leibler divergence of `send_divergence` nats. A received estimate is fused if
+    it agrees with the node's own: honest estimates, however correlated, pass that gate with at least
+    `gate_probability`. The node `liar` adds `lie_m` to its estimates after `lie_after_s`.
+    """
+
+    rule: Rule = "ci-trace"
+    tolerance: PositiveFloat = 1e-3
+    send_interval_s: NonNegativeFloat = 0.0
+    send_divergence: NonNegativeFloat = 0.0
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    liar: PositiveInt | None = None
+    lie_m: float = 1.0
+    lie_after_s: NonNegativeFloat = 0.0
+
+
+class Activities(NamedTuple):
+    """Every moment of every node at which it measures, sends or receives, by run, time and node.
+
+    Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
+    measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
+    in which a message was sent, `may_send` says in which activities a node has a chance to send.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    node: Integers
+    measured: Integers
+    received: Integers
+    message: Integers
+    may_send: Booleans
+
+
+class Sensing(NamedTuple):
+    """Measurements in the order of their activities: (k, n), NaN where a component is not measured.
+
+    `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
+    """
+
+    value: Floats
+    sensor: Integers
+    variance: Floats
+    density: Floats
+
+
+class Fusion(NamedTuple):
+    """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
+
+    With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
+    at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
+    squared distance between a prediction and what is heard, infinity where everything is fused. The
+    index `liar` is -1 where there is none.
+    """
+
+    rule: int
+    tolerance: float
+    own_first: bool
+    interval_ns: int
+    divergence: float
+    gate: float
+    liar: int
+    lie_m: float
+    lie_after_ns: int
+
+
+class Nodes(NamedTuple):
+    """What the nodes of one run know, first axis = node.
+
+    Attributes:
+        time_ns: (nodes,), of their estimates.
+        mean, covariance: (nodes, n), (nodes, n, n).
+        said_ns, said_mean, said_covariance: of each node's last message; -1 where there is none.
+    """
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    said_ns: Integers
+    said_mean: Floats
+    said_covariance: Floats
+
+
+class Work(NamedTuple):
+    """What one core works in: the nodes of a run, and what one of them fuses, with weights (most,)."""
+
+    nodes: Nodes
+    parts: Estimate
+    weights: Floats
+    memory: Memory
+
+
+def work_for(nodes: int, most: int, states: int) -> Work:
+    """Memory for so many nodes, of which each fuses so many estimates at most."""
+    square, many = (nodes, states, states), (most, states, states)
+    return Work(
+        Nodes(
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+        ),
+        Estimate(np.empty((most, states)), np.empty(many), np.empty(many)),
+        np.empty(most),
+        memory_for(most, states),
+    )
+
+
+class Results(NamedTuple):
+    """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
+
+    `refused` (m,) says of every message that arrived whether the gate kept it out.
+    """
+
+    mean: Floats
+    covariance: Floats
+    sent_mean: Floats
+    sent_covariance: Floats
+    sent_independent: Floats
+    sent: Booleans
+    refused: Booleans
+
+
+def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
+    """Predict with constant velocity, in place."""
+    coast(mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s))
+
+
+def observe(
+    mean: Floats, covariance: Floats, independent: Floats, value: Floats, variance: Floats
+) -> None:
+    """Update with what is measured, component by component, in place.
+
+    `independent` is the part of the covariance that stems from measurements since it was zero.
+    """
+    size = len(mean)
+    gain, crossed = np.empty(size), np.empty(size)
+    for seen in range(size):
+        if np.isnan(value[seen]):
+            continue
+        spread = covariance[seen, seen] + variance[seen]
+        error = value[seen] - mean[seen]
+        for row in range(size):
+            gain[row] = covariance[row, seen] / spread
+        at = independent[seen, seen]
+        for row in range(size):
+            crossed[row] = independent[seen, row]
+        for row in range(size):
+            mean[row] += gain[row] * error
+            for column in range(size):
+                independent[row, column] += (
+                    gain[row] * gain[column] * (at + variance[seen])
+                    - gain[row] * crossed[column]
+                    - crossed[row] * gain[column]
+                )
+        for row in range(size):
+            for column in range(row + 1):
+                covariance[row, column] -= gain[row] * gain[column] * spread
+                covariance[column, row] = covariance[row, column]
+
+
+def observe_all(
+    activity: int,
+    mean: Floats,
+    covariance: Floats,
+    independent: Floats,
+    activities: Activities,
+    sensing: Sensing,
+) -> None:
+    """Update with all that a node measures in an activity, see `observe`."""
+    for k in range(activities.measured[activity], activities.measured[activity + 1]):
+        variance = sensing.variance[sensing.sensor[k]]
+        observe(mean, covariance, independent, sensing.value[k], variance)
+
+
+def squared_distance(difference: Floats, covariance: Floats) -> float:
+    """The squared Mahalanobis distance; infinity where the covariance is singular."""
+    information = np.empty_like(covariance)
+    if not inverted(covariance, information):
+        return np.inf
+    squared = 0.0
+    for row in range(len(difference)):
+        for column in range(len(difference)):
+            squared += difference[row] * information[row, column] * difference[column]
+    return squared
+
+
+def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
+    """The Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    size = len(mean)
+    information, difference = np.empty_like(covariance), np.empty(size)
+    if not inverted(of_covariance, information):
+        return np.inf
+    total = np.log(determinant(of_covariance) / determinant(covariance)) - size
+    for row in range(size):
+        difference[row] = mean[row] - of_mean[row]
+        for column in range(size):
+            total += information[row, column] * covariance[row, column]
+    return 0.5 * (total + squared_distance(difference, of_covariance))
+
+
+def agrees(mean: Floats, covariance: Floats, heard: Estimate, gate: float) -> bool:
+    """Whether an estimate may be of the same state, however both are correlated.
+
+    The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
+    """
+    if gate == np.inf:
+        return True
+    difference, most = np.empty(len(mean)), np.empty_like(covariance)
+    for row in range(len(mean)):
+        difference[row] = heard.mean[row] - mean[row]
+    blend(2.0, covariance, 2.0, heard.covariance, most)
+    return squared_distance(difference, most) <= gate
+
+
+def follow(
+    run: int,
+    activities: Activities,
+    sensing: Sensing,
+    prior_mean: Floats,
+    prior_covariance: Floats,
+    prior_ns: Integers,
+    fusion: Fusion,
+    results: Results,
+    failed_ns: Integers,
+    work: Work,
+) -> None:
+    """Move the nodes of one run through their activities, until these end or a fusion fails.
+
+    At every time all nodes send first, and then take in what they hear.
+    """
+    nodes, parts, weights, memory = work
+    nodes.time_ns[:], nodes.said_ns[:] = prior_ns[run], -1
+    for node in range(len(nodes.mean)):
+        copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
+    begin, last = activities.offsets[run], activities.offsets[run + 1]
+    while begin < last:
+        now = activities.time_ns[begin]
+        end = begin
+        while end < last and activities.time_ns[end] == now:
+            predict_and_send(end, prior_ns[run], activities, sensing, fusion, nodes, results)
+            end += 1
+        for activity in range(begin, end):
+            node = activities.node[activity]
+            mean, covariance = nodes.mean[node], nodes.covariance[node]
+            heard = hear(activity, activities, sensing, fusion, nodes, parts, results)
+            if heard > 1:
+                rule, tolerance = fusion.rule, fusion.tolerance
+                gap = fuse_by(rule, heard, parts, weights, mean, covariance, tolerance, memory)
+                if not gap < np.inf:
+                    failed_ns[run] = now
+                    return
+            # the independent part is of no use any more
+            observe_all(activity, mean, covariance, parts.independent[0], activities, sensing)
+            copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
+        begin = end
+
+
+def predict_and_send(
+    activity: int,
+    start_ns: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    results: Results,
+) -> None:
+    """Predict a node to now, update x* with its own measurements, and send that where it is due."""
+    node, now = activities.node[activity], activities.time_ns[activity]
+    if now > nodes.time_ns[node]:
+        span_s = (now - nodes.time_ns[node]) * 1e-9
+        move(nodes.mean[node], nodes.covariance[node], sensing.density[node], span_s)
+        nodes.time_ns[node] = now
+    mean, covariance = results.sent_mean[activity], results.sent_covariance[activity]
+    copy_gaussian(nodes.mean[node], nodes.covariance[node], mean, covariance)
+    independent = results.sent_independent[activity]
+    observe_all(activity, mean, covariance, independent, activities, sensing)
+    if not activities.may_send[activity]:
+        return
+    if is_due(node, now, mean, covariance, sensing, fusion, nodes):
+        results.sent[activity], nodes.said_ns[node] = True, now
+        copy_gaussian(mean, covariance, nodes.said_mean[node], nodes.said_covariance[node])
+    if node == fusion.liar and now - start_ns >= fusion.lie_after_ns:
+        mean[0] += fusion.lie_m
+
+
+def is_due(
+    node: int,
+    now: int,
+    mean: Floats,
+    covariance: Floats,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+) -> bool:
+    """Whether x* may be sent again, and differs enough from what the last message says of now."""
+    if nodes.said_ns[node] < 0:
+        return True
+    if now - nodes.said_ns[node] < fusion.interval_ns:
+        return False
+    if fusion.divergence == 0.0:
+        return True
+    said_mean, said_covariance = nodes.said_mean[node].copy(), nodes.said_covariance[node].copy()
+    silent_s = (now - nodes.said_ns[node]) * 1e-9
+    move(said_mean, said_covariance, sensing.density[node], silent_s)
+    return fusion.divergence <= divergence(mean, covariance, said_mean, said_covariance)
+
+
+def hear(
+    activity: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    parts: Estimate,
+    results: Results,
+) -> int:
+    """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
+    node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
+    first, end = activities.received[activity], activities.received[activity + 1]
+    count = 0
+    for i in range(-1, end - first):
+        is_own = i < 0
+        source = activity if is_own else activities.message[first + i]
+        if not is_own and not results.sent[source]:
+            continue
+        mean, covariance = nodes.mean[node], nodes.covariance[node]
+        if not is_own or fusion.own_first:
+            mean, covariance = results.sent_mean[source], results.sent_covariance[source]
+        copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
+        late_s = (now - activities.time_ns[source]) * 1e-9
+        # what was new in a late one others may have passed on
+        new = 1.0 if not is_own and late_s <= 0.0 else 0.0
+        for row in range(size):
+            for column in range(size):
+                own = results.sent_independent[source, row, column]
+                parts.independent[count, row, column] = new * own
+        if late_s > 0.0:
+            move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
+        heard = one_of(parts, count)
+        if is_own or agrees(nodes.mean[node], nodes.covariance[node], heard, fusion.gate):
+            count += 1
+        else:
+            results.refused[first + i] = True
+    return count
+
+
+@cache
+def _compiled() -> Function:
+    return compile_over_runs(follow, allocates=False)
+
+
+def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> Fusion:
+    name, liar = parameters.rule, parameters.liar
+    if liar is not None and liar not in sensors:
+        raise BadInput(
+            f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; name one of them"
+        )
+    rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
+    return Fusion(
+        rule_number(rule),
+        parameters.tolerance,
+        name == TRAP,
+        round(parameters.send_interval_s * 1e9),
+        parameters.send_divergence,
+        float(chi2.ppf(parameters.gate_probability, states)),
+        -1 if liar is None else list(sensors).index(liar),
+        parameters.lie_m,
+        round(parameters.lie_after_s * 1e9),
+    )
+
+
+def message_bytes(name: str, states: int) -> int:
+    """What one message carries: stamp, mean and the covariance's triangle, twice that for split CI."""
+    triangle = states * (states + 1) // 2
+    doubles = {ALONE: 0, "split-ci": 1 + states + 2 * triangle}.get(name, 1 + states + triangle)
+    return 8 * doubles
+
+
+def solve(
+    whole: Mapping[str, Ragged],
+    *,
+    name: str,
+    sensors: Mapping[int, Topic],
+    components: Sequence[str],
+    parameters: NetworkParameters,
+) -> list[Ragged]:
+    """Replay the network, see the module; `sensors` are the topics by node.
+
+    Raises BadInput where a link or the liar names an unknown node, or a message arrives before it was
+    sent.
+    """
+    prior_ns, prior_mean, prior_covariance = gaussians(whole["/prior"])
+    runs, size = prior_mean.shape
+    activities, sensing, arrived = _schedule(whole, sensors, components, prior_ns, parameters.rule)
+    count = len(activities.node)
+    blank = np.full((count, size), np.nan)
+    square = np.full((count, size, size), np.nan)
+    results = Results(
+        blank,
+        square,
+        blank.copy(),
+        square.copy(),
+        np.zeros_like(square),
+        np.zeros(count, bool),
+        np.zeros(len(arrived), bool),
+    )
+    failed_ns = np.full(runs, -1)
+    most = 1 + int(np.diff(activities.received).max(initial=0))
+    _compiled()(
+        runs,
+        activities,
+        sensing,
+        prior_mean,
+        prior_covariance,
+        prior_ns,
+        _fusion(parameters, sensors, size),
+        results,
+        failed_ns,
+        scratch=partial(work_for, len(sensing.density), most, size),
+    )
+    well = np.full_like(failed_ns, ALL_WELL)
+    outputs = [
+        failures_of(f"/estimates/{name}", well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)
+    ]
+    topic, kinds = f"/estimates/{name}", components_of(components)
+    places = [f"node{number}" for number in sensors] if parameters.rule != CENTRALISED else ["centre"]
+    done = np.isfinite(results.mean[:, 0])
+    stamps = activities.time_ns, activities.offsets
+    for node, place in enumerate(places):
+        own = (activities.node == node) & done
+        estimates = ("state", own, "/truth", results.mean, results.covariance)
+        messages = ("sent", own & results.sent, None, results.sent_mean, results.sent_covariance)
+        is_sender = parameters.rule not in (ALONE, CENTRALISED)
+        for leaf, chosen, truth, mean, covariance in [estimates, messages][: 1 + is_sender]:
+            rows, where = np.flatnonzero(chosen), f"{topic}/{place}/{leaf}"
+            outputs.append(states_in(rows, where, *stamps, kinds, truth, mean, covariance))
+    if parameters.gate_probability < 1.0:
+        links, rows = whole["/links"], np.sort(arrived[results.refused])
+        refused = replace(links.stream.take(rows), topic=f"{topic}/refused")
+        outputs.append(Ragged(refused, np.searchsorted(rows, links.offsets)))
+    return outputs
+
+
+def _schedule(
+    whole: Mapping[str, Ragged],
+    sensors: Mapping[int, Topic],
+    components: Sequence[str],
+    prior_ns: Integers,
+    name: str,
+) -> tuple[Activities, Sensing, Integers]:
+    """The activities of all nodes and runs, their measurements, and the rows of what arrives."""
+    numbers = list(sensors)
+    centralised = name == CENTRALISED
+    sensing = _sensing(whole, sensors, components)
+    run, time_ns, node = _events([whole[topic.name] for topic in sensors.values()])
+    if centralised:
+        node = np.zeros_like(node)
+    links = whole["/links"]
+    link_run = np.repeat(np.arange(links.runs), np.diff(links.offsets))
+    ends = {}
+    for end in ("sender_id", "receiver_id"):
+        if not np.isin(links[end], numbers).all():
+            raise BadInput(
+                f"topic /links: {end} names a node that has no topic /nodeN/sensor; record the topic, "
+                "or leave out the link"
+            )
+        ends[end] = np.searchsorted(numbers, links[end])
+    sent_ns, arrival_ns = links.stream.publish_time_ns, links["arrival_time_ns"]
+    if np.any(arrival_ns < sent_ns):
+        raise BadInput(
+            "topic /links: a message arrives before it was sent; correct the clocks of the link"
+        )
+    arrived = links["lost"] == 0
+    if centralised or name == ALONE:
+        arrived = np.zeros(len(links), bool)
+        if centralised:
+            ends = {end: np.zeros_like(ids) for end, ids in ends.items()}
+    events = [
+        np.stack(each)
+        for each in (
+            (run, time_ns, node),
+            (link_run, sent_ns, ends["sender_id"]),
+            (link_run[arrived], arrival_ns[arrived], ends["receiver_id"][arrived]),
+        )
+    ]
+    stacked = np.concatenate(events, axis=1)
+    usable = stacked[1] >= prior_ns[stacked[0]]
+    instants, rank = np.unique(stacked[1], return_inverse=True)
+    keys = (stacked[0] * len(instants) + rank) * len(numbers) + stacked[2]
+    found, activity = np.unique(np.where(usable, keys, -1), return_inverse=True)
+    early = int(found[0] == -1) if len(found) else 0  # what happened before the prior
+    found, activity = found[early:], activity - early
+    moment, node_of = np.divmod(found, len(numbers))
+    run_of, instant = np.divmod(moment, len(instants))
+    cuts = np.cumsum([part.shape[1] for part in events])[:-1]
+    of_measurement, of_send, of_arrival = np.split(activity, cuts)
+    order = np.argsort(of_measurement, kind="stable")
+    order = order[of_measurement[order] >= 0]
+    source = of_send[arrived]
+    received = np.argsort(of_arrival, kind="stable")
+    received = received[source[received] >= 0]
+    sent = np.zeros(len(found), bool)
+    sent[of_send[of_send >= 0]] = True
+    bounds = np.arange(len(found) + 1)
+    return (
+        Activities(
+            np.searchsorted(run_of, np.arange(len(prior_ns) + 1)),
+            instants[instant],
+            node_of,
+            np.searchsorted(of_measurement[order], bounds),
+            np.searchsorted(of_arrival[received], bounds),
+            source[received],
+            sent,
+        ),
+        sensing._replace(value=sensing.value[order], sensor=sensing.sensor[order]),
+        np.flatnonzero(arrived)[received],
+    )
+
+
+def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
+    """Run, stamp and index of the part, of all messages, part by part."""
+    run = [np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts]
+    index = [np.full(len(part), number) for number, part in enumerate(parts)]
+    time_ns = [part.stream.publish_time_ns for part in parts]
+    return np.concatenate(run), np.concatenate(time_ns), np.concatenate(index)
+
+
+def _sensing(
+    whole: Mapping[str, Ragged], sensors: Mapping[int, Topic], components: Sequence[str]
+) -> Sensing:
+    values, index = [], []
+    variance = np.full((len(sensors), len(components)), np.nan)
+    density = np.empty(len(sensors))
+    for number, topic in enumerate(sensors.values()):
+        part = whole[topic.name]
+        try:
+            seen = [components.index(name) for name in topic.metadata["components"].split(",")]
+            variance[number, seen] = np.square([float(x) for x in topic.metadata["sigmas"].split(",")])
+            density[number] = float(topic.metadata["acceleration_density"])
+        except (KeyError, ValueError):
+            raise BadInput(
+                f"topic {topic.name}: the channel's metadata must name components of the state, sigmas "
+                "and acceleration_density"
+            ) from None
+        if part["value"].size != len(part) * len(seen):
+            raise BadInput(
+                f"topic {topic.name}: its values do not have the {len(seen)} components that its "
+                "channel names; name as many as there are"
+            )
+        value = np.full((len(part), len(components)), np.nan)
+        value[:, seen] = part["value"].reshape(len(part), len(seen))
+        values.append(value)
+        index.append(np.full(len(part), number))
+    if not np.all(np.nan_to_num(variance, nan=1.0) > 0):
+        raise BadInput(
+            "a sensor's sigma is not positive, which makes covariances singular; give one above zero"
+        )
+    return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:
+    sensors = numbered(topics, "node", "sensor", schemas.VECTOR_MEASUREMENT)
+    if not sensors or "/links" not in topics or "/prior" not in topics:
+        return []
+    components = state_of(topics["/prior"])
+    read = ("/links", *(topic.name for topic in sensors.values()))
+    work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
+    return [Batch(name, read, ("/prior",), work, {"/prior": components_of(components)})]
+
+
+def state_of(prior: Topic) -> list[str]:
+    """A prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
+
+    Raises BadInput where they are not these.
+    """
+    stated = [name for name in prior.metadata.get("components", "").split(",") if name]
+    positions = [name for name in stated if name.endswith("_m")]
+    components = [*positions, *(f"v{name.removesuffix('_m')}_mps" for name in positions)]
+    if not positions or sorted(components) != sorted(stated):
+        raise BadInput(
+            f"topic {prior.name}: its channel states {', '.join(stated) or 'no components'}; "
+            "positions such as x_m, and for each a velocity such as vx_mps, are needed"
+        )
+    return components
+
+
+NETWORK = Estimator(
+    "nodes that track one target and fuse the estimates they send each other, by any fusion rule",
+    "/prior, /links and, per node, /nodeN/sensor",
+    NetworkParameters,
+    _bind,
+    variant="rule",
+)

@@ -1,0 +1,1 @@
+"""Orientation from inertial and magnetic samples; begin with `orientation`."""

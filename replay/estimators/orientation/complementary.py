@@ -1,0 +1,213 @@
+"""Orientation by the common methods of inertial units: Madgwick's, Mahony's, and Laidig and Seel's VQF.
+
+They are what filters are compared with, and tell no covariance: one is assumed. Madgwick, "An
+efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
+Pflimlin, "Nonlinear Complementary Filters on the Special Orthogonal Group", IEEE Transactions on
+Automatic Control 53(5), 2008; VQF is its authors' library, as it is. Gains and parameters are the
+authors' own. Quaternions turn body vectors into east, north, up; each begins with its first sample.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from recorders.errors import BadInput
+from recorders.log import schemas
+from recorders.models.inertial import cross, into_body, into_plane, product
+from recorders.parameters import Parameters
+from replay.engine.api.functions import batch, each_run
+from replay.engine.api.inputs import Given, Messages, OneRun
+from replay.engine.api.outputs import Estimates, Results
+from replay.engine.arrays import Floats, Integers
+from replay.estimators.orientation.inertial import triad, unit
+from replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
+
+HALF = np.sqrt(0.5)
+
+
+class AssumedParameters(Parameters):
+    """The standard deviation about each axis that is assumed, since the method estimates none."""
+
+    sigma_deg: PositiveFloat = 3.0
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the rotation vector, rad^2, (3, 3)."""
+        return np.radians(self.sigma_deg) ** 2 * np.eye(3)
+
+
+class MadgwickParameters(AssumedParameters):
+    """The gain in rad/s of the gradient's direction; 0.041 is the author's for such a unit."""
+
+    gain: NonNegativeFloat = 0.041
+
+
+class MahonyParameters(AssumedParameters):
+    """The gain of the correction in 1/s, and of the bias in 1/s^2."""
+
+    gain: NonNegativeFloat = 1.0
+    bias_gain: NonNegativeFloat = 0.3
+
+
+class VqfParameters(AssumedParameters):
+    """The time constants in s of its corrections of inclination and of heading."""
+
+    inclination_s: PositiveFloat = 3.0
+    heading_s: PositiveFloat = 9.0
+
+
+class Settings(NamedTuple):
+    """The gains, and the covariance (3, 3) that is assumed."""
+
+    gain: float
+    bias_gain: float
+    covariance: Floats
+
+
+class State(NamedTuple):
+    """What is carried, first axis runs: orientations (runs, 4), zero for none yet; biases; stamps."""
+
+    orientation: Floats
+    bias: Floats
+    time_ns: Integers
+
+
+def start(given: Given[Any]) -> tuple[Settings, State]:
+    """Nothing known."""
+    values = given.parameters
+    settings = Settings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
+    return settings, State(
+        np.zeros((given.runs, 4)), np.zeros((given.runs, 3)), np.zeros(given.runs, int)
+    )
+
+
+def follow_madgwick(
+    run: int, settings: Settings, messages: Messages, state: State, results: Results
+) -> None:
+    """A step of the gyro, and one down the gradient of what force and field contradict."""
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        force, rate, field = unit_vectors(messages.value[row])
+        q = began(run, messages, row, state)
+        duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
+        # the author's north is x, see (46)
+        w, x, y, z = product((HALF, 0.0, 0.0, -HALF), q)
+        across, ahead, up = into_plane((w, x, y, z), field)
+        north = np.sqrt(across * across + ahead * ahead)
+        gravity = (
+            2 * (x * z - w * y) - force[0],
+            2 * (w * x + y * z) - force[1],
+            1 - 2 * (x * x + y * y) - force[2],
+        )
+        a, b, c = gravity
+        d = north * (1 - 2 * (y * y + z * z)) + 2 * up * (x * z - w * y) - field[0]
+        e = 2 * north * (x * y - w * z) + 2 * up * (w * x + y * z) - field[1]
+        f = 2 * north * (w * y + x * z) + up * (1 - 2 * (x * x + y * y)) - field[2]
+        # the transpose of the Jacobians (26) and (33)
+        gw = -2 * y * a + 2 * x * b - 2 * up * y * d + 2 * (up * x - north * z) * e + 2 * north * y * f
+        gx = 2 * z * a + 2 * w * b - 4 * x * c + 2 * up * z * d + 2 * (north * y + up * w) * e
+        gx += 2 * (north * z - 2 * up * x) * f
+        gy = -2 * w * a + 2 * z * b - 4 * y * c - 2 * (2 * north * y + up * w) * d
+        gy += 2 * (north * x + up * z) * e + 2 * (north * w - 2 * up * y) * f
+        gz = 2 * x * a + 2 * y * b + 2 * (up * x - 2 * north * z) * d
+        gz += 2 * (up * y - north * w) * e + 2 * north * x * f
+        length = np.sqrt(gw * gw + gx * gx + gy * gy + gz * gz)
+        gain = settings.gain / length if length > 0.0 else 0.0
+        dw, dx, dy, dz = product((w, x, y, z), (0.0, 0.5 * rate[0], 0.5 * rate[1], 0.5 * rate[2]))
+        w, x = w + duration_s * (dw - gain * gw), x + duration_s * (dx - gain * gx)
+        y, z = y + duration_s * (dy - gain * gy), z + duration_s * (dz - gain * gz)
+        keep(run, messages, row, product((HALF, 0.0, 0.0, HALF), (w, x, y, z)), settings, state, results)
+
+
+def follow_mahony(
+    run: int, settings: Settings, messages: Messages, state: State, results: Results
+) -> None:
+    """A step of the gyro less its bias, turned towards what force and field say, (48)."""
+    bias = state.bias[run]
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        force, rate, field = unit_vectors(messages.value[row])
+        q = began(run, messages, row, state)
+        duration_s = (messages.time_ns[row] - state.time_ns[run]) * 1e-9
+        up = into_body(q, (0.0, 0.0, 1.0))
+        east, north, above = into_plane(q, field)
+        ahead = into_body(q, (0.0, np.sqrt(east * east + north * north), above))
+        a, b = cross(force, up), cross(field, ahead)
+        x, y, z = a[0] + b[0], a[1] + b[1], a[2] + b[2]
+        bias[0] -= settings.bias_gain * x * duration_s
+        bias[1] -= settings.bias_gain * y * duration_s
+        bias[2] -= settings.bias_gain * z * duration_s
+        wx = 0.5 * (rate[0] - bias[0] + settings.gain * x)
+        wy = 0.5 * (rate[1] - bias[1] + settings.gain * y)
+        wz = 0.5 * (rate[2] - bias[2] + settings.gain * z)
+        dw, dx, dy, dz = product(q, (0.0, wx, wy, wz))
+        moved = (
+            q[0] + duration_s * dw,
+            q[1] + duration_s * dx,
+            q[2] + duration_s * dy,
+            q[3] + duration_s * dz,
+        )
+        keep(run, messages, row, moved, settings, state, results)
+
+
+def unit_vectors(value: Floats) -> Any:
+    """The directions of force and field, and the turn rate between them."""
+    return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
+
+
+def began(run: int, messages: Messages, row: int, state: State) -> Any:
+    """The orientation so far; of the first sample that of its force and field."""
+    q = state.orientation[run]
+    if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
+        q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
+        state.time_ns[run] = messages.time_ns[row]
+    return q[0], q[1], q[2], q[3]
+
+
+def keep(
+    run: int, messages: Messages, row: int, q: Any, settings: Settings, state: State, results: Results
+) -> None:
+    """Normalise, carry and tell an orientation."""
+    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for part in range(4):
+        state.orientation[run, part] = q[part] / length
+        results.mean[row, part] = q[part] / length
+    results.covariance[row] = settings.covariance
+    state.time_ns[run] = messages.time_ns[row]
+
+
+def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
+    """The library's estimate of every sample; samples are taken to be evenly spaced.
+
+    Raises BadInput where the library is not installed.
+    """
+    try:
+        from vqf import VQF
+    except ImportError:
+        raise BadInput("estimator vqf needs the package vqf: pip install vqf") from None
+    samples = streams["inertial"]
+    force, rate, field = (np.ascontiguousarray(samples[name]) for name in FIELDS)
+    time_ns = samples.publish_time_ns
+    step_s = float(np.median(np.diff(time_ns))) * 1e-9
+    vqf = VQF(step_s, tauAcc=parameters.inclination_s, tauMag=parameters.heading_s)
+    mean = vqf.updateBatch(rate, force, field)["quat9D"]
+    return Estimates(time_ns, mean, np.tile(parameters.covariance, (len(mean), 1, 1)))
+
+
+MADGWICK = of_inertial_samples(
+    "Madgwick's orientation by gradient descent", MadgwickParameters, start, follow=follow_madgwick
+)
+MAHONY = of_inertial_samples(
+    "Mahony's complementary filter of orientation and bias",
+    MahonyParameters,
+    start,
+    follow=follow_mahony,
+)
+VQF = batch(
+    "VQF of Laidig and Seel, by the package vqf",
+    parameters=VqfParameters,
+    streams={"inertial": schemas.INERTIAL_SAMPLE},
+    whole={},
+    components=ORIENTATION,
+    truth="truth",
+    solve=each_run(solve_vqf),
+)

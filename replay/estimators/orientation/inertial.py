@@ -1,0 +1,451 @@
+"""Orientation from inertial and magnetic samples: dead reckoning, corrected by the Bingham filter.
+
+Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
+
+Made for the BROAD benchmark (Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021). The body rests
+first, which gives the bias of the gyro. Then the accelerometer and the magnetometer are carried to the
+end of a block by the gyro and averaged, which tells gravity from motion; the TRIAD attitude of the
+averages is a quaternion measurement for the filter. Quaternions turn body vectors into east, north, up.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.models.inertial import cross
+from recorders.models.planar import Components
+from replay.distributions.bingham_kernels import (
+    Vector,
+    compose,
+    integrate,
+    local_moments,
+    predict,
+    turn_columns,
+    update,
+)
+from replay.engine.arrays import Floats, Integers
+from replay.engine.compiling.compile import compile_over_runs
+
+_NS = 1e-9
+
+
+class InertialModel(NamedTuple):
+    """What the filter takes for granted, the same for all logs.
+
+    Attributes:
+        rest_s: how long the body rests at the start.
+        block_s: how much time is averaged into one attitude.
+        attitude_sigma_rad: standard deviation of a block's attitude about each axis.
+        drift_sigma_rad: standard deviation of one second's dead reckoning about each axis.
+        gap_s: a longer gap between two samples makes the orientation unknown.
+    """
+
+    rest_s: float = 20.0
+    block_s: float = 1.0
+    attitude_sigma_rad: float = math.radians(10.0)
+    drift_sigma_rad: float = math.radians(0.4)
+    gap_s: float = 0.1
+
+
+class InertialSamples(NamedTuple):
+    """The samples of many runs end to end, in time order: run r owns offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns: (rows,).
+        rate: gyro, rad/s, (rows, 3).
+        force: accelerometer, (rows, 3), any unit: at rest it points up.
+        field: magnetometer, (rows, 3), any unit.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    rate: Floats
+    force: Floats
+    field: Floats
+
+
+class InertialState(NamedTuple):
+    """What the filter carries from sample to sample, first axis runs.
+
+    Attributes:
+        time_ns: of the first sample, the last one, the start of the block, (runs, 3); -1 for none yet.
+        rate_sum: the gyro's sum over the rest (runs, 3).
+        rest_samples: how many samples rate_sum has (runs,).
+        axes: of the Bingham distribution at the start of the block (runs, 4, 4).
+        concentrations: (runs, 4), all 0 while the orientation is unknown.
+        covariance: of its error as a rotation vector in the body's frame, rad^2, (runs, 3, 3).
+        increment: the rotation since, (runs, 4).
+        force: sum over the block, carried to the last sample, (runs, 3).
+        field: the same of the magnetometer, (runs, 3).
+    """
+
+    time_ns: Integers
+    rate_sum: Floats
+    rest_samples: Integers
+    axes: Floats
+    concentrations: Floats
+    covariance: Floats
+    increment: Floats
+    force: Floats
+    field: Floats
+
+
+class OrientationEstimates(NamedTuple):
+    """Per sample: orientation (rows, 4) and covariance of its rotation vector, body frame, (rows, 3, 3).
+
+    NaN while the orientation is unknown, and where a sample is not finite.
+    """
+
+    orientation: Floats
+    covariance: Floats
+
+
+class ReckoningState(NamedTuple):
+    """What dead reckoning carries from sample to sample, first axis runs.
+
+    Attributes:
+        orientation: (runs, 4), zero until the rest is over, NaN after a gap.
+        time_ns: of the first sample and the last one, (runs, 2); -1 for none yet.
+        sums: of gyro, accelerometer and magnetometer over the rest, (runs, 3, 3).
+        rest_samples: how many samples they have (runs,).
+    """
+
+    orientation: Floats
+    time_ns: Integers
+    sums: Floats
+    rest_samples: Integers
+
+
+def start_reckoning(runs: int) -> ReckoningState:
+    """The state before the first sample: nothing known."""
+    none_yet = np.full((runs, 2), -1)
+    return ReckoningState(
+        np.zeros((runs, 4)), none_yet, np.zeros((runs, 3, 3)), np.zeros(runs, np.int64)
+    )
+
+
+def start_inertial_filter(runs: int) -> InertialState:
+    """The state before the first sample: nothing known."""
+    return InertialState(
+        np.full((runs, 3), -1),
+        np.zeros((runs, 3)),
+        np.zeros(runs, np.int64),
+        np.tile(np.eye(4), (runs, 1, 1)),
+        np.zeros((runs, 4)),
+        np.zeros((runs, 3, 3)),
+        np.tile(np.eye(4)[0], (runs, 1)),
+        np.zeros((runs, 3)),
+        np.zeros((runs, 3)),
+    )
+
+
+@cache
+def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
+    return compile_over_runs(run_once, allocates=False)
+
+
+def run_inertial_filter(
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates | None = None,
+) -> tuple[InertialState, OrientationEstimates]:
+    """Go through the samples of an ensemble; returns the state after them and the estimates.
+
+    These are filled into `estimates`, all NaN, where given. Raises BadInput where the columns have
+    different lengths or the model's numbers are not positive.
+    """
+    samples, estimates = _prepared(model, samples, estimates)
+    state = InertialState._make(part.copy() for part in state)
+    _over_runs(_inertial_run)(len(samples.offsets) - 1, model, state, samples, estimates)
+    return state, estimates
+
+
+def run_dead_reckoning(
+    model: InertialModel,
+    state: ReckoningState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates | None = None,
+    *,
+    unbiased: bool,
+) -> tuple[ReckoningState, OrientationEstimates]:
+    """The gyro alone from the attitude of the rest on, less its mean over the rest where `unbiased`.
+
+    There are no estimates before the rest is over, nor after a gap. Args and errors as
+    `run_inertial_filter`.
+    """
+    samples, estimates = _prepared(model, samples, estimates)
+    state = ReckoningState._make(part.copy() for part in state)
+    _over_runs(_reckoning_run)(len(samples.offsets) - 1, model, unbiased, state, samples, estimates)
+    return state, estimates
+
+
+def attitudes(
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
+) -> OrientationEstimates:
+    """The TRIAD attitude of every sample alone: gravity is taken for all that is felt.
+
+    Args and errors as `run_inertial_filter`.
+    """
+    samples, estimates = _prepared(model, samples, estimates)
+    rows = len(samples.force)
+    _over_runs(_attitude)(rows, samples.force, samples.field, estimates.orientation)
+    estimates.covariance[:] = model.attitude_sigma_rad**2 * np.eye(3)
+    return estimates
+
+
+def _prepared(
+    model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
+) -> tuple[InertialSamples, OrientationEstimates]:
+    """Checked samples, and estimates to fill."""
+    rows = int(samples.offsets[-1])
+    if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
+        raise BadInput(
+            "inertial samples: give for each a time, and turn rate, specific force and magnetic field "
+            "of 3 numbers"
+        )
+    if not min(model[1:]) > 0.0 or model.rest_s < 0.0:
+        raise BadInput("block, standard deviations and gap of an inertial filter must be positive")
+    if estimates is None:
+        estimates = OrientationEstimates(np.full((rows, 4), np.nan), np.full((rows, 3, 3), np.nan))
+    return InertialSamples._make(map(np.ascontiguousarray, samples)), estimates
+
+
+def _attitude(row: int, force: NDArray, field: NDArray, orientation: NDArray) -> None:
+    found = triad(force[row], field[row])
+    for part in range(4):
+        orientation[row, part] = found[part]
+
+
+def _reckoning_run(
+    run: int,
+    model: InertialModel,
+    unbiased: bool,
+    state: ReckoningState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+) -> None:
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        _reckon(model, unbiased, state, run, samples, estimates, row)
+
+
+def _reckon(
+    model: InertialModel,
+    unbiased: bool,
+    state: ReckoningState,
+    run: int,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+    row: int,
+) -> None:
+    """Take in one sample; one that is not finite is passed over."""
+    time_ns, rate = samples.time_ns[row], samples.rate[row]
+    force, field = samples.force[row], samples.field[row]
+    if not _all_finite(rate, force, field):
+        return
+    orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
+    if times[0] < 0:
+        times[:] = time_ns
+    duration_s, elapsed_s = (time_ns - times[1]) * _NS, (time_ns - times[0]) * _NS
+    times[1] = time_ns
+    if duration_s > model.gap_s:
+        orientation[:] = np.nan
+    if elapsed_s < model.rest_s:
+        for i in range(3):
+            sums[0, i] += rate[i]
+            sums[1, i] += force[i]
+            sums[2, i] += field[i]
+        state.rest_samples[run] += 1
+        return
+    is_blank = True
+    for i in range(4):
+        is_blank = is_blank and orientation[i] == 0.0
+    if is_blank:
+        orientation[0], orientation[1], orientation[2], orientation[3] = triad(sums[1], sums[2])
+    turn, count = np.empty(3), max(state.rest_samples[run], 1)
+    for i in range(3):
+        turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
+    compose(orientation.copy(), _increment(turn[0], turn[1], turn[2]), orientation)
+    estimates.orientation[row] = orientation
+    variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
+    for i in range(3):
+        for j in range(3):
+            estimates.covariance[row, i, j] = variance if i == j else 0.0
+
+
+def _all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
+    total = 0.0
+    for i in range(3):
+        total += rate[i] + force[i] + field[i]
+    return math.isfinite(total)
+
+
+def _inertial_run(
+    run: int,
+    model: InertialModel,
+    state: InertialState,
+    samples: InertialSamples,
+    estimates: OrientationEstimates,
+) -> None:
+    for row in range(samples.offsets[run], samples.offsets[run + 1]):
+        elapsed_s = _accumulate(model, state, run, samples, row)
+        if elapsed_s >= model.block_s:
+            _end_block(model, state, run, elapsed_s)
+            elapsed_s = 0.0
+        if elapsed_s >= 0.0 and state.concentrations[run, 0] < 0.0:
+            _dead_reckon(model, state, run, elapsed_s, estimates, row)
+
+
+def _accumulate(
+    model: InertialModel, state: InertialState, run: int, samples: InertialSamples, row: int
+) -> float:
+    """Add one sample to the rest and to the block, in place.
+
+    Returns the time (s) since the block's start, or NaN where the sample is not finite and passed over.
+    """
+    time_ns, rate = samples.time_ns[row], samples.rate[row]
+    force, field = samples.force[row], samples.field[row]
+    if not _all_finite(rate, force, field):
+        return math.nan
+    times = state.time_ns[run]
+    duration_s = (time_ns - times[1]) * _NS
+    if times[0] < 0:
+        times[0] = time_ns
+    if times[1] < 0 or duration_s > model.gap_s:
+        duration_s = 0.0
+        state.concentrations[run] = 0.0
+        _start_block(state, run, time_ns)
+    times[1] = time_ns
+    if (time_ns - times[0]) * _NS < model.rest_s:
+        for i in range(3):
+            state.rate_sum[run, i] += rate[i]
+        state.rest_samples[run] += 1
+    else:
+        bias, count = state.rate_sum[run], max(state.rest_samples[run], 1)
+        increment = state.increment[run]
+        step = _increment(
+            (rate[0] - bias[0] / count) * duration_s,
+            (rate[1] - bias[1] / count) * duration_s,
+            (rate[2] - bias[2] / count) * duration_s,
+        )
+        compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
+        _carry(step, state.force[run])
+        _carry(step, state.field[run])
+    for i in range(3):
+        state.force[run, i] += force[i]
+        state.field[run, i] += field[i]
+    return (time_ns - times[2]) * _NS
+
+
+def _start_block(state: InertialState, run: int, time_ns: int) -> None:
+    state.time_ns[run, 2] = time_ns
+    state.increment[run] = 0.0
+    state.increment[run, 0] = 1.0
+    state.force[run] = 0.0
+    state.field[run] = 0.0
+
+
+def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
+    """One prediction over the block and one update with its attitude, in place."""
+    axes, z = state.axes[run], state.concentrations[run]
+    moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
+    if z[0] < 0.0:
+        turn_columns(axes, state.increment[run])
+        _isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
+        integrate(noise, moments, work)
+        _diagonal(moments, work)
+        predict(axes, z, work)
+    attitude = triad(state.force[run], state.field[run])
+    if math.isfinite(attitude[0]):
+        _isotropic(model.attitude_sigma_rad, noise)
+        _diagonal(noise, work)
+        update(axes, z, work, attitude)
+    local_moments(axes, z, moments, work)
+    for i in range(3):
+        for j in range(3):
+            # a small rotation vector is twice the vector part of its quaternion
+            state.covariance[run, i, j] = 4.0 * work[i + 1, j + 1]
+    _start_block(state, run, state.time_ns[run, 1])
+
+
+def _dead_reckon(
+    model: InertialModel,
+    state: InertialState,
+    run: int,
+    elapsed_s: float,
+    estimates: OrientationEstimates,
+    row: int,
+) -> None:
+    """The orientation that the block's increment leads to, and the error that it adds."""
+    increment, covariance = state.increment[run], estimates.covariance[row]
+    compose(state.axes[run, :, 3], increment, estimates.orientation[row])
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = state.covariance[run, i, j]
+    for i in range(3):
+        _carry(increment, covariance[i])
+    for i in range(3):
+        _carry(increment, covariance[:, i])
+        covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
+
+
+def _isotropic(sigma_rad: float, z: NDArray) -> None:
+    """Fill concentrations about the identity, in the order of a quaternion's components."""
+    z[:] = -2.0 / sigma_rad**2
+    z[0] = 0.0
+
+
+def _increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
+    """The quaternion of a rotation vector."""
+    x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = math.sin(angle) / angle if angle > 0.0 else 1.0
+    return math.cos(angle), scale * x, scale * y, scale * z
+
+
+def _carry(turned: Vector, vector: NDArray) -> None:
+    """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
+    w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
+    a, b, c = vector[0], vector[1], vector[2]
+    d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    vector[0] = a + w * d + y * f - z * e
+    vector[1] = b + w * e + z * d - x * f
+    vector[2] = c + w * f + x * e - y * d
+
+
+def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
+    """The orientation under which force points up and field north; NaN where they are parallel."""
+    up = unit(force)
+    east = unit(cross(field, up))
+    north = cross(up, east)
+    # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
+    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
+    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
+    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
+    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
+    column, most = (w, a, b, c), w
+    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
+        if size > most:
+            column, most = other, size
+    w, x, y, z = column
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length
+
+
+def unit(vector: Components) -> Components:
+    """The direction of a vector of three components; NaN where it has none."""
+    x, y, z = vector[0], vector[1], vector[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def _diagonal(values: NDArray, out: NDArray) -> None:
+    out[:] = 0.0
+    for i in range(len(values)):
+        out[i, i] = values[i]

@@ -1,0 +1,1 @@
+"""Guaranteed sets of positions from bounded errors; begin with `set_membership`."""

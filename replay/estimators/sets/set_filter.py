@@ -1,0 +1,384 @@
+"""Guaranteed sets over time: position sets moved by odometry with bounded errors, cut by every frame.
+
+Briechle, Hanebeck (2004) gives the set of one frame of relative bearings, see `set_membership`; moving
+and intersecting sets is the recursion of Schweppe, Recursive State Estimation: Unknown but Bounded
+Errors and System Inputs (1968). Errors of odometry are bounded over a span, not per second: a robot
+that starts late is late once. So each frame cuts the set at an earlier stamp, the anchor, and the set of
+now is moved from there in one go.
+
+A frame and what came before it that contradict each other leave two sets, one of which holds the robot
+if only one of them is wrong; the union is the estimate until later frames have emptied one of the two.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import shapely
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from shapely.geometry.base import BaseGeometry
+
+from recorders.log import Stream, Topic, make_stream, schemas
+from replay.engine.arrays import Floats, Integers
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.channels import given_or_stated
+from replay.engine.streams.failures import reason_stream
+from replay.estimators.sets.feasible_sets import excess_rad, to_blame
+from replay.estimators.sets.moving_sets import (
+    ALL_HEADINGS,
+    Growth,
+    Headings,
+    Motion,
+    Odometry,
+    all_headings_of,
+    common_headings,
+    corners_of,
+    directions,
+    from_rings,
+    moved,
+    odometry_of,
+    relative_pose,
+    to_rings,
+    turned,
+    within_l8,
+)
+from replay.estimators.sets.set_membership import (
+    Frame,
+    Known,
+    SetParameters,
+    fault_stream,
+    frames,
+    known_of,
+    polygons,
+    set_metadata,
+    set_streams,
+)
+
+CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
+FINDINGS = (
+    "the bearings of this frame contradict each other: it is left out",
+    "this frame contradicts what came before it: the sets of both are kept",
+    "this frame contradicts both sets that were kept: they count as one from here on",
+    "the earlier frame that contradicted what came before it was wrong",
+    "what came before the earlier frame that contradicted it was wrong",
+)
+NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
+LEAVES = ("range_bearing", "bearing", "relative_bearing")
+
+
+class SetFilterParameters(SetParameters):
+    """Bounds of the errors; those that are none are what the channels state.
+
+    Over a span of T s the position of the odometry is off by at most `position_error_m` + T
+    `position_error_mps`, seen from the pose at the beginning, and its heading by at most
+    `heading_error_rad` + T `heading_error_radps`. `bearing_bound_rad` is of single bearings, which
+    determine the heading, `bound_deg` of their differences. After `anchor_s` the current set becomes
+    the one that motion is counted from. A part of a set with more than `most_edges` edges is replaced
+    by a larger one of the form L = 8.
+    """
+
+    least_landmarks: Annotated[int, Field(ge=2)] = 2
+    bearing_bound_rad: Annotated[float, Field(gt=0, lt=np.pi)] | None = None
+    position_error_m: NonNegativeFloat | None = None
+    position_error_mps: NonNegativeFloat | None = None
+    heading_error_rad: NonNegativeFloat | None = None
+    heading_error_radps: NonNegativeFloat | None = None
+    anchor_s: PositiveFloat = 5.0
+    most_edges: PositiveInt = 400
+
+
+class Bounds(NamedTuple):
+    """How far odometry and bearings err at most."""
+
+    position: Growth
+    heading: Growth
+    bearing_rad: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Bounds":
+        """From the five numbers of a channel or of parameters, in the order of STATED."""
+        return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
+
+
+ERRORS = ("position_error_m", "position_error_mps", "heading_error_rad", "heading_error_radps")
+STATED = (*ERRORS, "bearing_bound_rad")
+
+
+class Bearings(NamedTuple):
+    """The bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
+
+    place_m: Floats
+    bearing_rad: Floats
+
+
+class Step(NamedTuple):
+    """The estimate at one frame.
+
+    Attributes:
+        time_ns: of the frame.
+        anchor_ns: of the set that this one was moved from; its own stamp where there was none.
+        parts: the set, one part more where two contradict each other.
+        headings: where the heading lies.
+        growth: how many times larger L = 8 made the set.
+        finding: what this frame showed, a number in FINDINGS; None where all is well.
+        blamed: the index of the relative bearing to blame, if any.
+    """
+
+    time_ns: int
+    anchor_ns: int
+    parts: list[BaseGeometry]
+    headings: Headings
+    growth: float = 1.0
+    finding: int | None = None
+    blamed: int | None = None
+
+
+@dataclass
+class Anchor:
+    """What is known of a robot at an earlier stamp; `parts` as in Step."""
+
+    time_ns: int
+    pose: Floats
+    parts: list[BaseGeometry]
+    headings: Headings
+
+
+def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
+    """The motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
+    span_s = float(time_ns[1] - time_ns[0]) * 1e-9
+    *displacement, turn = relative_pose(*poses)
+    return Motion(
+        np.array(displacement), bounds.position.over(span_s), float(turn), bounds.heading.over(span_s)
+    )
+
+
+def narrowed(
+    headings: Headings, places: BaseGeometry, seen: Bearings, bound_rad: float
+) -> Headings | None:
+    """The headings from which landmarks are seen as they were; None where there are none."""
+    left: Headings | None = headings
+    for place, bearing in zip(*seen, strict=True):
+        if left is not None:
+            direction = directions(places, place)
+            half = min(direction.half_rad + bound_rad, np.pi)
+            left = common_headings(left, Headings(direction.middle_rad - bearing, half))
+    return left
+
+
+def follow(
+    found: Iterable[tuple[Frame, Bearings]],
+    odometry: Odometry,
+    bounds: Bounds,
+    parameters: SetFilterParameters,
+) -> list[Step]:
+    """The estimates of one run, from its first frame with a set on."""
+    anchor: Anchor | None = None
+    steps = []
+    for frame, seen in found:
+        pose = odometry.pose_at(np.array([frame.time_ns]))[0]
+        cut = from_rings(polygons(frame.pairs, frame.arena, parameters))
+        if anchor is None:
+            if cut.area > 0.0:
+                step = _first(frame, cut, seen, bounds)
+                anchor = Anchor(frame.time_ns, pose, step.parts, step.headings)
+                steps.append(step)
+            continue
+        step = _advance(anchor, frame, cut, seen, pose, bounds)
+        is_old = step.time_ns - anchor.time_ns >= parameters.anchor_s * 1e9
+        is_cut = step.finding != CONTRADICTS_ITSELF
+        if step.finding in (CONTRADICTS_PAST, UNDECIDED) or (is_old and is_cut):
+            parts = [_simpler(part, parameters.most_edges) for part in step.parts]
+            step = step._replace(parts=parts, growth=_area(parts) / _area(step.parts))
+            anchor = Anchor(frame.time_ns, pose, parts, step.headings)
+        steps.append(step)
+    return steps
+
+
+def _first(frame: Frame, cut: BaseGeometry, seen: Bearings, bounds: Bounds) -> Step:
+    """What a frame says by itself."""
+    headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
+    return Step(frame.time_ns, frame.time_ns, [cut], headings)
+
+
+def _advance(
+    anchor: Anchor, frame: Frame, cut: BaseGeometry, seen: Bearings, pose: Floats, bounds: Bounds
+) -> Step:
+    """The set of an anchor moved to a frame and cut by it; the anchor is cut by the frame as well."""
+    stamps = np.array([anchor.time_ns, frame.time_ns])
+    motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
+    past = [moved(part, anchor.headings, motion) for part in anchor.parts]
+    headings = turned(anchor.headings, motion)
+    step = Step(frame.time_ns, anchor.time_ns, past, headings)
+    if cut.area == 0.0:
+        blamed = to_blame(frame.pairs, frame.arena)
+        first = int(blamed[0]) if len(blamed) else None
+        return step._replace(finding=CONTRADICTS_ITSELF, blamed=first)
+    agreed = _cut(anchor, step, cut, seen, motion, bounds)
+    if agreed is not None:
+        return agreed
+    whole, own = shapely.union_all(past), _first(frame, cut, seen, bounds)
+    return step._replace(
+        parts=[whole, cut],
+        headings=all_headings_of(headings, own.headings),
+        finding=CONTRADICTS_PAST if len(past) == 1 else UNDECIDED,
+        blamed=_contradicting(frame, whole),
+    )
+
+
+def _cut(
+    anchor: Anchor, step: Step, cut: BaseGeometry, seen: Bearings, motion: Motion, bounds: Bounds
+) -> Step | None:
+    """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
+    common = shapely.union_all(step.parts).intersection(cut)
+    if common.area == 0.0:
+        return None
+    headings = narrowed(step.headings, common, seen, bounds.bearing_rad)
+    if headings is None:
+        return None
+    before = common_headings(anchor.headings, turned(headings, motion, -1))
+    if before is None:
+        return None
+    origin = moved(cut, before, motion, -1)
+    held = [part.intersection(origin) for part in anchor.parts]
+    parts = [moved(part, before, motion).intersection(cut) for part in held]
+    alive = [index for index, part in enumerate(parts) if part.area > 0.0]
+    if not alive:
+        return None
+    finding = None
+    if len(alive) < len(parts):
+        finding = FRAME_WRONG if alive == [0] else PAST_WRONG
+    anchor.parts, anchor.headings = [held[index] for index in alive], before
+    return step._replace(parts=[parts[index] for index in alive], headings=headings, finding=finding)
+
+
+def _contradicting(frame: Frame, places: BaseGeometry) -> int | None:
+    """The relative bearing whose bound is exceeded most at the corner of a set that suits it best."""
+    excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
+    best = excess[np.argmin(excess.max(axis=1))]
+    return int(np.argmax(best)) if best.max() > 0.0 else None
+
+
+def _simpler(part: BaseGeometry, most_edges: int) -> BaseGeometry:
+    return within_l8(part) if shapely.get_num_coordinates(corners_of(part)) > most_edges else part
+
+
+def _area(parts: Sequence[BaseGeometry]) -> float:
+    return float(shapely.union_all(parts).area)
+
+
+def frames_with_bearings(
+    stream: Stream, landmarks: Stream, known: Known
+) -> Iterable[tuple[Frame, Bearings]]:
+    """The frames of a stream and the single bearings of each, none of a relative-bearing stream."""
+    places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
+    for frame in frames(stream, landmarks, known):
+        bearings = Bearings(np.empty((0, 2)), np.empty(0))
+        if "bearing_rad" in stream.columns:
+            first, end = np.searchsorted(stream.publish_time_ns, [frame.time_ns, frame.time_ns + 1])
+            rows = [row for row in range(first, end) if int(stream["target_id"][row]) in places]
+            targets = stream["target_id"][rows].tolist()
+            bearings = Bearings(
+                np.array([places[target] for target in targets]), stream["bearing_rad"][rows]
+            )
+        yield frame, bearings
+
+
+def solve(
+    whole: Mapping[str, Ragged],
+    *,
+    name: str,
+    topic: str,
+    odometry: str,
+    truth: str,
+    known: Known,
+    bounds: Bounds,
+    parameters: SetFilterParameters,
+) -> list[Ragged]:
+    """A set at every frame of every run; see `replay.engine.replaying.estimator.Batch`."""
+    metadata = {
+        **set_metadata(topic, truth, known),
+        "odometry": odometry,
+        **dict(
+            zip(STATED, map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad)), strict=True)
+        ),
+    }
+    solved = []
+    for run in range(whole[topic].runs):
+        seen, driven = whole[topic].of_run(run), whole[odometry].of_run(run)
+        velocity = np.stack([driven["forward_mps"], driven["turn_radps"]], axis=1)
+        found = list(frames_with_bearings(seen, whole["/landmarks"].of_run(run), known))
+        steps = follow(found, odometry_of(driven.publish_time_ns, velocity), bounds, parameters)
+        frame_at = {frame.time_ns: frame for frame, _ in found}
+        solved.append(_streams(f"/estimates/{name}", metadata, steps, frame_at))
+    return [gather(streams) for streams in zip(*solved, strict=True)]
+
+
+def _streams(
+    prefix: str, metadata: Mapping[str, str], steps: Sequence[Step], frame_at: Mapping[int, Frame]
+) -> tuple[Stream, ...]:
+    """Sets as `set_membership` gives them, what each rests on, and what was found wrong."""
+    blamed = [(frame_at[step.time_ns], step.blamed) for step in steps if step.blamed is not None]
+    told = [step for step in steps if step.finding is not None]
+    return (
+        *set_streams(
+            prefix, metadata, [(step.time_ns, to_rings(shapely.union_all(step.parts))) for step in steps]
+        ),
+        fault_stream(prefix, blamed),
+        make_stream(
+            f"{prefix}/step",
+            schemas.SET_STEP,
+            np.array([step.time_ns for step in steps], np.int64),
+            metadata=metadata,
+            anchor_time_ns=np.array([step.anchor_ns for step in steps], np.int64),
+            heading_rad=np.array([step.headings.middle_rad for step in steps]),
+            heading_half_width_rad=np.array([step.headings.half_rad for step in steps]),
+            area_growth=np.array([step.growth for step in steps]),
+        ),
+        reason_stream(
+            f"{prefix}/diagnosed",
+            schemas.DIAGNOSED,
+            np.array([step.time_ns for step in told], np.int64),
+            np.array([step.finding for step in told], np.int64),
+            FINDINGS,
+        ),
+    )
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: SetFilterParameters) -> list[Bound]:
+    bound: list[Bound] = []
+    if "/landmarks" not in topics:
+        return bound
+    for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
+        leaf = next((leaf for leaf in LEAVES if f"{prefix}/{leaf}" in topics), None)
+        if leaf is None or f"{prefix}/odometry" not in topics:
+            continue
+        topic, odometry = topics[f"{prefix}/{leaf}"], topics[f"{prefix}/odometry"]
+        stated = [given_or_stated(parameters, [odometry], error) for error in ERRORS]
+        if leaf == "relative_bearing":
+            bearing_rad = np.pi
+        else:
+            bearing_rad = given_or_stated(parameters, [topic], "bearing_bound_rad")
+        work: Any = partial(
+            solve,
+            name=f"{name}{prefix}",
+            topic=topic.name,
+            odometry=odometry.name,
+            truth=f"{prefix}/truth",
+            known=known_of(topic, topics["/landmarks"], parameters),
+            bounds=Bounds.of([*stated, bearing_rad]),
+            parameters=parameters,
+        )
+        bound.append(Batch(f"{name}{prefix}", (topic.name, odometry.name), ("/landmarks",), work))
+    return bound
+
+
+SET_FILTER = Estimator(
+    "guaranteed sets of positions over time, moved by odometry with bounded errors: exact, box, l4, l8",
+    "/landmarks and, per robot, .../odometry and one of .../range_bearing, bearing, relative_bearing",
+    SetFilterParameters,
+    _bind,
+    variant="shape",
+)

@@ -1,0 +1,298 @@
+"""Guaranteed position fixes from bounded relative bearings, one set per frame of one stamp.
+
+Briechle, Hanebeck (2004). The estimate is the set itself: the exact one, its tightest box, or the
+pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative bearing to blame is
+repeated on the fault's topic.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from recorders.errors import BadInput
+from recorders.log import Stream, Topic, make_stream, schemas
+from recorders.models.planar import wrap_angle
+from recorders.parameters import Parameters
+from replay.engine.arrays import Floats, Integers
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.measurements import PLANE, read_vectors
+from replay.estimators.sets.feasible_sets import (
+    Arena,
+    Pairs,
+    arena_around,
+    box,
+    exact_set,
+    make_pairs,
+    rings,
+    to_blame,
+)
+from replay.estimators.sets.pseudo_ellipsoids import Weighting, fit, outline
+
+LEAVES = ("relative_bearing", "range_bearing", "bearing")
+
+
+class SetParameters(Parameters):
+    """The form of the sets, and the bounds they come from; a bound that is none is the log's.
+
+    Bearings of one stamp give all their pairs. The arena is (low x, low y, high x, high y). Without
+    one, a robot is no farther from a landmark that it sees than `maximum_range_m`; without that either,
+    no farther than the longest range that its sensor measured.
+    """
+
+    shape: Literal["exact", "box", "l4", "l8"] = "exact"
+    bound_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
+    weighting: Weighting = "area"
+    sweeps: PositiveInt = 1
+    least_landmarks: Annotated[int, Field(ge=2)] = 3
+    arena_m: tuple[float, float, float, float] | None = None
+    maximum_range_m: PositiveFloat | None = None
+
+
+class Known(NamedTuple):
+    """What is known beside the bearings: their bound, and where the robot can be.
+
+    `arena_m` is (low x, low y, high x, high y). None where it follows from the sensor's maximum range,
+    which is None where that is the longest that it measured.
+    """
+
+    bound_rad: float
+    least_landmarks: int
+    arena_m: tuple[float, ...] | None
+    maximum_range_m: float | None
+
+    def metadata(self) -> dict[str, str]:
+        """As a channel states it."""
+        return {name: json.dumps(value) for name, value in self._asdict().items()}
+
+    @classmethod
+    def of(cls, metadata: Mapping[str, str]) -> "Known":
+        """What a channel states."""
+        return cls(*(json.loads(metadata[name]) for name in cls._fields))
+
+
+class Frame(NamedTuple):
+    """The relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
+
+    time_ns: int
+    pairs: Pairs
+    numbers: Integers
+    arena: Arena
+
+
+def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
+    """The frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
+
+    What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
+    where nothing says how far the robot can be from what it sees.
+    """
+    places_m = read_vectors(landmarks, "position_m", PLANE)
+    place_of = dict(zip(landmarks["landmark_id"].tolist(), places_m, strict=True))
+    range_m = _maximum_range_m(stream, known) if known.arena_m is None else np.inf
+    cuts = np.flatnonzero(np.diff(stream.publish_time_ns)) + 1
+    for rows in np.split(np.arange(len(stream)), cuts):
+        if "angle_rad" in stream.columns:
+            numbers = np.stack([stream["first_id"][rows], stream["second_id"][rows]], axis=1)
+            angle = stream["angle_rad"][rows]
+        else:
+            first, second = np.triu_indices(len(rows), 1)
+            targets, bearing = stream["target_id"][rows], stream["bearing_rad"][rows]
+            numbers = np.stack([targets[first], targets[second]], axis=1)
+            angle = wrap_angle(bearing[first] - bearing[second])
+        mapped = np.isin(numbers, list(place_of)).all(axis=1) & (numbers[:, 0] != numbers[:, 1])
+        numbers, angle = numbers[mapped].astype(np.int64), angle[mapped]
+        if len(np.unique(numbers)) < known.least_landmarks:
+            continue
+        places = np.array([place_of[number] for number in numbers.ravel().tolist()])
+        pairs = make_pairs(places[0::2], places[1::2], angle, known.bound_rad)
+        arena = _arena(known.arena_m) if known.arena_m else _within(places, range_m)
+        yield Frame(int(stream.publish_time_ns[rows[0]]), pairs, numbers, arena)
+
+
+def _maximum_range_m(stream: Stream, known: Known) -> float:
+    """How far the sensor sees: as stated, else the longest range that it measured."""
+    if known.maximum_range_m is not None:
+        return known.maximum_range_m
+    if "range_m" not in stream.columns:
+        raise BadInput(
+            f"topic {stream.topic}: nothing bounds the robot's position: the topic has no ranges and "
+            "states no maximum_range_m, and /landmarks states no arena_m; give "
+            "--set maximum_range_m=... or --set arena_m=[LOW_X,LOW_Y,HIGH_X,HIGH_Y]"
+        )
+    return float(stream["range_m"].max(initial=0.0))
+
+
+def _arena(corners_m: tuple[float, ...]) -> Arena:
+    return Arena(np.array(corners_m[:2]), np.array(corners_m[2:]))
+
+
+def _within(places: Floats, range_m: float) -> Arena:
+    """The rectangle no farther than a range from any of the places (n, 2).
+
+    Where there is none one landmark is misidentified, and the robot no farther from one of them.
+    """
+    low, high = places.max(axis=0) - range_m, places.min(axis=0) + range_m
+    return Arena(low, high) if np.all(low < high) else arena_around(places, range_m)
+
+
+def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floats]:
+    """The border of the chosen set of one frame; none where it is empty."""
+    if parameters.shape in ("l4", "l8"):
+        order: Literal[4, 8] = 4 if parameters.shape == "l4" else 8
+        try:
+            fused = fit(pairs, arena, order, parameters.weighting, parameters.sweeps)
+        except BadInput:  # no common point: an empty set
+            return []
+        return outline(fused, arena).rings
+    border = exact_set(pairs, arena)
+    if len(border.length) == 0 or parameters.shape == "exact":
+        return rings(border)
+    (low_x, low_y), (high_x, high_y) = box(border)
+    return [np.array([[low_x, low_y], [high_x, low_y], [high_x, high_y], [low_x, high_y]])]
+
+
+def solve(
+    whole: Mapping[str, Ragged],
+    *,
+    name: str,
+    topic: str,
+    truth: str,
+    known: Known,
+    parameters: SetParameters,
+) -> list[Ragged]:
+    """A set for every frame of every run; see `replay.engine.replaying.estimator.Batch`."""
+    metadata = set_metadata(topic, truth, known)
+    landmarks, seen = whole["/landmarks"], whole[topic]
+    solved = []
+    for run in range(seen.runs):
+        found = frames(seen.of_run(run), landmarks.of_run(run), known)
+        borders = [(frame, polygons(frame.pairs, frame.arena, parameters)) for frame in found]
+        blamed = [
+            (frame, int(pair))
+            for frame, border in borders
+            if not border
+            for pair in to_blame(frame.pairs, frame.arena)[:1]
+        ]
+        prefix, rings_of = f"/estimates/{name}", [(frame.time_ns, border) for frame, border in borders]
+        solved.append((*set_streams(prefix, metadata, rings_of), fault_stream(prefix, blamed)))
+    return [gather(streams) for streams in zip(*solved, strict=True)]
+
+
+def set_metadata(topic: str, truth: str, known: Known) -> dict[str, str]:
+    """What sets say of themselves: of which components, beside which truth, from which frames."""
+    return {
+        "components": "x_m,y_m",
+        "kinds": "linear,linear",
+        "truth": truth,
+        "measured": topic,
+        **known.metadata(),
+    }
+
+
+def set_streams(
+    prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
+) -> tuple[Stream, Stream]:
+    """The sets of a run, by stamp the borders of each, and how many vertices each has."""
+
+    def whole(numbers: Iterable[int]) -> Integers:
+        return np.fromiter(numbers, np.int64)
+
+    rings_of = [(time_ns, *each) for time_ns, found in borders for each in enumerate(found)]
+    lengths = whole(len(ring) for *_, ring in rings_of)
+    return (
+        make_stream(
+            f"{prefix}/set",
+            schemas.SET_ESTIMATE,
+            np.repeat(whole(time_ns for time_ns, *_ in rings_of), lengths),
+            metadata=metadata,
+            ring_id=np.repeat(whole(number for _, number, _ in rings_of), lengths),
+            vertex=np.concatenate([np.empty((0, 2)), *(ring for *_, ring in rings_of)]),
+        ),
+        make_stream(
+            f"{prefix}/size",
+            schemas.ESTIMATE_SIZE,
+            whole(time_ns for time_ns, _ in borders),
+            metadata=metadata,
+            elements=whole(sum(map(len, found)) for _, found in borders),
+        ),
+    )
+
+
+def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
+    """The relative bearings that are to blame for empty sets, by the frame and its pair."""
+    pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
+    return make_stream(
+        f"{prefix}/fault",
+        schemas.RELATIVE_BEARING,
+        np.array([frame.time_ns for frame, _ in blamed], np.int64),
+        metadata={"purpose": "the set is empty; this relative bearing is to blame"},
+        first_id=pairs[:, 0],
+        second_id=pairs[:, 1],
+        angle_rad=np.array([frame.pairs.angle_rad[pair] for frame, pair in blamed]),
+    )
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> list[Bound]:
+    bound: list[Bound] = []
+    if "/landmarks" not in topics:
+        return bound
+    for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
+        leaf = next((leaf for leaf in LEAVES if f"{prefix}/{leaf}" in topics), None)
+        if leaf is None:
+            continue
+        topic = topics[f"{prefix}/{leaf}"]
+        work: Any = partial(
+            solve,
+            name=f"{name}{prefix}",
+            topic=topic.name,
+            truth=f"{prefix}/truth",
+            known=known_of(topic, topics["/landmarks"], parameters),
+            parameters=parameters,
+        )
+        bound.append(Batch(f"{name}{prefix}", (topic.name,), ("/landmarks",), work))
+    return bound
+
+
+def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
+    """What the parameters say and, where they do not, the channels' metadata."""
+    bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
+    arena_m: tuple[float, ...] | None = parameters.arena_m
+    if arena_m is None and "arena_m" in landmarks.metadata:
+        arena_m = _numbers(landmarks, "arena_m")
+    if arena_m is not None and not (len(arena_m) == 4 and np.all(np.less(arena_m[:2], arena_m[2:]))):
+        raise BadInput(
+            f"an arena of {arena_m} m; give low x, low y, high x, high y with --set arena_m=[...] "
+            f"or in the metadata of {landmarks.name}"
+        )
+    range_m = parameters.maximum_range_m
+    if range_m is None and "maximum_range_m" in topic.metadata:
+        range_m = _numbers(topic, "maximum_range_m")[0]
+    if bound_rad is None and "bound_rad" in topic.metadata:
+        bound_rad = _numbers(topic, "bound_rad")[0]
+    if bound_rad is None:
+        raise BadInput(f"topic {topic.name} does not state bound_rad; give it with --set bound_deg=...")
+    return Known(bound_rad, parameters.least_landmarks, arena_m, range_m)
+
+
+def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
+    """Finite numbers, with commas between, that a channel states."""
+    try:
+        numbers = tuple(float(part) for part in topic.metadata[name].split(","))
+    except ValueError:
+        numbers = (np.nan,)
+    if not np.isfinite(numbers).all():
+        raise BadInput(f"topic {topic.name}: {name} is '{topic.metadata[name]}'; numbers are needed")
+    return numbers
+
+
+SET_MEMBERSHIP = Estimator(
+    "guaranteed sets of positions from bounded relative bearings: exact, box, l4, l8",
+    "/landmarks and one of .../relative_bearing, range_bearing, bearing",
+    SetParameters,
+    _bind,
+    variant="shape",
+)

@@ -1,0 +1,4 @@
+"""Trackers of many targets: scans, detections, reports, and the PHD filter.
+
+Begin with `tracker`.
+"""

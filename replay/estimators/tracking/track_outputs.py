@@ -1,0 +1,165 @@
+"""What a tracker puts out: the tracks after every scan, associations, innovations, what was not used."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import reason_stream
+from replay.engine.streams.results import innovation_stream, named
+from replay.estimators.tracking.scan_sensors import KINDS
+from replay.estimators.tracking.scans import Found
+from replay.inference.association.scanning import Scans
+from replay.inference.association.tracking import Told
+from replay.inference.association.tracks import NEVER
+from replay.inference.model.stage import Stage
+
+UNUSED = (
+    "there is no room for more tracks; give --set most_tracks=...",
+    "the scan came after a younger one; give --late rewind:SECONDS",
+)
+
+
+def track_outputs(
+    name: str, found: Found, stage: Stage, scans: Scans, told: Told, *, repeated: int = 0
+) -> list[Ragged]:
+    """The streams of the tracker `name` for these scans.
+
+    `repeated` is how many scans after a late one, the last of which these are of, were used again.
+    """
+    topic = f"/estimates/{name}"
+    return [
+        *_of_tracks(topic, stage, scans, told),
+        _associations(topic, found, scans, told),
+        *_of_scans(topic, scans, told, repeated),
+        *_modes(topic, stage, scans, told),
+        *_innovations(topic, found, scans, told),
+    ]
+
+
+def _filled(column: NDArray, ends: Integers) -> NDArray:
+    """The rows of a column (runs, rows, ...) that each run has filled, end to end."""
+    return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
+
+
+def _bounds(ends: Integers) -> Integers:
+    """Where the rows of each run begin and end (runs + 1,), from how many it has."""
+    return np.concatenate([[0], np.cumsum(ends)])
+
+
+def _track_stamps(scans: Scans, told: Told) -> Integers:
+    """The stamps of all tracks after all scans."""
+    used = told.confirmed != NEVER
+    return np.repeat(scans.time_ns[used], told.confirmed[used])
+
+
+def _of_tracks(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[Ragged]:
+    """After every scan how many tracks there are, which, and how probably each exists."""
+    metadata, ends = named(stage.model.state), told.end[:, 0]
+    used = np.flatnonzero(told.confirmed != NEVER)
+    size = make_stream(
+        f"{topic}/set",
+        schemas.ESTIMATE_SIZE,
+        scans.time_ns[used],
+        metadata=metadata,
+        elements=told.confirmed[used],
+    )
+    yield Ragged(size, np.searchsorted(used, scans.offsets))
+    stamps_ns, covariance = _track_stamps(scans, told), _filled(told.covariance, ends)
+    track = make_stream(
+        f"{topic}/track",
+        schemas.TRACK_ESTIMATE,
+        stamps_ns,
+        metadata=metadata,
+        track_id=_filled(told.number, ends),
+        mean=_filled(told.mean, ends),
+        covariance=covariance.reshape(len(covariance), stage.model.tangent**2),
+    )
+    yield Ragged(track, _bounds(ends))
+    existence = _filled(told.existence, ends)
+    stream = make_stream(f"{topic}/existence", schemas.EXISTENCE, stamps_ns, existence=existence)
+    yield Ragged(stream, _bounds(ends))
+
+
+def _modes(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[Ragged]:
+    """How probable the modes of each track are, where there are several."""
+    if not stage.modes:
+        return
+    ends = told.end[:, 0]
+    stream = make_stream(
+        f"{topic}/modes",
+        schemas.MODE_PROBABILITIES,
+        _track_stamps(scans, told),
+        metadata=named(dict.fromkeys(stage.model.modes or (), "linear")),
+        probability=_filled(told.probability, ends),
+    )
+    yield Ragged(stream, _bounds(ends))
+
+
+def _associations(topic: str, found: Found, scans: Scans, told: Told) -> Ragged:
+    """Which detection of a scan is which track's, and how probably."""
+    ends = told.end[:, 1]
+    track, scan, detection = _filled(told.pair, ends).T
+    stream = make_stream(
+        f"{topic}/association",
+        schemas.ASSOCIATION,
+        scans.time_ns[scan],
+        metadata={"sensors": ",".join(found.sensors)},
+        track_id=track,
+        sensor_id=scans.sensor[scan],
+        scan_id=scans.number[scan],
+        detection=detection,
+        probability=_filled(told.associated, ends),
+    )
+    return Ragged(stream, _bounds(ends))
+
+
+def _of_scans(topic: str, scans: Scans, told: Told, repeated: int) -> Iterator[Ragged]:
+    """What was approximated, what was not used, and how many scans were used again."""
+    approximated = np.flatnonzero(told.approximated)
+    tracks = told.approximated[approximated]
+    stream = make_stream(
+        f"{topic}/approximation", schemas.APPROXIMATION, scans.time_ns[approximated], tracks=tracks
+    )
+    yield Ragged(stream, np.searchsorted(approximated, scans.offsets))
+    late = told.confirmed == NEVER
+    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
+    reasons = np.where(late[unused], 1, 0)
+    stream = reason_stream(f"{topic}/unused", schemas.SKIPPED, scans.time_ns[unused], reasons, UNUSED)
+    yield Ragged(stream, np.searchsorted(unused, scans.offsets))
+    count = min(repeated, 1)
+    stream = make_stream(
+        f"{topic}/rewound", schemas.REWOUND, scans.time_ns[:count], repeated=[repeated] * count
+    )
+    yield Ragged(stream, np.minimum(scans.offsets, repeated))
+
+
+def _innovations(topic: str, found: Found, scans: Scans, told: Told) -> Iterator[Ragged]:
+    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
+    ends = told.end[:, 1]
+    pair, probability = _filled(told.pair, ends), _filled(told.associated, ends)
+    white, factor = _filled(told.white, ends), _filled(told.factor, ends)
+    order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
+    track, scan = pair[order, 0], pair[order, 1]
+    is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]
+    likeliest = np.sort(order[is_first])
+    for sensor, (kind, scan_topic) in enumerate(zip(found.kinds, found.scans, strict=True)):
+        rows = likeliest[scans.sensor[pair[likeliest, 1]] == sensor]
+        measured = KINDS[kind].measured
+        size = len(measured)
+        root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
+        stream = innovation_stream(
+            f"{topic}{scan_topic.removesuffix('/scan')}/innovation",
+            scans.time_ns[pair[rows, 1]],
+            measured,
+            "",
+            target_id=pair[rows, 0],
+            accepted=np.ones(len(rows), np.int64),
+            innovation=np.einsum("nij,nj->ni", root, whitened),
+            covariance=root @ root.transpose(0, 2, 1),
+            squared=(whitened**2).sum(axis=1),
+        )
+        yield Ragged(stream, np.searchsorted(rows, _bounds(ends)))

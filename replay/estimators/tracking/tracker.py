@@ -1,0 +1,445 @@
+"""Tracks of vessels and other targets from the unordered scans of several sensors at once.
+
+    tracker:nearest     the surest pair of track and detection first
+    tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
+    tracker:jpda        all maps, weighted
+    tracker:jipda       all maps, weighted, and how probable it is that each track exists
+    tracker:pmbm        the same, where any detection may be the first one of a target: the Poisson
+                        multi-Bernoulli mixture, of which after each scan the marginals are kept, the
+                        tracks' existence and states (TOMB/P of Williams, IEEE TAES 51(3), 2015). Targets
+                        that were never detected are a uniform Poisson process of steady density
+
+Targets keep their velocity but for white acceleration, or move as any registered model with a position
+says; where it has several modes, each track is an interacting multiple model. Sensors are those that
+state what they are like on the channels of their scans, see `replay.estimators.tracking.scan_sensors`.
+Places begin tracks, bearings only sharpen those that are confirmed.
+`replay.inference.association.tracking` does the work.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from recorders.errors import BadInput
+from recorders.log import Topic, schemas
+from recorders.parameters import Parameters
+from replay.distributions import chi2
+from replay.engine.arrays import Floats, Integers
+from replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from replay.engine.streams.blocks import Block, Ragged, gather, join
+from replay.engine.streams.channels import stated
+from replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
+from replay.estimators.tracking.scans import ORIGIN, Fixes, Found, latest_fixes, scans_of
+from replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
+from replay.estimators.tracking.targets import Targets, targets_of
+from replay.estimators.tracking.track_outputs import track_outputs
+from replay.estimators.tracking.track_smoother import smoothing_tracks
+from replay.inference.association.scanning import Scans, in_time, measuring, take_scans
+from replay.inference.association.tracking import Newborn, Told, Tracker, of_last, track_scans
+from replay.inference.association.tracks import Tracks, no_tracks
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.stage import stage_of
+
+# What sets apart the two that go by existence and have the associations of jpda.
+EXISTING: dict[str, dict[str, float]] = {
+    "jipda": {},
+    "pmbm": {
+        "undetected_per_m2": 1e-6,
+        "confirming_existence": 0.5,
+        "keeping_existence": 0.5,
+        "ending_existence": 0.001,
+    },
+}
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class TrackerParameters(Parameters):
+    """How targets move, how tracks begin and end, and what sensors are like.
+
+    What is none is what the channel of a sensor's scans states; a value given here holds for all
+    sensors. `sensors` are those to use, such as ["radar", "lidar"]; if it is empty, all are used.
+
+    `model` is a registered model with a position, whose parameters `motion` gives by name. A model with
+    modes uses all of them, or the one that `mode` names. Without a model targets keep their velocity,
+    but for an acceleration of density `acceleration_density` (m^2/s^3).
+
+    A track begins with a detection outside all gates that is `birth_distance_m` from all confirmed
+    tracks. With `undetected_per_m2`, the density of targets that were never detected, it begins with
+    any detection that may be one of these, by how probable that is.
+
+    `management` decides which tracks are confirmed. "existence" uses the probability that the target
+    exists: a track is confirmed from `confirming_existence` on until it falls below
+    `keeping_existence`, and ends below `ending_existence`. "hits" needs `hits_needed` detections in the
+    first `chances`. "score" tests the log-likelihood ratio of target and clutter, so that
+    `false_confirmation` and `missed_confirmation` are the probabilities of its errors. With hits or
+    score the existence is `birth_existence` until a track is confirmed, and then 1. If management is
+    none, jipda and pmbm use existence, the others hits.
+
+    With `registration_sigma_m` or `_rad` a sensor has a constant error in all that it measures, which
+    all tracks estimate together. With `correlated_sigma_m` or `_rad` it has another error for every
+    track, which lasts for about `correlation_s`. Both are components of the tracks' states.
+
+    With `smoothed` the tracks are estimated again at the end of the run from all their detections.
+    """
+
+    association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"
+    management: Literal["existence", "hits", "score"] | None = None
+    sensors: tuple[str, ...] = ()
+    model: str | None = None
+    mode: str | None = None
+    motion: dict[str, float] = {}
+    acceleration_density: PositiveFloat = 0.1
+    birth_sigma_mps: PositiveFloat = 3.0
+    birth_distance_m: NonNegativeFloat = 30.0
+    birth_existence: Probability | None = None
+    undetected_per_m2: NonNegativeFloat = 0.0
+    confirming_existence: Probability = 0.97
+    keeping_existence: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    ending_existence: Probability = 0.02
+    survival_s: PositiveFloat = 60.0
+    hits_needed: PositiveInt = 4
+    chances: PositiveInt = 6
+    false_confirmation: Probability = 1e-5
+    missed_confirmation: Probability = 1e-4
+    silence_s: PositiveFloat = 10.0
+    tentative_silence_s: PositiveFloat = 6.0
+    same_within_m: NonNegativeFloat = 10.0
+    same_within_mps: NonNegativeFloat = 2.0
+    most_tracks: PositiveInt = 100
+    smoothed: bool = False
+
+    gate_probability: Probability | None = None
+    sigma_m: PositiveFloat | None = None
+    sigma_across_rad: NonNegativeFloat | None = None
+    lag_s: float | None = None
+    bias_x_m: float | None = None
+    bias_y_m: float | None = None
+    bias_range_m: float | None = None
+    near_range_m: NonNegativeFloat | None = None
+    far_range_m: NonNegativeFloat | None = None
+    far_detection_probability: Probability | None = None
+    clutter_per_m2: PositiveFloat | None = None
+    far_clutter_factor: PositiveFloat | None = None
+    sector_from_rad: float | None = None
+    sector_to_rad: float | None = None
+    sector_detection_factor: Probability | None = None
+    sector_clutter_factor: PositiveFloat | None = None
+    joined_within_m: NonNegativeFloat | None = None
+    sigma_rad: PositiveFloat | None = None
+    sigma_across_m: NonNegativeFloat | None = None
+    bias_rad: float | None = None
+    clutter_per_rad: PositiveFloat | None = None
+    detection_probability: Probability | None = None
+    blind_from_rad: float | None = None
+    blind_to_rad: float | None = None
+    interval_s: NonNegativeFloat | None = None
+    registration_sigma_m: NonNegativeFloat | None = None
+    registration_sigma_rad: NonNegativeFloat | None = None
+    correlated_sigma_m: NonNegativeFloat | None = None
+    correlated_sigma_rad: NonNegativeFloat | None = None
+    correlation_s: PositiveFloat | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _managed(cls, values: Any) -> Any:
+        """Existence is what jipda and pmbm are about; the others count hits."""
+        association = values.get("association", "jipda")
+        goes_by_existence = association in EXISTING
+        given = values.get("management")
+        if goes_by_existence and given not in (None, "existence"):
+            raise ValueError(
+                f"{association} needs management = existence; management = {given} is for jpda"
+            )
+        management = given or ("existence" if goes_by_existence else "hits")
+        if values.get("undetected_per_m2") and management != "existence":
+            raise ValueError("undetected_per_m2 needs management = existence")
+        likely = {"birth_existence": 0.05 if management == "existence" else 0.135}
+        return {**likely, **EXISTING.get(association, {}), **values, "management": management}
+
+
+# Sensors
+
+
+def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
+    """The sensors with scans and places, bearings, or both range and bearing.
+
+    Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
+    """
+    rows = []
+    _check_scans(topics, wanted)
+    for scan in topics.values():
+        prefix, _, leaf = scan.name.rpartition("/")
+        if leaf != "scan" or scan.schema_name != schemas.SCAN.full_name:
+            continue
+        if wanted and prefix.strip("/") not in wanted:
+            continue
+        for number, kind in enumerate(KINDS):
+            seen = topics.get(f"{prefix}/{kind.leaf}")
+            if seen is not None and seen.schema_name == kind.schema.full_name:
+                rows.append((number, scan.name, seen.name, scan.metadata.get(ORIGIN, "")))
+    missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
+    if missing:
+        raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
+    found = Found(*zip(*rows, strict=True)) if rows else Found((), (), (), ())
+    for scan_name, origin in zip(found.scans, found.origins, strict=True):
+        if origin and (
+            origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
+        ):
+            raise BadInput(
+                f"topic {scan_name}: its sensor's position is that of {origin} (fuselog.PositionFix), "
+                "which is "
+                "missing; record the position of the sensor"
+            )
+    if rows and all(KINDS[kind].birth is None for kind in found.kinds):
+        raise BadInput(
+            "bearings alone begin no tracks, since they do not measure how far a target is; add a "
+            "sensor of positions, or of ranges with bearings"
+        )
+    return found
+
+
+def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
+    """Raise BadInput where detections are of scans that nobody recorded."""
+    for seen in topics.values():
+        prefix, _, leaf = seen.name.rpartition("/")
+        is_wanted = not wanted or prefix.strip("/") in wanted
+        if is_wanted and (leaf, seen.schema_name) in SEEN and f"{prefix}/scan" not in topics:
+            raise BadInput(
+                f"topic {seen.name}: detections without scans; record {prefix}/scan "
+                f"({schemas.SCAN.full_name}), which states how many each scan has, even if none"
+            )
+
+
+class Settings(NamedTuple):
+    """What the loop reads, a row for every sensor; and the errors that sensors have beside noise."""
+
+    names: tuple[str, ...]
+    numbers: Floats
+    errors: Errors
+
+
+def settings_of(
+    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters, targets: Targets
+) -> Settings:
+    """What parameters and channels say of the sensors and targets."""
+    names, own = number_fields(TrackerParameters), targets.parameters._asdict()
+    kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
+    for kind, scan in zip(kinds, found.scans, strict=True):
+        values = {name: number for name, number in own.items() if name not in names}
+        for name in names:
+            given = getattr(parameters, name)
+            if name in FOREIGN[kind.leaf]:
+                given = np.nan
+            if given is None:
+                needed = name not in UNSTATED
+                given = stated([topics[scan]], name, TrackerParameters, needed=needed)
+            values[name] = UNSTATED.get(name, np.nan) if np.isnan(given) else float(given)
+        values["gate"] = float(chi2.ppf(values["gate_probability"], len(kind.measured)))
+        by_sensor.append(values)
+    errors = errors_of(found.sensors, kinds, by_sensor)
+    of_errors = {f"{name}_sigma": sigma for name, sigma in zip(errors.names, errors.sigma, strict=True)}
+    of_errors |= {
+        f"{name}_s": each for name, each in zip(errors.names, errors.correlation_s, strict=True)
+    }
+    size = targets.stage.model.size
+    for values, places in zip(by_sensor, errors.places, strict=True):
+        values |= {name: place if place < 0 else size + place for name, place in places.items()}
+        values |= of_errors
+    return Settings(tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors)
+
+
+# The estimator
+
+
+class Setup(NamedTuple):
+    """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
+
+    name: str
+    found: Found
+    tracker: Tracker
+    settings: Floats
+    newborn: Newborn
+    most_tracks: int
+
+    def no_tracks(self, runs: int) -> Tracks:
+        """Runs in which nothing was met yet."""
+        first, count = self.tracker.shared
+        shared = self.newborn.covariance[first : first + count, first : first + count]
+        return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
+
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+        """The tracks after some scans, and what is said of them."""
+        return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
+
+    def outputs(self, scans: Scans, told: Told, *, repeated: int = 0) -> list[Ragged]:
+        """The streams of what is said of these scans; see `track_outputs`."""
+        return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
+
+
+class State(NamedTuple):
+    """What is carried from block to block: the last own positions, and the tracks.
+
+    Attributes:
+        fixes: by topic and run.
+        tracks: of all runs; where scans may come late those of one run each, see `Rewinding`.
+    """
+
+    fixes: Fixes
+    tracks: Any
+
+
+def start(_: Mapping[str, Ragged]) -> None:
+    """Nothing is known before the first scan, not even how many runs there are."""
+
+
+def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list[Ragged]]:
+    """Track a block; see `replay.engine.replaying.estimator.Recursive`."""
+    before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
+    scans, fixes = _scans(before, block, setup)
+    after, said = setup.track(before.tracks, scans)
+    outputs = [setup.outputs(batch, told) for batch, told in said]
+    return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
+
+
+def _runs(block: Block) -> int:
+    return next(iter(block.streams.values())).runs
+
+
+def _begin(block: Block, setup: Setup, tracks: Any) -> State:
+    unknown: list[Any] = [None] * _runs(block)
+    return State({topic: unknown for topic in setup.found.origins if topic}, tracks)
+
+
+def _scans(state: State, block: Block, setup: Setup) -> tuple[Scans, Fixes]:
+    """A block's scans, and the last own positions after it."""
+    scans = scans_of(block, setup.found, KINDS, state.fixes)
+    fixes = state.fixes.items()
+    return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
+
+
+class Rewinding(NamedTuple):
+    """One run whose scans may come late.
+
+    Attributes:
+        base: the tracks after all scans that no late one can precede any more.
+        pending: the scans after those, in time order.
+        head: the tracks after all scans.
+    """
+
+    base: Tracks
+    pending: Scans
+    head: Tracks
+
+
+def run_rewinding(
+    state: State | None, block: Block, *, setup: Setup, back_ns: int
+) -> tuple[State, list[Ragged]]:
+    """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
+
+    A late scan is put in its place and those after it are used again; what was said stays, and is said
+    again at the latest stamp.
+    """
+    nothing = setup.no_tracks(1)
+    scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
+    none = take_scans(scans, np.empty(0, np.int64))
+    runs = [Rewinding(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
+    after, outputs = [], []
+    for number, before in enumerate(runs):
+        rewinding, said = before, list[list[Ragged]]()
+        for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
+            rewinding, told = _take(rewinding, take_scans(scans, rows), setup, back_ns)
+            said += told
+        after.append(rewinding)
+        outputs.append([join(parts) for parts in zip(*said, strict=True)])
+    filled = next((each for each in outputs if each), [])
+    empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
+    by_topic = zip(*(each or empty for each in outputs), strict=True)
+    return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
+
+
+def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+    """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
+    newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
+    late = scans.time_ns[first:end] < newest_ns
+    cuts = np.flatnonzero(late | np.append(False, late[:-1]))
+    return (first + rows for rows in np.split(np.arange(end - first), cuts) if len(rows))
+
+
+def _take(
+    rewinding: Rewinding, arrived: Scans, setup: Setup, back_ns: int
+) -> tuple[Rewinding, list[list[Ragged]]]:
+    """One run after scans that go on in time, or after one that is late; and what is said then."""
+    base, pending, head = rewinding
+    repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
+    pending = in_time(pending, arrived)
+    if repeated:
+        head, said = setup.track(base, pending)
+        outputs = [setup.outputs(*of_last(*said[-1]), repeated=repeated)]
+    else:
+        head, said = setup.track(head, arrived)
+        outputs = [setup.outputs(batch, told) for batch, told in said]
+    rows = np.arange(len(pending.time_ns))
+    settled = pending.time_ns < pending.time_ns[-1] - back_ns
+    if settled.any():
+        base, _ = setup.track(base, take_scans(pending, rows[settled]))
+        pending = take_scans(pending, rows[~settled])
+    return Rewinding(base, pending, head), outputs
+
+
+def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
+    """The parts that the parameters ask for."""
+    stage, shared = targets.stage, settings.errors.shared
+    stage = stage_of(*stage, names=settings.names)
+    sensors = tuple(measuring(stage.model, kind, settings.names) for kind in KINDS)
+    association = "jpda" if parameters.association in EXISTING else parameters.association
+    assert parameters.management is not None
+    return Tracker(
+        stage._replace(sensors=sensors),
+        KINDS,
+        association,
+        parameters.management,
+        settings.names,
+        (stage.model.size - len(settings.errors.names), shared),
+    )
+
+
+def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
+    """One tracker of all sensors."""
+    found = find_sensors(topics, parameters.sensors)
+    if not found.scans:
+        return []
+    scans = [topics[scan] for scan in found.scans]
+    targets = targets_of(f"estimator {name}", parameters, scans)
+    settings = settings_of(topics, found, parameters, targets)
+    targets = with_errors(f"estimator {name}", targets, settings.errors)
+    tracker = tracker_of(parameters, targets, settings)
+    setup = Setup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
+    seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
+    read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
+
+    def rewinding(back_ns: int) -> Recursive:
+        return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
+
+    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    if not parameters.smoothed:
+        return [tracking]
+    if settings.errors.names:
+        raise BadInput(
+            f"estimator {name}: errors of sensors cannot be smoothed; leave out smoothed or the errors "
+            "of sensors"
+        )
+    return [smoothing_tracks(tracking, targets)]
+
+
+TRACKER = Estimator(
+    "tracks of many targets from the unordered scans of several sensors",
+    "per sensor .../scan and .../detection (positions) or .../range_bearing, or .../bearing beside "
+    "those",
+    TrackerParameters,
+    _bind,
+    variant="association",
+)

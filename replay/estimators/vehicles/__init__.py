@@ -1,0 +1,4 @@
+"""Cooperative vehicles: joint filters of several vehicles with unordered fixes.
+
+Begin with `streams`.
+"""

@@ -1,0 +1,80 @@
+"""The way back over tracks: each estimate of a track, given the detections that came later too.
+
+Which detections are a track's stays as the tracker found it; given that, its states are a chain of
+Gaussians that one motion ties together, and `replay.inference.smoothing.backward_pass` goes back over
+them.
+"""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Integers
+from replay.inference.model.stage import Stage
+from replay.inference.run.recursion import Estimates
+from replay.inference.smoothing.backward_pass import FOREVER_NS, Nodes, back_memory, going_back, no_later
+
+
+def smooth_tracks(
+    stage: Stage, parameters: Any, track: Integers, time_ns: Integers, mean: Floats, covariance: Floats
+) -> tuple[Floats, Floats]:
+    """Smoothed means (n, size) and covariances (n, size, size) of the filtered estimates of tracks.
+
+    `track` (n,) says whose each is; the estimates of a track are in time order. The motion of the
+    stage is linear, and nothing controls it.
+    """
+    order = np.argsort(track, kind="stable")
+    numbers, first = np.unique(track[order], return_index=True)
+    offsets = np.append(first, len(track))
+    nodes = _nodes(stage, parameters, offsets, time_ns[order], mean[order], covariance[order])
+    runs, n = len(numbers), stage.model.size
+    smoothed = Estimates(
+        offsets[1:].copy(),
+        np.empty_like(nodes.time_ns),
+        np.empty(mean.shape),
+        np.empty(covariance.shape),
+    )
+    arguments = (nodes, offsets, offsets[1:], FOREVER_NS, no_later(runs, n, n), offsets[:-1], smoothed)
+    going_back(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
+    back = np.argsort(order)
+    return smoothed.mean[back], smoothed.covariance[back]
+
+
+def _nodes(
+    stage: Stage, parameters: Any, offsets: Integers, time_ns: Integers, mean: Floats, covariance: Floats
+) -> Nodes:
+    """The estimates, with how each comes from the one before; that of a track's first is not used."""
+    duration_s = np.diff(time_ns, prepend=time_ns[:1]) * 1e-9
+    duration_s[offsets[:-1]] = 0.0
+    before, spread = np.roll(mean, 1, axis=0), np.roll(covariance, 1, axis=0)
+    transition, noise = _motion(stage, parameters, before, duration_s)
+    cross = spread @ transition.transpose(0, 2, 1)
+    predicted = transition @ cross + noise
+    gain = np.asarray(np.linalg.solve(predicted, cross.transpose(0, 2, 1)), float).transpose(0, 2, 1)
+    return Nodes(
+        end=offsets[1:].copy(),
+        time_ns=time_ns,
+        mean=mean,
+        covariance=covariance,
+        predicted=np.einsum("nij,nj->ni", transition, before),
+        slope=np.zeros_like(mean),
+        gain=gain,
+        rest=spread - gain @ cross.transpose(0, 2, 1),
+    )
+
+
+def _motion(stage: Stage, parameters: Any, mean: Floats, duration_s: Floats) -> tuple[Floats, Floats]:
+    """The matrices (n, size, size) of a linear motion over so long each, and of its noise."""
+    size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
+    assert stage.motion.noise is not None
+    transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))
+    for column, unit in enumerate(np.eye(size)):
+        moved = stage.motion.move(tuple(unit), (), duration_s, parameters)
+        for row, entry in enumerate(moved):
+            transition[:, row, column] = entry
+    lower = stage.motion.noise(state, duration_s, parameters)
+    rows, columns = np.diag_indices(size) if len(lower) == size else np.tril_indices(size)
+    for i, j, entry in zip(rows.tolist(), columns.tolist(), lower, strict=True):
+        noise[:, i, j] = noise[:, j, i] = entry
+    return transition, noise

@@ -1,0 +1,384 @@
+"""Methods: how the state of any model is estimated, and the filters among them.
+
+Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing but the model's functions;
+`ukf` and `lrkf:SAMPLING` sample them; `analytic` takes the exact moments where the model knows them.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.predict import linear_motion, motion_noise
+from replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Note,
+    Steps,
+    Workspace,
+    gaussian_filter,
+    workspace,
+)
+from replay.inference.kalman.update import (
+    kalman_update,
+    linear_innovation,
+    linear_sensor,
+    note_numbers,
+    noting,
+    reading,
+    sensor_derivative,
+)
+from replay.inference.linear_algebra.gaussian import (
+    kalman_step,
+    keep_measured,
+    reduce_covariance,
+    whiten,
+    widen,
+    widening,
+    wrap,
+)
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.model.corrections import correcting, relinearising, sloping
+from replay.inference.model.model import Model, trial_state
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.settings import trial_parameters
+from replay.inference.model.stage import Stage, traced_sensor
+from replay.sampling import parse_sampling
+from replay.sampling.names import Sampling, Unscented
+
+ITERATIONS = 50
+SETTLED = 1e-12  # of the iterated update: the largest component of the last step
+
+
+class MethodParameters(Parameters):
+    """Options of every method.
+
+    `every_s` asks for estimates at this interval too, besides those at the sensors' stamps. `mode` is
+    the motion to use of a model that has several. `estimate` names parameters that become part of the
+    state: each starts from its value with the standard deviation in `estimate_sigma`. It is constant,
+    or walks at random with the density in `estimate_drift` (its unit per square root of a second), or
+    returns to its value within about the time in `estimate_time_s`, as a first-order Gauss-Markov
+    process. `topics` says which topic of the log stands for one that the model asks for, such as {pose
+    = "/amcl_pose/pose"}; an empty name leaves a sensor out.
+    """
+
+    every_s: PositiveFloat | None = None
+    mode: str | None = None
+    estimate: list[str] | None = None
+    estimate_sigma: dict[str, PositiveFloat] | None = None
+    estimate_drift: dict[str, NonNegativeFloat] | None = None
+    estimate_time_s: dict[str, PositiveFloat] | None = None
+    topics: dict[str, str] | None = None
+
+
+class UnscentedParameters(MethodParameters):
+    """`kappa` sets how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter."""
+
+    kappa: float = 0.0
+
+
+class RegressionParameters(MethodParameters):
+    """`sampling` is the name of a sampling, such as s2kf-50; `seed` is for random ones."""
+
+    sampling: str = "ukf"
+    seed: NonNegativeInt = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One way to estimate the state of any model.
+
+    Attributes:
+        summary: what it is, in one line.
+        parameters: their type.
+        steps: makes the filter's steps for a model with the sensors at hand.
+        sampling: where the samples come from, for methods that take some.
+        lacks: what a model lacks for it, in words; empty where it will do.
+        variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+        made_for: what the method is with these parameters, where they choose among several; raises
+            BadInput where they name none.
+        filtering: what goes through a log, where that is no `replay.inference.run.filtering.Filter`.
+        takes_all_modes: whether it takes all modes of a model, not one of its motions.
+    """
+
+    summary: str
+    parameters: type[MethodParameters]
+    steps: Callable[[Stage], Steps]
+    sampling: Callable[[Any], Sampling] | None = None
+    lacks: Callable[[Model], str] = lambda _: ""
+    variant: str | None = None
+    made_for: Callable[[Any], "Method"] | None = None
+    filtering: Callable[..., Any] | None = None
+    takes_all_modes: bool = False
+
+
+def _extended(stage: Stage) -> Steps:
+    updates = (
+        kalman_update(stage, number, linear_sensor(stage, number))
+        for number in range(len(stage.sensors))
+    )
+    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
+
+
+def _iterated(stage: Stage) -> Steps:
+    updates = (iterated_update(stage, number) for number in range(len(stage.sensors)))
+    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
+
+
+def iterated_update(stage: Stage, number: int) -> Function:
+    """The update linearised anew at every iterate, until it settles: Gauss-Newton on the posterior.
+
+    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
+    gate is tested at the prediction, and so is how much the measurement counts; innovation and
+    likelihood are those of the last iterate.
+    """
+    model, sensor = stage.model, stage.sensors[number]
+    n, t, m = model.size, model.tangent, len(sensor.measured)
+    read_state, read_about = tuple_of(n), reading(sensor).about
+    linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
+    tell, correct = noting(stage, number), correcting(model.kinds, model.correct)
+    find_slope = sloping(model.kinds, model.correct)
+    step_to, chain = relinearising(model)
+
+    def relinearise(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
+    ) -> None:
+        """The innovation by the Jacobian at mean (+) step, as one about the mean."""
+        innovation, step, rows = work.innovations[number], work.step, work.rows
+        step_to(mean, work)
+        linearise(read_state(work.state), read_about(data), parameters, work)
+        chain(rows[:m], work)
+        compare(covariance, data, parameters, work)
+        for i in range(m):
+            for k in range(t):
+                innovation.difference[i] += rows[i, k] * step[k]
+
+    def update(
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        work: Workspace,
+        note: Note,
+    ) -> int:
+        present = 0
+        for i in range(m):
+            present += not np.isnan(data[i])
+        if present == 0:
+            return NOTHING_MEASURED
+        innovation, step, factor = work.innovations[number], work.step, 1.0
+        find_slope(mean, covariance, work.slope)
+        for row in range(t):
+            step[row] = 0.0
+        for iteration in range(ITERATIONS):
+            relinearise(mean, covariance, data, parameters, work)
+            tell(innovation, note)
+            size = keep_measured(innovation)
+            squared, determinant = whiten(innovation, size)
+            if np.isnan(squared):
+                return NOT_POSITIVE_DEFINITE
+            if iteration == 0:
+                factor = widening(squared, size, parameters)
+            if size == 0 or (iteration == 0 and not squared <= gate[size]):
+                note_numbers(note, squared, determinant, size, False, 1.0)
+                return ALL_WELL
+            widen(innovation, size, factor)
+            for row in range(t):
+                work.turned[row] = step[row]
+            kalman_step(innovation, size, step)
+            change = 0.0
+            for row in range(t):
+                change = max(change, abs(step[row] - work.turned[row]))
+            if change < SETTLED:
+                break
+        reduce_covariance(covariance, innovation.cross_covariance, size)
+        correct(mean, covariance, work)
+        note_numbers(note, squared, determinant, size, True, factor)
+        return ALL_WELL
+
+    return update
+
+
+def _sampled(stage: Stage) -> Steps:
+    """Regression at samples; what is linear is passed on exactly instead."""
+    model, motion = stage.model, stage.motion
+    dimensions: list[int] = []
+    shapes: list[tuple[int, tuple[str, ...]]] = []
+    predict = linear_motion(stage)
+    if not motion.linear:
+        predict = sampled_motion(stage, 0)
+        dimensions.append(model.tangent + motion.noises)
+        shapes.append((motion.noises, model.kinds))
+    updates = []
+    for number, sensor in enumerate(stage.sensors):
+        innovate = linear_sensor(stage, number)
+        if not sensor.linear:
+            innovate = sampled_sensor(stage, number, len(shapes))
+            dimensions.append(model.tangent + sensor.noises)
+            shapes.append((sensor.noises, tuple(sensor.measured.values())))
+        updates.append(kalman_update(stage, number, innovate))
+
+    def memory(sets: tuple[Any, ...]) -> Workspace:
+        made = (
+            sample_memory(each, model.kinds, noises, outputs)
+            for each, (noises, outputs) in zip(sets, shapes, strict=True)
+        )
+        return workspace(stage, tuple(made))
+
+    return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions))
+
+
+def _analytic(stage: Stage) -> Steps:
+    motion = stage.motion
+    predict = linear_motion(stage)
+    if not motion.linear:
+        predict = _exact_motion(stage)
+    updates = tuple(
+        kalman_update(
+            stage,
+            number,
+            linear_sensor(stage, number) if sensor.linear else _exact_sensor(stage, number),
+        )
+        for number, sensor in enumerate(stage.sensors)
+    )
+    return gaussian_filter(stage, predict, updates)
+
+
+def _exact_motion(stage: Stage) -> Function:
+    model, motion = stage.model, stage.motion
+    moments, add_noise = motion.moments, motion_noise(model, motion)
+    assert moments is not None
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        state = read_state(mean)
+        moments(mean, covariance, read_control(control), duration_s, parameters)
+        add_noise(state, covariance, duration_s, parameters, work)
+        return True
+
+    return predict
+
+
+def _exact_sensor(stage: Stage, number: int) -> Function:
+
+    sensor = stage.sensors[number]
+    moments, read_about = sensor.moments, reading(sensor).about
+    assert moments is not None
+    m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
+
+    def innovate(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+    ) -> bool:
+        difference, spread, cross = work.innovations[number]
+        predicted = work.predicted
+        moments(mean, covariance, read_about(data), parameters, predicted, spread, cross)
+        for i in range(m):
+            difference[i] = wrap(data[i] - predicted[i], angular[i])
+        return True
+
+    return innovate
+
+
+def _lacks_slopes(model: Model) -> str:
+    """A sensor whose linearised components depend on one another at every state, in noise and all.
+
+    As those of a point and its square do: the innovation covariance is then singular.
+    """
+    parameters = trial_parameters(model)
+    for sensor in model.sensors:
+        if sensor.noises and sensor.jacobian is None:
+            m, about = len(sensor.measured), (0.7,) * sensor.about_size
+            rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
+            work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
+            try:
+                own = traced_sensor(model, sensor, number_fields(model.parameters))
+                sensor_derivative(model, own)(trial_state(model.kinds), about, parameters, work)
+            except Exception:  # is said when the model is bound, see `model.check_sensor`
+                continue
+            if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
+                return f"a regular linearisation of its sensor {sensor.topic}"
+    return ""
+
+
+def _lacks_moments(model: Model) -> str:
+    motions = (model.modes or {"": model.motion}).values()
+    if not all(motion.linear or motion.moments for motion in motions):
+        return "exact moments of its motion"
+    missing = [each.topic for each in model.sensors if not (each.linear or each.moments)]
+    return f"exact moments of its sensor {missing[0]}" if missing else ""
+
+
+FILTERS: Mapping[str, Method] = {
+    "ekf": Method("extended Kalman filter", MethodParameters, _extended, lacks=_lacks_slopes),
+    "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated, lacks=_lacks_slopes),
+    "ukf": Method(
+        "unscented Kalman filter",
+        UnscentedParameters,
+        _sampled,
+        sampling=lambda parameters: Unscented(kappa=parameters.kappa),
+    ),
+    "lrkf": Method(
+        "linear regression Kalman filter; the sampling follows the name, as in lrkf:s2kf-50",
+        RegressionParameters,
+        _sampled,
+        sampling=lambda parameters: parse_sampling(parameters.sampling),
+        variant="sampling",
+    ),
+    "analytic": Method(
+        "Kalman filter with the exact moments, which linear regression approximates",
+        MethodParameters,
+        _analytic,
+        lacks=_lacks_moments,
+    ),
+}
+
+
+def no_steps(stage: Stage) -> Steps:
+    """For a method whose steps are those of one that `Method.made_for` makes for its parameters."""
+    raise AssertionError("the method was not made for its parameters")
+
+
+def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
+    """The name and the variant of a filter for a method to rest on, such as "lrkf:s2kf-50".
+
+    Raises BadInput where there is no such filter; `use` says what for.
+    """
+    name, _, variant = text.partition(":")
+    if name not in FILTERS:
+        raise BadInput(f"'{name}' is not a filter {use}; {choices(name, FILTERS)}")
+    if variant and FILTERS[name].variant is None:
+        raise BadInput(f"filter {name} has no variants; give '{method}:{name}' without ':{variant}'")
+    return name, variant
+
+
+@lru_cache(maxsize=64)
+def filter_with(name: str, variant: str) -> Method:
+    """A filter whose variant is set, as in `lrkf:s2kf-50`."""
+    chosen = FILTERS[name]
+    sampling = chosen.sampling
+    if not variant or sampling is None:
+        return chosen
+
+    def sampling_of_variant(parameters: Any) -> Sampling:
+        return sampling(parameters.model_copy(update={chosen.variant: variant}))
+
+    return replace(chosen, sampling=sampling_of_variant)

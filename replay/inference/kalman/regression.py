@@ -1,0 +1,261 @@
+"""Statistical linear regression: a Gaussian through a function at weighted samples of it.
+
+Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
+(24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
+vectors, and means are intrinsic: the weighted differences from them sum to zero.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, varying
+from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
+from replay.inference.kalman.steps import Workspace
+from replay.inference.kalman.update import reading, sensor_noise
+from replay.inference.linear_algebra.gaussian import cholesky, wrap
+from replay.inference.linear_algebra.manifold import (
+    differencing,
+    is_flat,
+    recentring,
+    retraction,
+    tangent_size,
+)
+from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
+from replay.inference.linear_algebra.tuples import filling, tuple_of
+from replay.inference.model.model import Motion, Sensor
+from replay.inference.model.stage import Stage
+from replay.sampling.sets import SampleSets
+
+MEANS = 30  # at most so many steps to an intrinsic mean
+
+
+@varying(0, points=1, weights=1)
+class SampleMemory(NamedTuple):
+    """Samples of N(0, I), and what a regression at them works in; N = t + noises.
+
+    Attributes:
+        points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
+        factor: (N, N) lower factor of the covariance of state (t) and noise.
+        offsets: (L, N) the samples' tangent vectors from the mean.
+        point, noise: (n,), one sample, and (noises,), the variances.
+        values: (L, v), the function's values as tangent vectors from a centre.
+        centre, shift: (n of the values,), (v,), their mean, and what the values are away from it.
+    """
+
+    points: Floats
+    weights: Floats
+    first: int
+    stride: int
+    factor: Floats
+    offsets: Floats
+    point: Floats
+    noise: Floats
+    values: Floats
+    centre: Floats
+    shift: Floats
+
+
+def sample_memory(
+    sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
+) -> SampleMemory:
+    """Memory for the regression of a function of a state and its noise."""
+    _, count, dimension = sets.points.shape
+    values = tangent_size(outputs)
+    return SampleMemory(
+        *sets,
+        factor=np.zeros((dimension, dimension)),
+        offsets=np.empty((count, dimension)),
+        point=np.empty(len(kinds)),
+        noise=np.empty(noises),
+        values=np.empty((count, values)),
+        centre=np.empty(len(outputs)),
+        shift=np.empty(values),
+    )
+
+
+def regression(
+    function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
+) -> Function:
+    """The regression of `function(state, noise, arguments)` at samples.
+
+    Returns `regress(mean, covariance, arguments, variances, spread, cross, use, memory)`. It takes the
+    samples of use number `use`, fills `memory.centre` with the intrinsic mean of the values, `spread`
+    (v, v) with their covariance and `cross` (t, v) with that with the state; False where the state's
+    covariance is not positive definite. `variances` is a tuple of those of the noise; `spread` may be
+    the state's covariance itself.
+    """
+    t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
+    size = t + noises
+    read_state, read_noise = tuple_of(components), tuple_of(noises, t)
+    add, subtract = retraction(kinds), differencing(outputs)
+    fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
+    lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
+    settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
+
+    def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
+        """Fill the offsets of all samples, and the function's values as differences from the centre."""
+        triangle, state, offsets = lower(memory.factor), read_state(mean), memory.offsets
+        centre = function(state, no_noise, arguments)
+        fill(memory.centre, centre)
+        for index in range(len(points)):
+            away = offset(triangle, points, index)
+            fill_offset(offsets[index], away)
+            if flat_states:
+                point = tuple(state[row] + away[row] for row in range(components))
+            else:
+                for row in range(components):
+                    memory.point[row] = mean[row]
+                add(memory.point, away)
+                point = read_state(memory.point)
+            value = function(point, read_noise(away), arguments)
+            subtract(value, centre, memory.values, index)
+
+    def regress(
+        mean: Floats,
+        covariance: Floats,
+        arguments: tuple[Any, ...],
+        variances: tuple[float, ...],
+        spread: Floats,
+        cross: Floats,
+        use: int,
+        memory: SampleMemory,
+    ) -> bool:
+        chosen = (use - memory.first) * memory.stride
+        weights, factor = memory.weights[chosen], memory.factor
+        if not cholesky(factor, covariance, t):
+            return False
+        fill_noise(memory.noise, variances)
+        for k in range(noises):
+            factor[t + k, t + k] = np.sqrt(memory.noise[k])
+        evaluate(mean, memory.points[chosen], arguments, memory)
+        settle(weights, memory.values, memory.centre, memory.shift)
+        moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
+        return True
+
+    return regress
+
+
+@lru_cache(maxsize=64)
+def settling(kinds: tuple[str, ...]) -> Function:
+    """`settle(weights, values, centre, shift)`: moves a centre to the intrinsic mean of values.
+
+    The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
+    afterwards.
+    """
+    v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
+    add, recentre, weighted_mean = retraction(kinds), recentring(kinds), weighted_mean_of(v)
+
+    def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
+        for _ in range(MEANS):
+            weighted_mean(weights, values, shift)
+            add(centre, shift)
+            if straight:
+                return
+            again = recentre(values, shift)
+            for i in range(v):
+                shift[i] = 0.0
+            if not again:
+                return
+
+    return settle
+
+
+def _no_variances(*_: Any) -> tuple[float, ...]:
+    return ()
+
+
+def sampled_motion(stage: Stage, number: int) -> Function:
+    """Prediction by regression at the samples `work.samples[number]`.
+
+    Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
+    """
+    model, motion = stage.model, stage.motion
+    entering = motion.noise if motion.noises else None
+    regress = regression(_moved(motion), model.kinds, motion.noises, model.kinds)
+    variances_of = entering or _no_variances
+    add_noise = nothing if entering else motion_noise(model, motion)
+    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+    fill = filling(model.size)
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        memory, state, driven = work.samples[number], read_state(mean), read_control(control)
+        arguments = (driven, duration_s, parameters)
+        variances = variances_of(state, duration_s, parameters)
+        cross = work.product.T
+        if not regress(mean, covariance, arguments, variances, covariance, cross, use, memory):
+            return False
+        linearise(state, driven, duration_s, parameters, work)
+        add_noise(state, covariance, duration_s, parameters, work)
+        fill(mean, memory.centre)
+        return True
+
+    return predict
+
+
+def _moved(motion: Motion) -> Function:
+    move = motion.move
+    if motion.noises:
+
+        def with_noise(state: Any, noise: Any, arguments: Any) -> Any:
+            return move(state, arguments[0], noise, arguments[1], arguments[2])
+
+        return with_noise
+
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
+        return move(state, arguments[0], arguments[1], arguments[2])
+
+    return without
+
+
+def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
+    """`innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
+    model, sensor = stage.model, stage.sensors[number]
+    kinds = tuple(sensor.measured.values())
+    regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)
+    read_about, m = reading(sensor).about, len(kinds)
+    angular = tuple(kind == "angle" for kind in kinds)
+    entering = sensor.noise if sensor.noises else None
+    variances_of = entering or _no_variances
+    add_noise = nothing if sensor.noises else sensor_noise(sensor)
+
+    def innovate(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+    ) -> bool:
+        memory = work.samples[samples]
+        difference, spread, cross = work.innovations[number]
+        arguments, variances = (read_about(data), parameters), variances_of(parameters)
+        if not regress(mean, covariance, arguments, variances, spread, cross, use, memory):
+            return False
+        for i in range(m):
+            difference[i] = wrap(data[i] - memory.centre[i], angular[i])
+        add_noise(spread, data, parameters, work)
+        return True
+
+    return innovate
+
+
+def _measured(sensor: Sensor) -> Function:
+    measure = sensor.measure
+    if sensor.noises:
+
+        def with_noise(state: Any, noise: Any, arguments: Any) -> Any:
+            return measure(state, noise, arguments[0], arguments[1])
+
+        return with_noise
+
+    def without(state: Any, noise: Any, arguments: Any) -> Any:
+        return measure(state, arguments[0], arguments[1])
+
+    return without

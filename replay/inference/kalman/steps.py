@@ -1,0 +1,208 @@
+"""The steps of a recursive Gaussian filter, made for one model: what a method puts together.
+
+A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
+`linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.
+All work in one workspace, and the Kalman update after them is the same (`kalman_update`).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.gaussian import (
+    Innovation,
+    copy_gaussian,
+    no_innovation,
+)
+from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from replay.inference.model.model import Model
+from replay.inference.model.stage import Stage
+
+FAILURES = (
+    "the covariance is no longer positive definite",
+    "the estimate is no longer finite",
+    "no particle explains what was measured",
+    "the truth is not known here",
+    "what drives the motion is silent for too long",
+)
+# indices of FAILURES
+NOT_POSITIVE_DEFINITE, NOT_FINITE, NOT_EXPLAINED, NO_TRUTH, NOT_DRIVEN = 0, 1, 2, 3, 4
+NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
+
+
+class Gaussian(NamedTuple):
+    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+class Steps(NamedTuple):
+    """A recursive filter of one model, as the recursion takes it.
+
+    Attributes:
+        memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
+        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well;
+            moves the belief in place. `use` numbers the sets of randomised samples.
+        updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
+            ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
+        estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
+            covariance, and what the method keeps beside them.
+        sampled: the dimensions in which it takes samples, the motion's first.
+        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
+    """
+
+    memory: Callable[[tuple[Any, ...]], Any]
+    predict: Function
+    updates: tuple[Function, ...]
+    estimate: Function
+    sampled: tuple[int, ...] = ()
+    resumes: bool = False
+
+
+class Note(NamedTuple):
+    """What an update tells of itself: one row of the results.
+
+    Attributes:
+        difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
+        numbers: NIS, log-likelihood, and 1 where the gate let the measurement in, (3,).
+    """
+
+    difference: Floats
+    covariance: Floats
+    numbers: Floats
+
+
+class Workspace(NamedTuple):
+    """What the steps of one core work in.
+
+    Attributes:
+        state: (n,), the moved state.
+        transition: (t, t).
+        product: (t, t), after a prediction the covariance of the moved state with the one before.
+        gain, control_variance: (t, controls), (controls,).
+        noise_gain, noise_variance: (t or m, noises), (noises,).
+        rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
+        step, turned, slope: (t,), the correction of the state, and along what it bends.
+        innovations: one for each sensor.
+        samples: what `replay.inference.kalman.regression` works in, motion first, one for each of
+            `sampled`.
+    """
+
+    state: Floats
+    transition: Floats
+    product: Floats
+    gain: Floats
+    control_variance: Floats
+    noise_gain: Floats
+    noise_variance: Floats
+    rows: Floats
+    predicted: Floats
+    step: Floats
+    turned: Floats
+    slope: Floats
+    innovations: tuple[Innovation, ...]
+    samples: tuple[Any, ...]
+
+
+def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
+    """A workspace for a model with the sensors at hand."""
+    model, t = stage.model, stage.model.tangent
+    m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    noises = max([stage.motion.noises, *(sensor.noises for sensor in stage.sensors)])
+    return Workspace(
+        state=np.empty(model.size),
+        transition=np.empty((t, t)),
+        product=np.empty((t, t)),
+        gain=np.empty((t, model.controls)),
+        control_variance=np.empty(model.controls),
+        noise_gain=np.empty((max(t, m), noises)),
+        noise_variance=np.empty(noises),
+        rows=np.empty((m, t)),
+        predicted=np.empty(m),
+        step=np.empty(t),
+        turned=np.empty(t),
+        slope=np.zeros(t),
+        innovations=tuple(no_innovation(t, len(sensor.measured)) for sensor in stage.sensors)
+        or (no_innovation(t, 0),),
+        samples=samples or ((np.empty(0),),),
+    )
+
+
+def gaussian_filter(
+    stage: Stage,
+    predict: Function,
+    updates: tuple[Function, ...],
+    memory: Callable[[tuple[Any, ...]], Any] | None = None,
+    sampled: tuple[int, ...] = (),
+) -> Steps:
+    """The steps of a filter whose belief is one Gaussian.
+
+    `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
+    one run's mean and covariance.
+    """
+    lost = stage.motion.lost
+    if lost is not None:
+        predict = _predicting_lost(stage.model, lost, predict)
+
+    def predict_run(
+        run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
+    ) -> bool:
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        return predict(mean, covariance, control, duration_s, parameters, use, work)
+
+    def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
+        mean, covariance = estimates.mean[row], estimates.covariance[row]
+        copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
+
+    return Steps(
+        memory or (lambda _: workspace(stage)),
+        predict_run,
+        tuple(_of_run(update) for update in updates),
+        estimate,
+        sampled,
+        resumes=lost is not None,
+    )
+
+
+def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
+    """The prediction that, where the control is NaN, keeps the mean and adds to the covariance."""
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        if not np.isnan(control[0]):
+            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+        for row in range(t):
+            for column in range(t):
+                work.product[row, column] = covariance[row, column]
+        add(covariance, lost(read_state(mean), duration_s, parameters))
+        return True
+
+    return predict
+
+
+def _of_run(update: Function) -> Function:
+    def update_run(
+        run: int,
+        belief: Gaussian,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        work: Any,
+        note: Note,
+    ) -> int:
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        return update(mean, covariance, data, parameters, gate, use, work, note)
+
+    return update_run

@@ -1,0 +1,275 @@
+"""The algebra of recursive Gaussian filters: scalar loops over small arrays, in place.
+
+Means lie in the state's own space, covariances in its tangent space and are symmetric by construction.
+Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats
+
+LOG_TWO_PI = float(np.log(2.0 * np.pi))
+
+
+class Innovation(NamedTuple):
+    """How a measurement differs from its prediction.
+
+    Attributes:
+        difference: v (m,), NaN where the measurement has no such component.
+        covariance: S (m, m), of v.
+        cross_covariance: C (t, m), of the state with v.
+    """
+
+    difference: Floats
+    covariance: Floats
+    cross_covariance: Floats
+
+
+def no_innovation(states: int, components: int) -> Innovation:
+    """Memory for an innovation."""
+    return Innovation(
+        np.empty(components), np.empty((components, components)), np.empty((states, components))
+    )
+
+
+def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
+    """Fill the lower factor of the leading block; False where it is not positive definite (or NaN).
+
+    Both arguments may be the same array.
+    """
+    for column in range(size):
+        for row in range(column, size):
+            entry = matrix[row, column]
+            for k in range(column):
+                entry -= factor[row, k] * factor[column, k]
+            if row > column:
+                factor[row, column] = entry / factor[column, column]
+            elif entry > 0.0:
+                factor[row, row] = np.sqrt(entry)
+            else:
+                return False
+    return True
+
+
+def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
+    """The same of a positive semidefinite matrix: what is below a pivot of about zero is zero.
+
+    False where it is none (or NaN).
+    """
+    for column in range(size):
+        smallest = 1e-15 * size * matrix[column, column]
+        for row in range(column, size):
+            entry = matrix[row, column]
+            for k in range(column):
+                entry -= factor[row, k] * factor[column, k]
+            if row == column:
+                if not entry >= -smallest:
+                    return False
+                factor[row, row] = np.sqrt(entry) if entry > smallest else 0.0
+            else:
+                pivot = factor[column, column]
+                factor[row, column] = entry / pivot if pivot > 0.0 else 0.0
+    return True
+
+
+def wrap(difference: float, is_angle: bool) -> float:
+    """The difference, in [-pi, pi) where it is one of angles."""
+    if is_angle and not abs(difference) < np.pi:
+        return wrap_angle(difference)
+    return difference
+
+
+def keep_measured(innovation: Innovation) -> int:
+    """Move the components that were measured to the front; returns how many there are."""
+    difference, covariance, cross_covariance = innovation
+    size = 0
+    for component in range(len(difference)):
+        if np.isnan(difference[component]):
+            continue
+        if size < component:
+            difference[size] = difference[component]
+            for row in range(len(cross_covariance)):
+                cross_covariance[row, size] = cross_covariance[row, component]
+            for k in range(len(difference)):
+                covariance[size, k] = covariance[component, k]
+            for k in range(len(difference)):
+                covariance[k, size] = covariance[k, component]
+        size += 1
+    return size
+
+
+def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
+    """Turn v into L^-1 v and S into L, S = L L'; returns v' S^-1 v and log det S.
+
+    The first is NaN where S is not positive definite.
+    """
+    difference, factor, _ = innovation
+    if not cholesky(factor, factor, size):
+        return np.nan, np.nan
+    squared, determinant = 0.0, 1.0
+    for i in range(size):
+        entry = difference[i]
+        for k in range(i):
+            entry -= factor[i, k] * difference[k]
+        difference[i] = entry / factor[i, i]
+        squared += difference[i] * difference[i]
+        determinant *= factor[i, i]
+    return squared, 2.0 * np.log(determinant)
+
+
+def widening(squared: float, size: int, parameters: Any) -> float:
+    """How many times larger the covariance of an innovation counts, of a NIS and so many components.
+
+    To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
+    a Kalman update still. 1 where no option of `replay.inference.model.model.ModelParameters` is given:
+    those
+    are NaN then. The largest of those given holds:
+
+    - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
+    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
+      Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
+    - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
+
+    >>> from types import SimpleNamespace
+    >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
+    >>> widening(36.0, 1, SimpleNamespace(**given)), widening(8.0, 1, SimpleNamespace(**given))
+    (4.0, 1.0)
+    """
+    factor = 1.0
+    if squared > parameters.inflate_nis:
+        factor = squared / parameters.inflate_nis
+    if parameters.student_freedom > 0.0:
+        freedom = parameters.student_freedom
+        factor = max(factor, (freedom + squared) / (freedom + size))
+    if squared > parameters.switch_nis:
+        half = 0.5 * (1.0 + squared / parameters.switch_nis)
+        factor = max(factor, half * half)
+    return factor
+
+
+def widen(innovation: Innovation, size: int, factor: float) -> None:
+    """Make the covariance of a whitened innovation so many times larger."""
+    root = np.sqrt(factor)
+    for i in range(size):
+        innovation.difference[i] /= root
+        for k in range(i + 1):
+            innovation.covariance[i, k] *= root
+
+
+def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
+    """Fill `step` with K v of a whitened innovation; the cross-covariance C becomes W = C L^-T.
+
+    So K v = W L^-1 v, and K S K' = W W'.
+    """
+    difference, factor, cross = innovation
+    for row in range(len(step)):
+        step[row] = 0.0
+        for i in range(size):
+            entry = cross[row, i]
+            for k in range(i):
+                entry -= factor[i, k] * cross[row, k]
+            cross[row, i] = entry / factor[i, i]
+            step[row] += cross[row, i] * difference[i]
+
+
+def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
+    """P becomes P - W W', with W as `kalman_step` leaves it."""
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            entry = covariance[row, column]
+            for i in range(size):
+                entry -= weighted[row, i] * weighted[column, i]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def scalar_update(
+    mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
+) -> None:
+    """The Kalman update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
+    share = difference / variance
+    for row in range(len(cross)):
+        mean[row] += cross[row] * share
+        part = cross[row] / variance
+        for column in range(row + 1):
+            covariance[row, column] -= part * cross[column]
+            covariance[column, row] = covariance[row, column]
+
+
+def multiply(left: Floats, right: Floats, product: Floats) -> None:
+    """Fill `product` with that of two square matrices."""
+    for row in range(len(product)):
+        for column in range(len(product)):
+            entry = 0.0
+            for k in range(len(product)):
+                entry += left[row, k] * right[k, column]
+            product[row, column] = entry
+
+
+def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
+    """Make F A of A, by way of `product`."""
+    multiply(left, matrix, product)
+    for row in range(len(matrix)):
+        for column in range(len(matrix)):
+            matrix[row, column] = product[row, column]
+
+
+def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
+    """P becomes F P F', by way of `product`."""
+    size = len(covariance)
+    multiply(transition, covariance, product)
+    for row in range(size):
+        for column in range(row + 1):
+            entry = 0.0
+            for k in range(size):
+                entry += product[row, k] * transition[column, k]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def coast(
+    mean: Floats,
+    covariance: Floats,
+    duration_s: float,
+    layout: tuple[int, int],
+    noise: tuple[float, float, float],
+) -> None:
+    """Move positions at constant velocity for a while, in place.
+
+    Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
+    a variance of the position, a covariance of both, and a variance of the velocity.
+    """
+    stride, apart = layout
+    places = range(0, stride * (len(mean) // 2), stride)
+    for place in places:
+        mean[place] += duration_s * mean[place + apart]
+        for column in range(len(mean)):
+            covariance[place, column] += duration_s * covariance[place + apart, column]
+    for place in places:
+        for row in range(len(mean)):
+            covariance[row, place] += duration_s * covariance[row, place + apart]
+    for place in places:
+        covariance[place, place] += noise[0]
+        covariance[place, place + apart] += noise[1]
+        covariance[place + apart, place] += noise[1]
+        covariance[place + apart, place + apart] += noise[2]
+
+
+def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
+    """P becomes P + G diag(variances) G', for a gain G whose columns go with the variances."""
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            entry = covariance[row, column]
+            for k in range(len(variances)):
+                entry += gain[row, k] * variances[k] * gain[column, k]
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covariance: Floats) -> None:
+    """Copy a mean and its covariance."""
+    for i in range(len(mean)):
+        to_mean[i] = mean[i]
+    for i in range(len(covariance)):
+        for j in range(len(covariance)):
+            to_covariance[i, j] = covariance[i, j]

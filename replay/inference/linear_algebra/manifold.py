@@ -1,0 +1,207 @@
+"""States on their manifold, and the tangent space in which steps and covariances are.
+
+Kinds and tangent space as in `replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
+rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i
+angle). Hertzberg et al., Information Fusion 14, 2013, where adding a step is called boxplus and the
+difference of two states boxminus; Sola, arXiv 1711.02508.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats, Function
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
+
+Quaternion = tuple[float, float, float, float]
+
+
+def tangent_size(kinds: Sequence[str]) -> int:
+    """How many components the tangent space of these components has."""
+    return sum(width for _, _, _, width in things(kinds))
+
+
+def things(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
+    """Every number, angle, axis and quaternion: kind, first component and tangent one, tangent size."""
+    found, component, tangent = [], 0, 0
+    while component < len(kinds):
+        kind = kinds[component]
+        found.append((kind, component, tangent, TANGENT_WIDTHS[kind]))
+        component += WIDTHS[kind]
+        tangent += TANGENT_WIDTHS[kind]
+    return found
+
+
+def is_flat(kinds: Sequence[str]) -> bool:
+    """Whether the tangent space is the space itself, but for the wrapping of angles."""
+    return set(kinds) <= {"linear", "angle"}
+
+
+@lru_cache(maxsize=64)
+def retraction(kinds: tuple[str, ...]) -> Function:
+    """`add(x, d)`: moves the state x (n,) by a tangent vector d (t,), in place."""
+    parts = tuple(things(kinds))
+
+    def add(x: Floats, d: Floats) -> None:
+        for kind, c, t, _ in parts:
+            if kind in ("linear", "angle"):
+                x[c] += d[t]
+            elif kind == "axis":
+                cosine, sine = np.cos(d[t]), np.sin(d[t])
+                x[c], x[c + 1] = x[c] * cosine - x[c + 1] * sine, x[c] * sine + x[c + 1] * cosine
+            else:
+                turn = from_vector(d[t], d[t + 1], d[t + 2])
+                w, i, j, k = product((x[c], x[c + 1], x[c + 2], x[c + 3]), turn)
+                length = np.sqrt(w * w + i * i + j * j + k * k)
+                x[c], x[c + 1], x[c + 2], x[c + 3] = w / length, i / length, j / length, k / length
+
+    return add
+
+
+@lru_cache(maxsize=64)
+def differencing(kinds: tuple[str, ...]) -> Function:
+    """`subtract(a, b, d, k)`: row k of d (..., t) becomes the tangent vector from b to a, both (n,)."""
+    parts = tuple(things(kinds))
+
+    def subtract(a: Floats, b: Floats, d: Floats, k: int) -> None:
+        for kind, c, t, _ in parts:
+            if kind == "linear":
+                d[k, t] = a[c] - b[c]
+            elif kind == "angle":
+                change = a[c] - b[c]
+                d[k, t] = change if abs(change) < np.pi else wrap_angle(change)
+            elif kind == "axis":
+                cosine = b[c] * a[c] + b[c + 1] * a[c + 1]
+                sine = b[c] * a[c + 1] - b[c + 1] * a[c]
+                sign = -1.0 if cosine < 0.0 else 1.0
+                d[k, t] = np.arctan2(sign * sine, sign * cosine)
+            else:
+                p = (b[c], b[c + 1], b[c + 2], b[c + 3])
+                q = (a[c], a[c + 1], a[c + 2], a[c + 3])
+                d[k, t], d[k, t + 1], d[k, t + 2] = to_vector(*product(conjugate(p), q))
+
+    return subtract
+
+
+@lru_cache(maxsize=64)
+def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
+    """`reset(d, rows)`: multiplies the rows (t, m) of every rotation by its right Jacobian at d (t,).
+
+    Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
+    With `back` it multiplies by the inverse instead, which carries a covariance the other way.
+    """
+    factors_of = inverse_right_jacobian if back else right_jacobian
+    turns = tuple(t for kind, _, t, _ in things(kinds) if kind == "quaternion")
+
+    def reset(d: Floats, rows: Floats) -> None:
+        for t in turns:
+            x, y, z = d[t], d[t + 1], d[t + 2]
+            first, second = factors_of(x * x + y * y + z * z)
+            for column in range(rows.shape[1]):
+                a, b, c = rows[t, column], rows[t + 1, column], rows[t + 2, column]
+                u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+                rows[t, column] = a - first * u + second * (y * w - z * v)
+                rows[t + 1, column] = b - first * v + second * (z * u - x * w)
+                rows[t + 2, column] = c - first * w + second * (x * v - y * u)
+
+    return reset
+
+
+def right_jacobian(squared: float) -> tuple[float, float]:
+    """The factors f, g of Jr(d) = I - f [d]x + g [d]x^2, of t^2 = |d|^2.
+
+    They are (1 - cos t)/t^2 and (t - sin t)/t^3. Markley 2003; Mueller 2017.
+    """
+    angle = np.sqrt(squared)
+    half = np.sinc(0.5 * angle / np.pi)
+    if angle < 0.05:
+        second = (1.0 - squared / 20.0 * (1.0 - squared / 42.0)) / 6.0
+    else:
+        second = (angle - np.sin(angle)) / (squared * angle)
+    return 0.5 * half * half, second
+
+
+def inverse_right_jacobian(squared: float) -> tuple[float, float]:
+    """The factors of its inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
+    angle = np.sqrt(squared)
+    if angle < 0.05:
+        second = (1.0 + squared / 60.0 * (1.0 + squared / 42.0)) / 12.0
+    else:
+        second = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / squared
+    return -0.5, second
+
+
+@lru_cache(maxsize=64)
+def recentring(kinds: tuple[str, ...]) -> Function:
+    """`recentre(values, shift)`: tangent vectors (L, t) from a centre become those from centre + shift.
+
+    Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a
+    rotation is not yet settled.
+    """
+    parts = tuple(things(kinds))
+
+    def recentre(values: Floats, shift: Floats) -> bool:
+        again = False
+        for kind, _, t, _ in parts:
+            if kind == "linear":
+                for index in range(len(values)):
+                    values[index, t] -= shift[t]
+            elif kind == "angle":
+                for index in range(len(values)):
+                    change = values[index, t] - shift[t]
+                    if not abs(change) < np.pi:
+                        change = wrap_angle(change)
+                        again = True
+                    values[index, t] = change
+            elif kind == "axis":
+                for index in range(len(values)):
+                    change = values[index, t] - shift[t]
+                    if not abs(change) < 0.5 * np.pi:
+                        change = (change + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+                        again = True
+                    values[index, t] = change
+            else:
+                x, y, z = shift[t], shift[t + 1], shift[t + 2]
+                if max(abs(x), abs(y), abs(z)) > 1e-15:
+                    again = True
+                turned_back = conjugate(from_vector(x, y, z))
+                for index in range(len(values)):
+                    q = from_vector(values[index, t], values[index, t + 1], values[index, t + 2])
+                    turn = to_vector(*product(turned_back, q))
+                    values[index, t], values[index, t + 1], values[index, t + 2] = turn
+        return again
+
+    return recentre
+
+
+def product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton's product of two quaternions."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The inverse of a unit quaternion."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+def from_vector(x: float, y: float, z: float) -> Quaternion:
+    """The unit quaternion of a rotation vector."""
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)
+    scale = 0.5 * np.sinc(half / np.pi)
+    return np.cos(half), scale * x, scale * y, scale * z
+
+
+def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The shortest rotation vector of a unit quaternion, which is that of its negative too."""
+    sign = -1.0 if w < 0.0 else 1.0
+    length = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(length, sign * w)
+    scale = 2.0 * sign * (angle / length if length > 0.0 else 1.0)
+    return scale * x, scale * y, scale * z

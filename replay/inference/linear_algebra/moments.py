@@ -1,0 +1,81 @@
+"""Weighted samples: the points that a factor of a covariance makes of them, their means and covariances.
+
+All sums stay in registers: arrays might overlap, for all that a compiler knows. A kernel reads the whole
+of a tuple that changes wherever its name stands, so that such a tuple is gone through, not indexed.
+"""
+
+from functools import lru_cache
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.tuples import total
+
+Numbers = tuple[float, ...]
+
+
+@lru_cache(maxsize=64)
+def lower_of(size: int) -> Function:
+    """`read(factor)`: the rows of a lower triangle as one tuple."""
+    places = tuple((row, column) for row in range(size) for column in range(row + 1))
+
+    def read(factor: Floats) -> Numbers:
+        return tuple(factor[row, column] for row, column in places)
+
+    return read
+
+
+@lru_cache(maxsize=64)
+def offset_of(size: int) -> Function:
+    """`offset(lower, points, index)`: a triangle, as `lower_of` reads it, times one row of points."""
+    firsts = tuple(row * (row + 1) // 2 for row in range(size))
+
+    def offset(lower: Numbers, points: Floats, index: int) -> Numbers:
+        return tuple(
+            total(tuple(lower[first + k] * points[index, k] for k in range(row + 1)))
+            for row, first in enumerate(firsts)
+        )
+
+    return offset
+
+
+@lru_cache(maxsize=64)
+def moments_of(states: int, values: int) -> Function:
+    """`moments(weights, offsets, found, shift, spread, cross)`: weighted covariances, in one loop.
+
+    Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t).
+    """
+    pairs = tuple((i, j) for i in range(values) for j in range(i + 1))
+    mixed = tuple((row, i) for row in range(states) for i in range(values))
+
+    def moments(
+        weights: Floats, offsets: Floats, found: Floats, shift: Floats, spread: Floats, cross: Floats
+    ) -> None:
+        centre = tuple(shift[i] for i in range(values))
+        own, joint = (0.0,) * len(pairs), (0.0,) * len(mixed)
+        for k in range(len(weights)):
+            y = tuple(found[k, i] - centre[i] for i in range(values))
+            weighed = tuple(weights[k] * each for each in y)
+            x = tuple(offsets[k, row] for row in range(states))
+            own = tuple(sofar + weighed[i] * y[j] for sofar, (i, j) in zip(own, pairs, strict=True))
+            joint = tuple(
+                sofar + x[row] * weighed[i] for sofar, (row, i) in zip(joint, mixed, strict=True)
+            )
+        for entry, (i, j) in zip(own, pairs, strict=True):
+            spread[i, j] = spread[j, i] = entry
+        for entry, (row, i) in zip(joint, mixed, strict=True):
+            cross[row, i] = entry
+
+    return moments
+
+
+@lru_cache(maxsize=64)
+def weighted_mean_of(values: int) -> Function:
+    """`fill(weights, found, mean)`: the weighted sums (v,) of values (L, v)."""
+
+    def fill(weights: Floats, found: Floats, mean: Floats) -> None:
+        sums = (0.0,) * values
+        for k in range(len(weights)):
+            sums = tuple(sofar + weights[k] * found[k, i] for i, sofar in enumerate(sums))
+        for i, entry in enumerate(sums):
+            mean[i] = entry
+
+    return fill

@@ -1,0 +1,139 @@
+"""Linear algebra of a few components, for estimators of one's own: scalar loops that work in place.
+
+They are called from a compiled `follow` (see `replay.engine.api.functions.recursive`) and make no
+arrays: what they work in is made there once, before the loop over the messages. Covariances stay
+symmetric. A Kalman filter of x' = F x + w and z = H x + v is
+
+    memory, product = update_memory(states, components), np.empty((states, states))
+    for row in range(messages.offsets[run], messages.offsets[run + 1]):
+        predict(mean, covariance, transition, process_noise, product)
+        squared = update(mean, covariance, difference, rows, measurement_noise, memory)
+
+Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023, chapters 4 and 6.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats
+from replay.inference.linear_algebra.gaussian import (
+    Innovation,
+    cholesky,
+    kalman_step,
+    keep_measured,
+    moved_covariance,
+    no_innovation,
+    reduce_covariance,
+    whiten,
+)
+
+__all__ = ["UpdateMemory", "cholesky", "predict", "solve", "update", "update_memory"]
+
+
+class UpdateMemory(NamedTuple):
+    """What `update` works in; afterwards the innovation is used up."""
+
+    innovation: Innovation
+    step: Floats
+
+
+def update_memory(states: int, components: int) -> UpdateMemory:
+    """Memory for updates of so many states by up to so many measured components."""
+    return UpdateMemory(no_innovation(states, components), np.empty(states))
+
+
+def solve(matrix: Floats, right: Floats, size: int) -> bool:
+    """Make x of b in place, A x = b, by Cholesky's factor of the leading block, which overwrites A.
+
+    Args:
+        matrix: A (n, n), symmetric positive definite in its first `size` rows and columns.
+        right: b (n,).
+        size: how many equations there are.
+
+    Returns whether A was positive definite; `right` is as it was where not.
+    """
+    if not cholesky(matrix, matrix, size):
+        return False
+    for i in range(size):
+        for k in range(i):
+            right[i] -= matrix[i, k] * right[k]
+        right[i] /= matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            right[i] -= matrix[k, i] * right[k]
+        right[i] /= matrix[i, i]
+    return True
+
+
+def predict(
+    mean: Floats, covariance: Floats, transition: Floats, noise: Floats, product: Floats
+) -> None:
+    """Make F x of x, and F P F' + Q of P, in place.
+
+    Args:
+        mean: x (n,).
+        covariance: P (n, n).
+        transition: F (n, n).
+        noise: Q (n, n).
+        product: (n, n) to work in.
+    """
+    size = len(mean)
+    for row in range(size):
+        entry = 0.0
+        for k in range(size):
+            entry += transition[row, k] * mean[k]
+        product[0, row] = entry
+    for row in range(size):
+        mean[row] = product[0, row]
+    moved_covariance(covariance, transition, product)
+    for row in range(size):
+        for column in range(size):
+            covariance[row, column] += noise[row, column]
+
+
+def update(
+    mean: Floats,
+    covariance: Floats,
+    difference: Floats,
+    rows: Floats,
+    noise: Floats,
+    memory: UpdateMemory,
+    gate: float = float("inf"),
+) -> float:
+    """The Kalman update in place: x + K v and P - K S K' with S = H P H' + R and K = P H' S^-1.
+
+    Args:
+        mean: x (n,).
+        covariance: P (n, n).
+        difference: v = z - h(x) (m,), NaN where a component is missing.
+        rows: H (m, n), the derivative of the measurement by the state.
+        noise: R (m, m).
+        memory: of `update_memory`.
+        gate: nothing changes where the NIS is beyond this.
+
+    Returns the NIS v' S^-1 v; NaN where S is not positive definite, and nothing has changed.
+    """
+    innovation, step = memory.innovation, memory.step
+    measured = len(difference)
+    for i in range(measured):
+        innovation.difference[i] = difference[i]
+        for row in range(len(mean)):
+            entry = 0.0
+            for k in range(len(mean)):
+                entry += covariance[row, k] * rows[i, k]
+            innovation.cross_covariance[row, i] = entry
+        for j in range(i + 1):
+            entry = noise[i, j]
+            for k in range(len(mean)):
+                entry += rows[i, k] * innovation.cross_covariance[k, j]
+            innovation.covariance[i, j] = innovation.covariance[j, i] = entry
+    size = keep_measured(innovation)
+    squared = whiten(innovation, size)[0]
+    if not squared <= gate:
+        return squared
+    kalman_step(innovation, size, step)
+    for row in range(len(mean)):
+        mean[row] += step[row]
+    reduce_covariance(covariance, innovation.cross_covariance, size)
+    return squared

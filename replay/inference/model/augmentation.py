@@ -1,0 +1,288 @@
+"""Parameters as part of the state: a sensor's bias, a scale factor, a time offset that is estimated too.
+
+A transformation of models: the state gets a component for each, which the model's functions read in
+place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
+has the parameter's value for a mean, and stands beside the log's; between measurements it moves as
+`replay.inference.model.gauss_markov` says. Methods see a model as any other. Errors about the points of
+a map are added in the same way, see `replay.inference.model.point_errors`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput, choices
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.priors import gaussians
+from replay.engine.streams.results import gaussian_stream
+from replay.inference.model.corrections import correcting_more
+from replay.inference.model.gauss_markov import Walk, kept, spread, with_walk_parameters
+from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.point_errors import (
+    Errors,
+    PointError,
+    motion_with_errors,
+    point_errors,
+    sensor_with_errors,
+    with_point_errors,
+)
+from replay.inference.model.settings import TracedParameters
+from replay.inference.model.stage import Stage
+
+Names = tuple[str, ...]
+Start = Callable[[Mapping[str, Ragged]], Any]
+
+
+class Added(NamedTuple):
+    """What is estimated beside the state: parameters, then errors about points, and how each moves."""
+
+    parameters: Names
+    errors: Errors
+    walks: tuple[Walk, ...]
+
+    @property
+    def names(self) -> Names:
+        """The components, in their order."""
+        return self.parameters + tuple(each.name for each in self.errors)
+
+
+def estimated(label: str, model: Model, parameters: Any) -> Added:
+    """What is to be estimated beside the state, as the settings say.
+
+    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
+    one that is asked for, one stands twice, or has no sigma.
+    """
+    check_estimable(f"estimator {label}", model)
+    asked = parameters.estimate or []
+    options = {
+        "estimate_sigma": parameters.estimate_sigma or {},
+        "estimate_drift": parameters.estimate_drift or {},
+        "estimate_time_s": parameters.estimate_time_s or {},
+    }
+    for option, given in options.items():
+        for name in given.keys() - set(asked):
+            raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
+    named: dict[str, Walk] = {}
+    errors: dict[PointError, Walk] = {}
+    for asks in asked:
+        where = f"estimator {label}: estimate = {asks}"
+        own = point_errors(where, model, asks)
+        if not own and asks not in model.estimable:
+            known = choices(asks, model.estimable)
+            raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
+        if asks in named or not errors.keys().isdisjoint(own):
+            raise BadInput(f"{where}: is named twice; name it once")
+        sigma, drift, time_s = (given.get(asks) for given in options.values())
+        if sigma is None:
+            raise BadInput(
+                f"{where}: its uncertainty at the start is missing; give its standard deviation, "
+                f"estimate_sigma.{asks}=..."
+            )
+        if time_s is not None and model.estimable.get(asks) == "angle":
+            raise BadInput(
+                f"{where}: is an angle, which cannot return to a mean; give "
+                f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
+            )
+        walk = Walk(sigma, drift or 0.0, time_s or np.inf)
+        if own:
+            errors |= dict.fromkeys(own, walk)
+        else:
+            named[asks] = walk
+    return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
+
+
+def check_estimable(where: str, model: Model) -> None:
+    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
+    if not isinstance(model.estimable, Mapping):
+        raise BadInput(
+            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
+            'to kind, such as {"length_m": "linear"}'
+        )
+    known = number_fields(model.parameters)
+    for name, kind in model.estimable.items():
+        if name not in known:
+            raise BadInput(
+                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+            )
+        if kind not in ("linear", "angle"):
+            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
+
+
+def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
+    """The model with these parameters and errors in its state; the model itself where there are none.
+
+    >>> from replay.estimators.models.landmarks import ROBOT
+    >>> list(augmented(ROBOT, ("bias_range_m",)).state)
+    ['x_m', 'y_m', 'heading_rad', 'bias_range_m']
+    """
+    model = _augmented(model, names) if names else model
+    return with_point_errors(model, errors) if errors else model
+
+
+def augmented_stage(stage: Stage, added: Added) -> Stage:
+    """The same of a model as a method takes it."""
+    names, errors = added.parameters, added.errors
+    if names:
+        model, sensors = stage.model, stage.sensors
+        motions = [_augmented_motion(model, each, names) for each in (stage.motion, *stage.modes)]
+        sensors = tuple(_augmented_sensor(model, each, names) for each in sensors)
+        stage = Stage(_augmented(model, names), motions[0], sensors, tuple(motions[1:]))
+    if errors:
+        model, sensors = stage.model, stage.sensors
+        motions = [motion_with_errors(model, each, errors) for each in (stage.motion, *stage.modes)]
+        sensors = tuple(sensor_with_errors(model, each, errors) for each in sensors)
+        stage = Stage(with_point_errors(model, errors), motions[0], sensors, tuple(motions[1:]))
+    return stage
+
+
+def with_walks(settings: Floats, added: Added) -> Floats:
+    """Numbers of motion and sensors with those that an augmented model has beside them."""
+    numbers = np.ravel(added.walks)
+    return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
+
+
+def begin(
+    label: str, topic: str, stage: Stage, added: Added, settings: Floats
+) -> Callable[[Start], Start]:
+    """What makes of the start of an augmented model's filter one from the log's own prior on `topic`.
+
+    `stage` and `settings` are those of the model itself. Raises BadInput where a parameter that is to be
+    estimated has no value.
+    """
+    fields = number_fields(stage.model.parameters)
+    means = np.array(
+        [settings[0, fields.index(name)] if name in fields else 0.0 for name in added.names]
+    )
+    for name, mean in zip(added.names, means, strict=True):
+        if not np.isfinite(mean):
+            raise BadInput(
+                f"estimator {label}: estimate = {name}: its value at the start is missing; give "
+                f"{name}=..."
+            )
+    variances = np.array([walk.sigma**2 for walk in added.walks])
+
+    def extended(prior: Ragged) -> Ragged:
+        time_ns, mean, covariance = gaussians(prior)
+        runs, t, k = len(mean), covariance.shape[1], len(added.walks)
+        wider = np.zeros((runs, t + k, t + k))
+        wider[:, :t, :t] = covariance
+        wider[:, range(t, t + k), range(t, t + k)] = variances
+        longer = np.concatenate([mean, np.tile(means, (runs, 1))], axis=1)
+        return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
+
+    def begun(start: Start) -> Start:
+        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if added.walks else start
+
+    return begun
+
+
+@lru_cache(maxsize=64)
+def _augmented(model: Model, names: Names) -> Model:
+    modes = model.modes and {
+        name: _augmented_motion(model, motion, names) for name, motion in model.modes.items()
+    }
+    return replace(
+        model,
+        state={**model.state, **{name: model.estimable[name] for name in names}},
+        parameters=with_walk_parameters(model.parameters, names),
+        sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
+        motion=_augmented_motion(model, model.motion, names),
+        modes=modes,
+        correct=correcting_more(model, len(names)),
+        estimable={},
+    )
+
+
+@lru_cache(maxsize=256)
+def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
+    """The motion, in which the parameters walk about or come back to what they were given as."""
+    n, t, noises = model.size, model.tangent, motion.noises
+    given = motion.noise or _no_noise(t)
+    state, parameters = trial_state(model.kinds), _traced(model)
+    is_triangle = not noises and len(given(state, 1.0, parameters)) != t
+    entering = ((0.0,) * noises,) if noises else ()
+    parameters = _traced(model)
+    motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
+    reads_none = not parameters.read & set(names)
+    move_own = _reading(model, names, motion.move)
+    angular = tuple(model.estimable[name] == "angle" for name in names)
+
+    def move(state: Any, control: Any, *others: Any) -> Any:
+        *entering, duration_s, parameters = others
+        own = (each[:noises] for each in entering)
+        moved = list(move_own(state, control, *own, duration_s, parameters))
+        for index, name in enumerate(names):
+            stay = state[n + index]
+            if not angular[index]:  # an angle has no mean to come back to
+                share = kept(name, duration_s, parameters)
+                stay = share * stay + (1.0 - share) * getattr(parameters, name)
+            moved.append(stay + entering[0][noises + index] if noises else stay)
+        return tuple(moved)
+
+    def with_spreads(function: Function, *, is_triangle: bool = False) -> Function:
+        own = _reading(model, names, function)
+
+        def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+            found = list(own(state, duration_s, parameters))
+            for index, name in enumerate(names):
+                found += [0.0] * (t + index) if is_triangle else []
+                found.append(spread(name, duration_s, parameters))
+            return tuple(found)
+
+        return noise
+
+    return replace(
+        motion,
+        move=move,
+        noise=with_spreads(given, is_triangle=is_triangle),
+        lost=motion.lost and with_spreads(motion.lost),
+        noises=noises + len(names) if noises else 0,
+        linear=motion.linear and reads_none,
+        jacobians=None,
+        moments=None,
+    )
+
+
+@lru_cache(maxsize=256)
+def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
+    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+    parameters, about = _traced(model), (1.0,) * sensor.about_size
+    sensor.measure(trial_state(model.kinds), *entering, about, parameters)
+    return replace(
+        sensor,
+        measure=_reading(model, names, sensor.measure),
+        log_likelihood=sensor.log_likelihood and _reading(model, names, sensor.log_likelihood),
+        linear=sensor.linear and not parameters.read & set(names),
+        jacobian=None,
+        moments=None,
+    )
+
+
+def _reading(model: Model, names: Names, function: Function) -> Function:
+    """A model's function of the augmented state, which reads the estimated parameters from there."""
+    n, fields = model.size, number_fields(model.parameters)
+    settings = settings_type(fields)
+    places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)
+
+    def read(state: Any, *others: Any) -> Any:
+        *given, parameters = others
+        own = (getattr(parameters, name) if at < 0 else state[at] for name, at in places)
+        return function(state[:n], *given, settings(*own))
+
+    return read
+
+
+def _no_noise(size: int) -> Function:
+    def no_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        return (0.0,) * size
+
+    return no_noise
+
+
+def _traced(model: Model) -> TracedParameters:
+    return TracedParameters(dict.fromkeys(number_fields(model.parameters)))

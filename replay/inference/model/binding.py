@@ -1,0 +1,153 @@
+"""Where a log has what a model needs: its topics, by the names that the model has for them.
+
+One binding for all models: the topics of a model are looked for under every prefix that has its prior,
+as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from recorders.log import Schema, Topic, schemas
+from replay.engine.arrays import Floats
+from replay.engine.streams.channels import resolved
+from replay.engine.streams.geodetic import GEODETIC
+from replay.engine.streams.results import named
+from replay.inference.model.model import (
+    Control,
+    Model,
+    Sensor,
+)
+
+
+class Found(NamedTuple):
+    """Where a log has what a model needs.
+
+    Attributes:
+        prefix: what the names of its topics begin with, as `/robot1`.
+        prior: of a log without one, where it would be.
+        truth: the topic that estimates are compared with.
+        control: what drives the motion.
+        sensors: those that the log has.
+        has_prior: whether the log does; else see `replay.inference.run.initialization`.
+        instead: topics that take the place of some components of the control.
+        origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
+    """
+
+    prefix: str
+    prior: Topic
+    truth: str
+    control: Topic | None
+    sensors: tuple[tuple[Sensor, Topic], ...]
+    has_prior: bool = True
+    instead: tuple[tuple[Control, Topic], ...] = ()
+    origin: Floats | None = None
+
+    @property
+    def geodetic(self) -> tuple[Topic, ...]:
+        """The topics of fixes that are latitude and longitude."""
+        return tuple(topic for _, topic in self.sensors if topic.schema_name == GEODETIC)
+
+
+def roles_of(model: Model) -> list[str]:
+    """The topics that a model asks for, by the names that it has for them."""
+    control = [model.control, *model.control.instead] if model.control else []
+    maps = [each.topic for sensor in model.all_sensors for each in sensor.maps]
+    sensors = [sensor.topic for sensor in model.all_sensors]
+    drives = [each.topic for each in control]
+    return list(dict.fromkeys([model.prior, model.truth, *drives, *maps, *sensors]))
+
+
+class UnderPrefix(NamedTuple):
+    """The topics under one prefix of a log; `names` gives a topic by the model's name for it."""
+
+    topics: Mapping[str, Topic]
+    prefix: str
+    names: Mapping[str, str]
+
+    def place(self, name: str) -> str:
+        """A topic's full name."""
+        return resolved(self.names.get(name, name), self.prefix)
+
+    def topic(self, name: str, schema: Schema) -> Topic | None:
+        """The topic of this name, if its messages are of the schema or serve as such."""
+        found = self.topics.get(self.place(name))
+        return found if found is not None and found.schema_name in serving(schema) else None
+
+    def has(self, name: str) -> bool:
+        """Whether there is a topic of this name, whatever it is."""
+        return self.place(name) in self.topics
+
+
+def serving(schema: Schema) -> tuple[str, ...]:
+    """The schemas, by their full names, whose messages a sensor of this schema takes."""
+    geodetic = (GEODETIC,) if schema is schemas.POSITION_FIX else ()
+    return (schema.full_name, *geodetic)
+
+
+def topics_of(
+    model: Model, topics: Mapping[str, Topic], names: Mapping[str, str] | None = None
+) -> list[Found]:
+    """Everything in a log that is of this model; `names` are topics by the model's names for them."""
+    names = names or {}
+    begins = [model.prior]
+    if model.start is not None:
+        begins += [model.control.topic] if model.control else [each.topic for each in model.all_sensors]
+    ends = [f"/{names.get(name, name).removeprefix('/')}" for name in begins]
+    prefixes = dict.fromkeys(
+        topic.removesuffix(end) for end in ends for topic in topics if topic.endswith(end)
+    )
+    found = (_found(model, UnderPrefix(topics, prefix, names)) for prefix in prefixes)
+    return [each for each in found if each is not None]
+
+
+def _found(model: Model, here: UnderPrefix) -> Found | None:
+    """What there is of a model under one prefix; None where it does not fit."""
+    control = here.topic(model.control.topic, model.control.schema) if model.control else None
+    if model.control is not None and control is None:
+        return None
+    sensors = tuple(
+        (sensor, topic)
+        for sensor in model.all_sensors
+        if (topic := here.topic(sensor.topic, sensor.schema)) is not None
+        and topic.metadata.get("system", model.system) == model.system
+        and all(here.topic(each.topic, each.schema) is not None for each in sensor.maps)
+    )
+    prior = here.topic(model.prior, schemas.GAUSSIAN_ESTIMATE)
+    has_prior = prior is not None
+    if not _suffices(model, here, sensors, has_prior=has_prior):
+        return None
+    if prior is None:
+        name = schemas.GAUSSIAN_ESTIMATE.full_name
+        prior = Topic(here.place(model.prior), name, "protobuf", (), named(model.state), 0)
+    instead = tuple(
+        (each, topic)
+        for each in (model.control.instead if model.control else ())
+        if (topic := here.topic(each.topic, each.schema)) is not None
+    )
+    truth = here.place(model.truth)
+    return Found(here.prefix, prior, truth, control, sensors, has_prior, instead)
+
+
+def _suffices(
+    model: Model, here: UnderPrefix, sensors: Sequence[tuple[Sensor, Topic]], *, has_prior: bool
+) -> bool:
+    """Whether a model can start from these sensors or the prior, and go on.
+
+    A log without the prior fits a model that can start without, if a sensor measures the state itself.
+    One without sensors fits if it has no part of them, such as sightings whose map is missing.
+    """
+    if not has_prior and (model.start is None or here.has(model.prior)):
+        return False
+    if sensors:
+        return has_prior or model.finds_start or any(measures_state(model, each) for each, _ in sensors)
+    if not model.needs_sensor:
+        return True
+    parts = {each.topic for each in model.all_sensors}
+    parts |= {each.topic for sensor in model.all_sensors for each in sensor.maps}
+    is_driven = model.control is not None and model.start is not None and not model.finds_start
+    return is_driven and not any(map(here.has, parts))
+
+
+def measures_state(model: Model, sensor: Sensor) -> bool:
+    """Whether a sensor measures components of the state by their names, with their covariance."""
+    return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()

@@ -1,0 +1,377 @@
+"""Whether a model is what it says of itself: for the tests of who writes one.
+
+`check_model` tries a model's functions at random states: derivatives, what is declared linear or an
+angle, numbers of components, variances. What it finds is one sentence with the function's file and line.
+"""
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from recorders.errors import BadInput
+from recorders.models.planar import wrap_angle
+from recorders.parameters import build
+from replay.engine.arrays import Floats, Function
+from replay.engine.vectors.tangent import WIDTHS, tangent_components
+from replay.inference.linear_algebra.linearization import Input, derivative
+from replay.inference.linear_algebra.manifold import differencing, retraction, tangent_size, things
+from replay.inference.linear_algebra.tuples import adding_noise
+from replay.inference.model.augmentation import check_estimable
+from replay.inference.model.model import (
+    Correction,
+    Model,
+    Motion,
+    Sensor,
+    check_correction,
+    check_motion,
+    check_sensor,
+    check_state,
+    check_switching,
+    switching_of,
+)
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.tracing.functions import arguments_like, place_of, traced
+
+STATES, PATHS, STEPS = 20, 60, 200
+DURATION_S = 0.1
+STEP = 1e-5  # of central differences
+TURN = 2.0 * np.pi
+
+
+class _Call(NamedTuple):
+    """A model's function of a state and other inputs, as a method calls it.
+
+    Attributes:
+        what: its name and place, for sentences.
+        function: itself.
+        state: names and kinds of the state's components.
+        outputs: those of what it returns.
+        inputs: the further arguments that derivatives are taken by, by name: how many numbers each has,
+            and whether it is zero.
+        rest: the last arguments.
+    """
+
+    what: str
+    function: Function
+    state: Mapping[str, str]
+    outputs: Mapping[str, str]
+    inputs: Mapping[str, tuple[int, bool]]
+    rest: tuple[Any, ...]
+
+    def value(self, state: Floats, *others: Floats) -> Floats:
+        return np.array(self.function(tuple(state), *map(tuple, others), *self.rest), dtype=float)
+
+    def others(self, rng: np.random.Generator) -> list[Floats]:
+        return [np.zeros(n) if zero else rng.normal(size=n) for n, zero in self.inputs.values()]
+
+
+def check_model(
+    model: Model,
+    parameters: Mapping[str, Any] | None = None,
+    states: ArrayLike | None = None,
+    seed: int = 0,
+) -> None:
+    """Check all functions of a model against what it declares.
+
+    Args:
+        model: the model.
+        parameters: their values; one that is neither given nor has a default is 1.
+        states: (n, components) at which to try; random ones of order one unless given.
+        seed: of the random states, controls and points of a map.
+
+    Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
+    from central differences or from those written by hand, a number of components is wrong, what is
+    declared linear is not, an angle is declared linear or what is declared an angle is none, a unit
+    vector leaves its length, or a variance is negative; BadInput where the parameters are none of the
+    model's.
+    """
+    values = build(model.parameters, parameters or {}, "check_model")
+    names = number_fields(model.parameters)
+    given = (getattr(values, name) for name in names)
+    numbers = settings_type(names)(*(1.0 if value is None else float(value) for value in given))
+    motions = {"motion": model.motion, **(model.modes or {})}
+    try:
+        check_state("check_model", model)
+        check_estimable("check_model", model)
+        check_correction("check_model", model)
+        for motion in motions.values():
+            check_motion("check_model", model, motion, numbers)
+        if model.modes and model.switching:
+            check_switching("check_model", model, numbers)
+            switching_of("check_model", model, numbers)
+        for sensor in model.sensors:
+            check_sensor("check_model", model, sensor, numbers)
+    except BadInput as error:
+        raise AssertionError(str(error)) from error
+    rng = np.random.default_rng(seed)
+    tried = _states(model.kinds, rng) if states is None else np.array(states, dtype=float)
+    with np.errstate(all="ignore"):
+        calls = [_motion_call(model, motion, numbers) for motion in motions.values()]
+        calls += [_sensor_call(model, sensor, numbers, rng) for sensor in model.sensors]
+        parts: Sequence[Motion | Sensor] = [*motions.values(), *model.sensors]
+        for call, part in zip(calls, parts, strict=True):
+            for state in tried:
+                _check_length(call, call.value(state, *call.others(rng)))
+            by_state = [_check_derivatives(call, state, call.others(rng), part) for state in tried]
+            _check_linear(call, part.linear, by_state)
+            _check_jumps(call, tried, rng)
+            _check_twins(call, tried, rng)
+        if model.correct is not None:
+            for state in tried:
+                _check_correction(model.correct, model, state, rng)
+        for index, name in enumerate(model.state):
+            _check_period(name, index, model, calls, tried)
+        for motion in motions.values():
+            size = motion.noises or model.tangent
+            for state in tried:
+                arguments = (tuple(state), DURATION_S, numbers)
+                _check_noise(motion.noise, arguments, size, motion.noise_block)
+            _check_noise(motion.control_noise, (DURATION_S, numbers), model.controls)
+        for sensor in model.sensors:
+            if not sensor.covariance:
+                _check_noise(sensor.noise, (numbers,), sensor.noises or len(sensor.measured))
+
+
+def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
+    inputs = {"control": (model.controls, False)}
+    if motion.noises:
+        inputs["noise"] = (motion.noises, True)
+    rest = (DURATION_S, numbers)
+    return _Call(place_of(motion.move), motion.move, model.state, model.state, inputs, rest)
+
+
+def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
+    about = tuple(rng.normal(size=sensor.about_size))
+    inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
+    rest = (about, numbers)
+    return _Call(place_of(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
+
+
+def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
+    """Random states (n, components): numbers of order one, angles of all turns, unit vectors."""
+    columns = []
+    for kind, *_ in things(kinds):
+        drawn = rng.normal(size=(STATES, WIDTHS[kind]))
+        if kind == "angle":
+            drawn = rng.uniform(-np.pi, np.pi, (STATES, 1))
+        elif kind != "linear":
+            drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+        columns.append(drawn)
+    return np.concatenate(columns, axis=1)
+
+
+def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
+    found = np.empty((1, tangent_size(kinds)))
+    differencing(kinds)(tuple(end), tuple(start), found, 0)
+    return found[0]
+
+
+def _check_derivatives(
+    call: _Call, state: Floats, others: list[Floats], part: Motion | Sensor
+) -> Floats:
+    """Compare derivatives with differences and what is written by hand; returns that by the state."""
+    kinds, outputs = tuple(call.state.values()), tuple(call.outputs.values())
+    sizes = {"state": tangent_size(kinds), **{name: n for name, (n, _) in call.inputs.items()}}
+    inputs = [Input("state", kinds, "state")]
+    inputs += [Input(name, ("linear",) * n, name if n else "") for name, (n, _) in call.inputs.items()]
+    rows = tangent_size(outputs)
+    work = SimpleNamespace(
+        values=np.empty(len(outputs)), **{name: np.zeros((rows, size)) for name, size in sizes.items()}
+    )
+    given = (tuple(state), *map(tuple, others), *call.rest)
+    try:
+        linearise = derivative(traced(call.function, *arguments_like(given)), inputs, outputs, "values")
+    except BadInput as error:
+        raise AssertionError(str(error)) from error
+    linearise(*given, work)
+    arguments = [state, *others]
+    for index, (name, size) in enumerate(sizes.items()):
+        for column in range(size):
+            add = retraction(kinds if index == 0 else ("linear",) * size)
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = [each.copy() for each in arguments]
+                add(moved[index], sign * STEP * np.eye(size)[column])
+                ends.append(call.value(*moved))
+            slopes = _difference(ends[0], ends[1], outputs) / (2.0 * STEP)
+            _compare(call, getattr(work, name), slopes, (name, column), 1e-6, "by central differences")
+    _check_by_hand(call, part, state, others, work)
+    return np.array(work.state)
+
+
+def _check_correction(
+    correct: Correction, model: Model, state: Floats, rng: np.random.Generator
+) -> None:
+    """A small correction moves every component by itself, and a step back is found again."""
+    at, slope = tuple(state), rng.normal(size=model.tangent)
+    slope /= np.dot(slope, correct.along(at))
+    for moved in (correct.move, correct.back):
+        for column, name in enumerate(_tangent(model.state)):
+            small = STEP * np.eye(model.tangent)[column]
+            end, start = (np.array(moved(at, tuple(step), slope)) for step in (small, -small))
+            slopes = _difference(end, start, model.kinds) / (2.0 * STEP)
+            if not np.allclose(slopes, small / STEP, atol=1e-6):
+                place = place_of(moved)
+                raise AssertionError(f"{place}: a small step of {name} moves other components too")
+    step = 0.3 * rng.normal(size=model.tangent)
+    again = correct.step(at, correct.back(at, tuple(step), slope), slope)
+    if not np.allclose(again, step, atol=1e-9):
+        both = f"{place_of(correct.step)} does not find the step of {place_of(correct.back)}"
+        raise AssertionError(both)
+
+
+def _check_by_hand(
+    call: _Call, part: Motion | Sensor, state: Floats, others: list[Floats], work: Any
+) -> None:
+    written: dict[str, Floats] = {}
+    if isinstance(part, Motion) and part.jacobians is not None:
+        control = others[0]
+        written = {name: np.zeros_like(getattr(work, name)) for name in ("state", "control")}
+        part.jacobians(tuple(state), tuple(control), *call.rest, written["state"], written["control"])
+        if part.control_noise is None:  # nobody asks for it
+            del written["control"]
+    elif isinstance(part, Sensor) and part.jacobian is not None:
+        written = {"state": np.zeros_like(work.state)}
+        part.jacobian(tuple(state), *call.rest, written["state"])
+    for name, jacobian in written.items():
+        for column in range(jacobian.shape[1]):
+            found = getattr(work, name)
+            _compare(call, found, jacobian[:, column], (name, column), 1e-9, "as written by hand")
+
+
+def _compare(
+    call: _Call, exact: Floats, others: Floats, by: tuple[str, int], tolerance: float, how: str
+) -> None:
+    """Raise where a column of a Jacobian is not as it is by another way."""
+    name, column = by
+    found = exact[:, column]
+    allowed = tolerance * np.maximum(1.0, np.maximum(np.abs(found), np.abs(exact).max(initial=0.0)))
+    wrong = np.flatnonzero(~(np.abs(found - others) <= allowed))
+    if len(wrong):
+        row = int(wrong[0])
+        inner = _tangent(call.state)[column] if name == "state" else f"{name} {column}"
+        raise AssertionError(
+            f"{call.what}: the derivative of {_tangent(call.outputs)[row]} by {inner} is "
+            f"{found[row]:.9g} and {others[row]:.9g} {how}"
+        )
+
+
+def _tangent(components: Mapping[str, str]) -> list[str]:
+    return [name for name, _ in tangent_components(list(components), list(components.values()))]
+
+
+def _check_linear(call: _Call, is_linear: bool, by_state: list[Floats]) -> None:
+    if not is_linear:
+        return
+    spread = np.ptp(by_state, axis=0)
+    if not np.all(spread <= 1e-9 * np.maximum(1.0, np.abs(by_state[0]))):
+        row, column = np.unravel_index(int(np.argmax(spread)), spread.shape)
+        raise AssertionError(
+            f"{call.what} is declared linear, but the derivative of {_tangent(call.outputs)[row]} by "
+            f"{_tangent(call.state)[column]} changes from state to state"
+        )
+
+
+def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
+    """An angle a turn further, and the negative of a unit vector, are the same state."""
+    names, outputs = list(call.state), tuple(call.outputs.values())
+    for kind, first, *_ in things(tuple(call.state.values())):
+        if kind == "linear":
+            continue
+        for state in states:
+            others, twin = call.others(rng), state.copy()
+            columns = slice(first, first + WIDTHS[kind])
+            twin[columns] = state[columns] + TURN if kind == "angle" else -state[columns]
+            value = call.value(state, *others)
+            away = _difference(call.value(twin, *others), value, outputs)
+            wrong = np.flatnonzero(~(np.abs(away) <= 1e-8 * max(1.0, np.abs(value).max())))
+            if len(wrong):
+                same = "a full turn on" if kind == "angle" else "at its negative, which is the same"
+                other = _tangent(call.outputs)[wrong[0]]
+                raise AssertionError(
+                    f"{call.what}: {names[first]} is of kind {kind}, but {other} is another {same}"
+                )
+
+
+def _check_length(call: _Call, value: Floats) -> None:
+    for kind, first, *_ in things(tuple(call.outputs.values())):
+        vector = value[first : first + WIDTHS[kind]]
+        if kind in ("axis", "quaternion") and not abs(np.linalg.norm(vector) - 1.0) < 1e-9:
+            raise AssertionError(
+                f"{call.what}: {list(call.outputs)[first]} and its neighbours are of kind {kind}, but "
+                f"come out with length {np.linalg.norm(vector):.6g}"
+            )
+
+
+def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
+    """A component declared linear that jumps by a turn along a path of states is an angle."""
+    kinds = tuple(call.state.values())
+    add, scales = retraction(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
+    linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]
+    for path in range(PATHS if linear else 0):
+        others, direction = call.others(rng), np.empty(tangent_size(kinds))
+        for kind, _, t, width in things(kinds):
+            direction[t : t + width] = scales[kind] * rng.normal(size=width)
+        values = np.empty((STEPS + 1, len(call.outputs)))
+        for step in range(STEPS + 1):
+            state = states[path % len(states)].copy()
+            add(state, (step / STEPS - 0.5) * direction)
+            values[step] = call.value(state, *others)
+        change = np.diff(values[:, linear], axis=0)
+        usual = np.abs(change)
+        is_jump = np.abs(usual - TURN) < 0.5
+        calm = np.minimum(np.roll(usual, 1, axis=0), np.roll(usual, -1, axis=0)) < 0.5
+        if (is_jump & calm).any():
+            column = int(np.flatnonzero((is_jump & calm).any(axis=0))[0])
+            raise AssertionError(
+                f"{call.what}: {list(call.outputs)[linear[column]]} is declared linear, but jumps by a "
+                "full turn from one state to the next; its kind is angle"
+            )
+
+
+def _check_period(name: str, index: int, model: Model, calls: list[_Call], states: Floats) -> None:
+    """A component declared linear that tells by sine and cosine alone is an angle."""
+    if model.kinds[index] != "linear":
+        return
+
+    def changes(shift: float) -> bool:
+        """Whether anything changes, beside the component itself, when it is shifted."""
+        for call in calls:
+            zeros = [np.full(n, 0.0 if zero else 0.5) for n, zero in call.inputs.values()]
+            for state in states:
+                moved = state.copy()
+                moved[index] += shift
+                value = call.value(state, *zeros)
+                away = call.value(moved, *zeros) - value
+                if name in call.outputs:
+                    away[list(call.outputs).index(name)] -= shift
+                angular = np.array([kind == "angle" for kind in call.outputs.values()])
+                away = np.where(angular, wrap_angle(away), away)
+                if not np.all(np.abs(away) <= 1e-8 * max(1.0, np.abs(value).max())):
+                    return True
+        return False
+
+    if changes(1.0) and not changes(TURN):
+        raise AssertionError(
+            f"check_model: {name} is declared linear, but nothing changes when it is a full turn on; "
+            "its kind is angle"
+        )
+
+
+def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, block: int = 0) -> None:
+    """Variances, or the rows of a lower triangle."""
+    if noise is None:
+        return
+    numbers = np.array(noise(*arguments), dtype=float)
+    if len(numbers) == size:
+        smallest = float(numbers.min(initial=0.0))
+        scale = 0.0
+    else:
+        matrix = np.zeros((size, size))
+        adding_noise(size, block)(matrix, numbers)
+        smallest, scale = float(np.linalg.eigvalsh(matrix)[0]), 1e-12 * float(np.abs(matrix).max())
+    if not smallest >= -scale:
+        raise AssertionError(f"{place_of(noise)} gives a negative variance, {smallest:.6g}")

@@ -1,0 +1,200 @@
+"""How an update moves a state by a step of its tangent space, and what becomes of the covariance.
+
+Components move by themselves (`manifold.retraction`), unless a model says how they bend together
+(`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
+of the new one by the derivative of the moved state by the step, and the other way by that of the step by
+the state to which it leads.
+"""
+
+from typing import Any
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.gaussian import moved_covariance
+from replay.inference.linear_algebra.linearization import Input, derivative
+from replay.inference.linear_algebra.manifold import (
+    differencing,
+    is_flat,
+    resetting,
+    retraction,
+    tangent_size,
+)
+from replay.inference.linear_algebra.tuples import filling, tuple_of
+from replay.inference.model.model import Correction, Model
+from replay.tracing.functions import traced
+
+Kinds = tuple[str, ...]
+
+
+def sloping(kinds: Kinds, correct: Correction | None) -> Function:
+    """`fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
+
+    Where nothing bends it is left as it is.
+    """
+    if correct is None:
+
+        def leave(mean: Floats, covariance: Floats, slope: Floats) -> None:
+            pass
+
+        return leave
+    along = traced(correct.along, len(kinds))
+    read_state, t = tuple_of(len(kinds)), tangent_size(kinds)
+
+    def fill(mean: Floats, covariance: Floats, slope: Floats) -> None:
+        direction, variance = along(read_state(mean)), 0.0
+        for row in range(t):
+            slope[row] = 0.0
+            for column in range(t):
+                slope[row] += covariance[row, column] * direction[column]
+            variance += direction[row] * slope[row]
+        for row in range(t):
+            slope[row] = slope[row] / variance if variance > 0.0 else 0.0
+
+    return fill
+
+
+def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) -> Function:
+    """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
+
+    Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
+    `product`. With `back` it is a step of a smoother's way back.
+    """
+    if correct is not None:
+        step_together = _stepping(kinds, correct.back if back else correct.move)
+        fill = filling(len(kinds))
+
+        def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
+            step_together(mean, work)
+            fill(mean, work.state)
+            moved_covariance(covariance, work.transition, work.product)
+
+        return move_together
+    add, reset = retraction(kinds), resetting(kinds)
+    if is_flat(kinds):
+
+        def move(mean: Floats, covariance: Floats, work: Any) -> None:
+            add(mean, work.step)
+
+        return move
+
+    def move_and_turn(mean: Floats, covariance: Floats, work: Any) -> None:
+        add(mean, work.step)
+        reset(work.step, covariance)
+        reset(work.step, covariance.T)
+
+    return move_and_turn
+
+
+def comparing(kinds: Kinds, correct: Correction | None) -> Function:
+    """`compare(origin, mean, covariance, work)`: the step that `correcting` takes back, found again.
+
+    Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
+    from the mean's tangent space to the origin's.
+    """
+    if correct is not None:
+        t, read_state = tangent_size(kinds), tuple_of(len(kinds))
+        read_slope = tuple_of(t)
+        inputs = [
+            Input("origin", kinds),
+            Input("target", kinds, "transition"),
+            Input("slope", ("linear",) * t),
+        ]
+        linearise = derivative(
+            traced(correct.step, len(kinds), len(kinds), t), inputs, ("linear",) * t, "step"
+        )
+
+        def compare_together(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+            linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
+            for row in range(t):
+                work.change[0, row] = work.step[row]
+            moved_covariance(covariance, work.transition, work.product)
+
+        return compare_together
+    subtract, reset_back = differencing(kinds), resetting(kinds, back=True)
+    if is_flat(kinds):
+
+        def compare(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+            subtract(mean, origin, work.change, 0)
+
+        return compare
+
+    def compare_and_turn(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
+        subtract(mean, origin, work.change, 0)
+        reset_back(work.change[0], covariance)
+        reset_back(work.change[0], covariance.T)
+
+    return compare_and_turn
+
+
+def relinearising(model: Model) -> tuple[Function, Function]:
+    """Where an iterated update linearises, and the chain rule back to the mean.
+
+    `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`; after it
+    `chain(rows, work)` makes of a Jacobian (m, t) at that state one by the step.
+    """
+    t = model.tangent
+    if model.correct is not None:
+
+        def chain_together(rows: Floats, work: Any) -> None:
+            for i in range(len(rows)):
+                for column in range(t):
+                    entry = 0.0
+                    for k in range(t):
+                        entry += rows[i, k] * work.transition[k, column]
+                    work.turned[column] = entry
+                for column in range(t):
+                    rows[i, column] = work.turned[column]
+
+        return _stepping(model.kinds, model.correct.move), chain_together
+    fill, add, flat = filling(model.size), retraction(model.kinds), is_flat(model.kinds)
+    turn = resetting(model.kinds)
+
+    def step_to(mean: Floats, work: Any) -> None:
+        fill(work.state, mean)
+        add(work.state, work.step)
+
+    def chain(rows: Floats, work: Any) -> None:
+        if not flat:
+            for row in range(t):
+                work.turned[row] = -work.step[row]
+            turn(work.turned, rows.T)
+
+    return step_to, chain
+
+
+def _stepping(kinds: Kinds, move: Function) -> Function:
+    """`step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
+    straight = ("linear",) * tangent_size(kinds)
+    inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
+    arguments = (len(each.kinds) for each in inputs)
+    linearise = derivative(traced(move, *arguments), inputs, kinds, "state")
+    read_state, read_step = tuple_of(len(kinds)), tuple_of(len(straight))
+
+    def step_to(mean: Floats, work: Any) -> None:
+        linearise(read_state(mean), read_step(work.step), read_step(work.slope), work)
+
+    return step_to
+
+
+def correcting_more(model: Model, more: int) -> Correction | None:
+    """How a model is corrected whose state gets so many more components, which move by themselves."""
+    if model.correct is None:
+        return None
+    n, t, correct = model.size, model.tangent, model.correct
+
+    def longer(move: Function) -> Function:
+        def move_all(state: Any, step: Any, slope: Any) -> Any:
+            moved = move(state[:n], step[:t], slope[:t])
+            return (*moved, *(state[n + each] + step[t + each] for each in range(more)))
+
+        return move_all
+
+    along_own, step_own = correct.along, correct.step
+
+    def along(state: Any) -> Any:
+        return (*along_own(state[:n]), *(0.0,) * more)
+
+    def step_to(state: Any, target: Any, slope: Any) -> Any:
+        step = step_own(state[:n], target[:n], slope[:t])
+        return (*step, *(target[n + each] - state[n + each] for each in range(more)))
+
+    return Correction(along, longer(correct.move), step_to, longer(correct.back))

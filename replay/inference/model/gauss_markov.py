@@ -1,0 +1,48 @@
+"""How what is added to a state moves: a random walk, or one that comes back to its mean.
+
+The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimation, 1974, section 3.6.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import NonNegativeFloat, create_model
+
+from replay.inference.model.model import ModelParameters
+
+
+class Walk(NamedTuple):
+    """What is known of a component.
+
+    Attributes:
+        sigma: its standard deviation at first.
+        drift: the density of its walk, per square root of a second.
+        time_s: how fast it comes back to its mean, while noise keeps up its sigma; infinite for never.
+    """
+
+    sigma: float
+    drift: float
+    time_s: float
+
+
+def with_walk_parameters(
+    parameters: type[ModelParameters], names: Sequence[str]
+) -> type[ModelParameters]:
+    """Parameters of a model with those of the walks of these components."""
+    walks: dict[str, Any] = {
+        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in Walk._fields
+    }
+    return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **walks)
+
+
+def kept(name: str, duration_s: Any, parameters: Any) -> Any:
+    """The share of a component's distance from its mean that is left after a step."""
+    return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
+
+
+def spread(name: str, duration_s: Any, parameters: Any) -> Any:
+    """The variance that a step adds to it."""
+    walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
+    lost = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
+    return walked + lost * getattr(parameters, f"sigma_{name}") ** 2

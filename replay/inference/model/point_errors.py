@@ -1,0 +1,147 @@
+"""Errors that last, of what is measured about each point of a map, as part of the state.
+
+Measurement noise that is not white: ranges to one anchor, or between an anchor and a tag, err alike for
+seconds. A transformation of models: the state gets a component for each point or pair of points, which
+is added to what is measured about it, and moves by itself: a random walk, or a first-order Gauss-Markov
+process of mean zero. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, section 8.2.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from typing import Any, NamedTuple
+
+from recorders.errors import BadInput
+from replay.inference.model.corrections import correcting_more
+from replay.inference.model.gauss_markov import kept, spread, with_walk_parameters
+from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.settings import trial_parameters
+
+Names = tuple[str, ...]
+
+
+class PointError(NamedTuple):
+    """The error of what is `measured` about the points with these numbers, one of each map."""
+
+    measured: str
+    numbers: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """The component of the state."""
+        return "_".join(["error", self.measured, *map(str, self.numbers)])
+
+
+Errors = tuple[PointError, ...]
+
+
+def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
+    """The errors that an entry of `estimate` names; none where it names a parameter.
+
+    `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
+    about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
+    Raises BadInput where the model measures nothing of the kind.
+    """
+    found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
+    if found is None:
+        return []
+    measured, numbers = found.groups()
+    spans = [re.fullmatch(r" *(\d+)(?::(\d+))? *", each) for each in numbers.split(",")]
+    ranges = [range(int(each[1]), int(each[2] or int(each[1]) + 1)) for each in spans if each]
+    maps = max((len(each.maps) for each in model.sensors if measured in each.measured), default=0)
+    if len(spans) > maps or len(ranges) < len(spans) or not all(ranges):
+        raise BadInput(
+            f"{where}: expected NUMBER or FIRST:END in the brackets, with a comma before those of a "
+            f"second map; this model measures {measured} about the points of {maps} maps"
+        )
+    return [PointError(measured, pair) for pair in product(*ranges)]
+
+
+@lru_cache(maxsize=64)
+def with_point_errors(model: Model, errors: Errors) -> Model:
+    """The model with these errors in its state."""
+    kinds = {name: kind for each in model.sensors for name, kind in each.measured.items()}
+    return replace(
+        model,
+        state={**model.state, **{each.name: kinds[each.measured] for each in errors}},
+        parameters=with_walk_parameters(model.parameters, _names(errors)),
+        sensors=tuple(sensor_with_errors(model, sensor, errors) for sensor in model.sensors),
+        motion=motion_with_errors(model, model.motion, errors),
+        correct=correcting_more(model, len(errors)),
+        modes=model.modes
+        and {name: motion_with_errors(model, each, errors) for name, each in model.modes.items()},
+    )
+
+
+@lru_cache(maxsize=256)
+def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
+    """The motion, beside which each error goes its own way."""
+    n, t = model.size, model.tangent
+    noises, names, inner, noise_of = motion.noises, _names(errors), motion.move, motion.noise
+    given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()
+    entries = len(given) or t
+
+    def move(state: Any, control: Any, *others: Any) -> Any:
+        *entering, duration_s, parameters = others
+        own = (each[:noises] for each in entering)
+        moved = list(inner(state[:n], control, *own, duration_s, parameters))
+        for index, name in enumerate(names):
+            stay = kept(name, duration_s, parameters) * state[n + index]
+            moved.append(stay + entering[0][noises + index] if noises else stay)
+        return tuple(moved)
+
+    def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
+        found = noise_of(state[:n], duration_s, parameters) if noise_of else (0.0,) * t
+        return (*found, *(spread(name, duration_s, parameters) for name in names))
+
+    return replace(
+        motion,
+        move=move,
+        noise=noise,
+        noises=noises + len(errors) if noises else 0,
+        noise_block=t if not noises and entries != t else 0,
+        jacobians=None,
+        moments=None,
+    )
+
+
+@lru_cache(maxsize=256)
+def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
+    """The sensor, to whose measurements the errors about their points are added."""
+    own = [
+        (model.size + index, list(sensor.measured).index(each.measured), each.numbers)
+        for index, each in enumerate(errors)
+        if each.measured in sensor.measured
+    ]
+    n, size, inner = model.size, sensor.about_size, sensor.measure
+
+    def measure(state: Any, *others: Any) -> Any:
+        *entering, about, parameters = others
+        seen = list(inner(state[:n], *entering, about[:size], parameters))
+        for place, row, numbers in own:
+            seen[row] = seen[row] + _same(about[size:], numbers) * state[place]
+        return tuple(seen)
+
+    return replace(
+        sensor,
+        measure=measure,
+        is_numbered=bool(own),
+        jacobian=None,
+        log_likelihood=None if own else sensor.log_likelihood,
+        moments=None,
+    )
+
+
+def _same(about: Any, numbers: Sequence[int]) -> Any:
+    """1 where a message is about these points, 0 where not."""
+    found: Any = 1.0
+    for index, number in enumerate(numbers):
+        found = found * (about[index] == number)
+    return found
+
+
+def _names(errors: Errors) -> Names:
+    return tuple(each.name for each in errors)

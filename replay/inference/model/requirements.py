@@ -1,0 +1,120 @@
+"""What a model needs of a log, in words: for a list of models, and for a log that lacks something."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from recorders.log import Schema, Topic, schemas
+from replay.engine.streams.channels import resolved
+from replay.inference.model.binding import UnderPrefix, measures_state, serving
+from replay.inference.model.model import (
+    Model,
+)
+
+# What to do with a log that no registered model fits; docs/your-model.md
+OWN_MODEL = (
+    'use a model of your own from Python, fl.modelled(MODEL, "ekf"), or register it: see Your model '
+    "in the documentation"
+)
+
+
+def needs_of(model: Model) -> str:
+    """What a log has to have for a model, in words; of one that can start without, what it may have."""
+    words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
+    if model.start is None or model.control is None or not model.needs_sensor:
+        return "; ".join(words)
+    control, *maps, sensors = words
+    of_maps = [f"those about a map need {each}" for each in maps]
+    return "; ".join([control, sensors.replace("one of", "any of", 1), *of_maps])
+
+
+def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
+    """Which of the models comes nearest to fitting a log, and what the log lacks for it."""
+    tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
+    name, parts = max(tried, key=lambda one: _fit(one[1]))
+    if not any(part.is_here for part in parts):
+        which = f"{name} needs" if len(models) == 1 else "a registered model needs"
+        return f"it has nothing that {which}"
+    missing = "; ".join(part.words for part in parts if not part.is_here)
+    return f"model {name} comes nearest and lacks {missing}"
+
+
+def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
+    """Which model the log's prior is of, where only its control has another name; empty where none is.
+
+    As with several inertial units, of which one has to be chosen.
+    """
+    for name, model in models.items():
+        control = model.control
+        if control is None or control.topic in names:
+            continue
+        others = [
+            each for each, topic in topics.items() if topic.schema_name == control.schema.full_name
+        ]
+        end = f"/{names.get(model.prior, model.prior)}"
+        priors = [each for each in topics if each.endswith(end)]
+        for prior in priors:
+            place = resolved(control.topic, prior.rpartition("/")[0])
+            if others and place not in topics and names_state(topics[prior], model, exactly=True):
+                return (
+                    f"{prior} is of model {name}, which needs {place} ({control.schema.full_name}); the "
+                    f"log has {', '.join(others)} of that type: choose one, as with "
+                    f"--set topics.{control.topic}={others[0]}"
+                )
+    return ""
+
+
+def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
+    """What a model needs, under the prefix of a log that has most of it."""
+    prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
+    return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
+
+
+def _fit(parts: Sequence["Part"]) -> int:
+    return sum(1 if part.is_here else -1 for part in parts)
+
+
+class Part(NamedTuple):
+    """Something that a model needs, and whether a log has it."""
+
+    words: str
+    is_here: bool
+
+
+def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
+    """All that a model needs under one prefix."""
+
+    def part(name: str, schema: Schema, system: str = "") -> Part:
+        place, known = here.place(name), here.topics.get(here.place(name))
+        words = f"{place} ({schema.full_name}"
+        words += f" of system {system})" if system else ")"
+        if known is not None and known.schema_name not in serving(schema):
+            return Part(f"{words}, which is {known.schema_name} here", is_here=False)
+        is_of = known is not None and known.metadata.get("system", system) == system
+        return Part(words, is_here=is_of)
+
+    parts = []
+    sensing = [sensor for sensor in model.all_sensors if here.has(sensor.topic)]
+    starts = not sensing or model.finds_start or any(measures_state(model, each) for each in sensing)
+    if model.start is None or here.has(model.prior) or not starts:
+        words, is_here = part(model.prior, schemas.GAUSSIAN_ESTIMATE)
+        if is_here:
+            is_here = names_state(here.topics[here.place(model.prior)], model)
+        parts.append(Part(f"{words} of {', '.join(model.state)}", is_here))
+    if model.control is not None:
+        parts.append(part(model.control.topic, model.control.schema))
+    seeing = [sensor for sensor in model.sensors if not here.topics or here.has(sensor.topic)]
+    maps = {each.topic: each for sensor in seeing for each in sensor.maps}
+    parts += [part(topic, each.schema) for topic, each in maps.items()]
+    sensors = [part(each.topic, each.schema, model.system) for each in model.all_sensors]
+    if sensors and model.needs_sensor:
+        own = len(model.sensors)
+        words = ("one of " if own > 1 else "") + ", ".join(each.words for each in sensors[:own])
+        words = ", or ".join([words, *(each.words for each in sensors[own:])])
+        parts.append(Part(words, any(each.is_here for each in sensors)))
+    return parts
+
+
+def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
+    """Whether a prior's channel names all components of a model's state, and no others if `exactly`."""
+    named = set(prior.metadata.get("components", "").split(","))
+    return named == set(model.state) if exactly else named >= set(model.state)

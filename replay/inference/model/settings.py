@@ -1,0 +1,157 @@
+"""The numbers that a model's functions read: given as parameters, or stated by a log's channels."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Topic
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.channels import stated
+from replay.inference.model.binding import Found
+from replay.inference.model.model import (
+    Model,
+    ModelParameters,
+    Sensor,
+    check_correction,
+    check_motion,
+    check_sensor,
+    check_state,
+    check_switching,
+    switching_of,
+)
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.stage import Stage
+
+
+@lru_cache(maxsize=64)
+def reading_settings(names: tuple[str, ...]) -> Function:
+    """`read(settings, row)`: a row of numbers as the NamedTuple."""
+    kind = settings_type(names)
+
+    def read(settings: Floats, row: int) -> Any:
+        return kind(*(settings[row, index] for index in range(len(names))))
+
+    return read
+
+
+def trial_parameters(model: Model) -> Any:
+    """Parameters to try functions with: every number is one."""
+    names = number_fields(model.parameters)
+    return settings_type(names)(*(1.0,) * len(names))
+
+
+class TracedParameters:
+    """Parameters to try a model's functions with: `read` is which they read; one where unset."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self.read: set[str] = set()
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._values:
+            raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._values)}")
+        self.read.add(name)
+        value = self._values[name]
+        # overflows to infinity, as compiled code does
+        return np.float64(1.0 if value is None else value)
+
+
+def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:
+    """The numbers (1 + sensors, fields) that motion and sensors get: given, or as channels state them.
+
+    What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
+    looks in its own first. Raises BadInput where none states a number that is used, or one that the
+    parameter does not allow, and where the model is not what it says.
+    """
+    model = stage.model
+    names = number_fields(model.parameters)
+    given = {name: getattr(parameters, name) for name in names}
+    everything = _stating(found)
+    assumed = assumed_of(label, stage, found, parameters)
+    given |= {name: number for name, number in assumed.items() if given[name] is None}
+    needed = _needed(f"estimator {label}", stage, tuple(given.items()))
+    own = [[], *([topic] for _, topic in found.sensors)]
+    settings = np.array(
+        [
+            [
+                stated([*first, *everything], name, model.parameters, needed=False)
+                if given[name] is None
+                else float(given[name])
+                for name in names
+            ]
+            for first in own
+        ]
+    )
+    lacking = [
+        (row, name)
+        for row, read in enumerate(needed)
+        for column, name in enumerate(names)
+        if name in read and np.isnan(settings[row, column])
+    ]
+    if lacking:
+        row, _ = lacking[0]
+        missing = list(dict.fromkeys(name for _, name in lacking))
+        usual = model.start.parameters if model.start is not None else {}
+        better = ", or numbers that you know better" if usual else ""
+        mend = " ".join(f"--set {name}={usual.get(name, '...')}" for name in missing)
+        raise BadInput(
+            f"topic {[*own[row], *everything][0].name} does not state {', '.join(missing)}; give "
+            f"{'it' if len(missing) == 1 else 'them'} with {mend}{better}"
+        )
+    if stage.modes:
+        switching_of(f"estimator {label}", model, reading_settings(names)(settings, 0))
+    return settings
+
+
+def _stating(found: Found) -> list[Topic]:
+    """The topics whose channels state numbers, in the order in which they are asked."""
+    control = [] if found.control is None else [found.control]
+    instead, sensors = ([topic for _, topic in each] for each in (found.instead, found.sensors))
+    return [*instead, *control, found.prior, *sensors]
+
+
+def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
+    """The parameters that are used, and assumed since a log without a prior does not state them."""
+    start = stage.model.start
+    if found.has_prior or start is None:
+        return {}
+    names = number_fields(stage.model.parameters)
+    given = {name: getattr(parameters, name) for name in names}
+    read = set().union(*_needed(f"estimator {label}", stage, tuple(given.items())))
+    stating = _stating(found)
+    return {
+        name: number
+        for name, number in start.parameters.items()
+        if name in read and given[name] is None and not any(name in each.metadata for each in stating)
+    }
+
+
+@lru_cache(maxsize=64)
+def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tuple[set[str], ...]:
+    """The parameters that motion and sensors read; BadInput where the model is not what it says."""
+    model, values = stage.model, dict(given)
+    check_state(where, model)
+    check_correction(where, model)
+    motion, *sensors = traced = [TracedParameters(values) for _ in range(1 + len(stage.sensors))]
+    for each in stage.modes or (stage.motion,):
+        check_motion(where, model, each, motion)
+    if stage.modes:
+        check_switching(where, model, motion)
+    for sensor, parameters in zip(stage.sensors, sensors, strict=True):
+        check_sensor(where, model, sensor, parameters)
+    return tuple(each.read for each in traced)
+
+
+def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
+    """Why a message was not used, and what would help; "" where no covariance can be missing."""
+    if not sensor.covariance:
+        return ""
+    parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))
+    if sensor.noise is not None:
+        sensor.noise(parameters)
+    mend = "".join(f"; give --set {name}=..." for name in sorted(parameters.read))
+    what = sensor.covariance if isinstance(sensor.covariance, str) else "its covariance"
+    return f"topic {topic}: {what} is missing{mend}"

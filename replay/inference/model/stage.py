@@ -1,0 +1,119 @@
+"""A model as a method takes it: its functions traced, with the motion and the sensors that are used."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+from recorders.registry import available
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import number_fields
+from replay.tracing.functions import Argument, Shape, traced
+
+Part = TypeVar("Part")
+
+
+class Stage(NamedTuple):
+    """A model as a method takes it: its motion, and the sensors that the log has.
+
+    `modes` are the motions of all modes, in their order, for a method that takes all of them. Made by
+    `stage_of`: the functions are traced.
+    """
+
+    model: Model
+    motion: Motion
+    sensors: tuple[Sensor, ...]
+    modes: tuple[Motion, ...] = ()
+
+
+def stage_of(
+    model: Model,
+    motion: Motion,
+    sensors: Sequence[Sensor] = (),
+    modes: Sequence[Motion] = (),
+    names: tuple[str, ...] | None = None,
+) -> Stage:
+    """A model with one of its motions, some of its sensors, and perhaps all its modes, traced.
+
+    `names` are the parameters that functions may read, the model's own unless given.
+
+    Raises BadInput where a function cannot be traced; what has not changed is the same again.
+    """
+    names = number_fields(model.parameters) if names is None else names
+    return Stage(
+        traced_model(model, names),
+        traced_motion(model, motion, names),
+        tuple(traced_sensor(model, sensor, names) for sensor in sensors),
+        tuple(traced_motion(model, mode, names) for mode in modes),
+    )
+
+
+def title_of(model: Model, summary: str) -> str:
+    """What the kernel of a method with this summary is called while one waits until it is compiled.
+
+    The model has its registered name where it is one of those that are loaded, which imports nothing.
+    """
+    found = (
+        (name, getattr(sys.modules.get(entry.module), entry.attr, None))
+        for name, entry in available("models").items()
+    )
+    named = [name for name, known in found if getattr(known, "summary", None) == model.summary]
+    return f"the {summary.partition(';')[0]} of {named[0] if named else model.summary}"
+
+
+def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motion:
+    """A motion whose functions are traced."""
+    n, t, controls = model.size, model.tangent, model.controls
+    entering = (motion.noises,) if motion.noises else ()
+    driven = (controls, None, names)
+    return _with_traced(
+        motion,
+        move=(n, controls, *entering, None, names),
+        noise=(n, None, names),
+        control_noise=(None, names),
+        lost=(n, None, names),
+        jacobians=(n, *driven, Shape((t, t)), Shape((t, controls))),
+        moments=(Shape((n,)), Shape((t, t)), *driven),
+    )
+
+
+def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Sensor:
+    """A sensor whose functions are traced."""
+    n, t, m, about = model.size, model.tangent, len(sensor.measured), sensor.about_size
+    entering = (sensor.noises,) if sensor.noises else ()
+    filled = (Shape((m,)), Shape((m, m)), Shape((t, m)))
+    return _with_traced(
+        sensor,
+        measure=(n, *entering, about, names),
+        noise=(names,),
+        jacobian=(n, about, names, Shape((m, t))),
+        moments=(Shape((n,)), Shape((t, t)), about, names, *filled),
+        log_likelihood=(n, m, about, names),
+    )
+
+
+def traced_model(model: Model, names: tuple[str, ...]) -> Model:
+    """A model whose switching is traced; its motion and sensors are as they were."""
+    if model.switching is None:
+        return model
+    switching = _with_traced(model.switching, rates=(names,))
+    return model if switching is model.switching else _same_again(model, switching=switching)
+
+
+def _with_traced(part: Part, **arguments: tuple[Argument, ...]) -> Part:
+    functions = {name: getattr(part, name) for name in arguments}
+    made = {name: traced(each, *arguments[name]) for name, each in functions.items()}
+    changed = {name: each for name, each in made.items() if each is not functions[name]}
+    return _same_again(part, **changed) if changed else part
+
+
+_KNOWN: dict[Any, tuple[Any, Any]] = {}
+
+
+def _same_again(part: Part, **changes: Any) -> Part:
+    """The part with these changes: one object as long as they are the same ones."""
+    key = id(part), *((name, id(each)) for name, each in changes.items())
+    known = _KNOWN.get(key)
+    if known is None:
+        known = _KNOWN[key] = part, replace(part, **changes)  # type: ignore[type-var]
+    return known[1]

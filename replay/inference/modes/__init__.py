@@ -1,0 +1,4 @@
+"""Several filters side by side: interacting multiple models, and Gaussian sums.
+
+Begin with `imm`.
+"""

@@ -1,0 +1,323 @@
+"""A bank of filters: many narrow Gaussians from a prior that is too wide in an angle for one of them.
+
+The prior is cut across the widest direction of its angles, such as an unknown heading, into Gaussians
+side by side. Each is filtered by itself; every message weighs them by its likelihood, and what is told
+is their mixture. A member that is next to impossible ends, and where those that are left agree they
+become one, so that in the end the bank costs what its filter costs.
+
+Magill, Optimal Adaptive Estimation of Sampled Stochastic Processes, IEEE TAC 10(4), 1965.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.results import ALL_WELL
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, things
+from replay.inference.kalman.methods import (
+    FILTERS,
+    Method,
+    RegressionParameters,
+    UnscentedParameters,
+    filter_with,
+    named_filter,
+    no_steps,
+)
+from replay.inference.kalman.steps import Gaussian, Note, Steps
+from replay.inference.kalman.update import slots_of
+from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
+from replay.inference.linear_algebra.manifold import retraction
+from replay.inference.model.model import Model
+from replay.inference.model.stage import Stage
+from replay.inference.modes.imm import Mixing, Mixtures, likeliest_of, mixing, weighed_update
+from replay.inference.run.filtering import State
+
+IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
+ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says
+AGREED = 0.1  # members become one where their means are on average so near, as a squared distance
+
+
+class BankParameters(UnscentedParameters, RegressionParameters):
+    """The filter of every member, and the number of members for a whole turn.
+
+    Members lie side by side, and the standard deviation of each is half their distance, so that their
+    sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not cut.
+    The number is odd: of an even one, each member has another opposite, and whether that is half a turn
+    to the left or to the right, and so the mean of all, rounding would say.
+    """
+
+    filter: str = "ekf"
+    members: Annotated[int, Field(ge=9, le=721)] = 45
+
+    @field_validator("members")
+    @classmethod
+    def _odd(cls, members: int) -> int:
+        if members % 2 == 0:
+            raise ValueError(f"members must be odd, so that no two are opposite; give {members + 1}")
+        return members
+
+
+class Belief(NamedTuple):
+    """What is believed of the states, first axis = run: those of M Gaussians that are left, in front.
+
+    Attributes:
+        mean, covariance: (runs, M, n), (runs, M, t, t).
+        probability, log_probability: (runs, M).
+        member: (runs, M), which of the first members it is.
+        left: (runs,), how many there are.
+    """
+
+    mean: Floats
+    covariance: Floats
+    probability: Floats
+    log_probability: Floats
+    member: Integers
+    left: Integers
+
+
+class Memory(NamedTuple):
+    """What the steps of one core work in; see `imm.Memory`, and `factor` (t, t)."""
+
+    filters: tuple[Any]
+    centre: Floats
+    away: Floats
+    carried: Floats
+    shift: Floats
+    notes: Note
+    open_gate: Floats
+    factor: Floats
+
+
+def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
+    """The steps of a bank of so many of these filters."""
+    n, t = stage.model.size, stage.model.tangent
+    slots = len(slots_of(stage.sensors))
+    most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
+    gather, mix = mixing(stage.model.kinds)
+    predict_member = inner.predict
+
+    def predict(
+        run: int,
+        belief: Belief,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        memory: Memory,
+    ) -> bool:
+        gaussians, well = Gaussian(belief.mean[run], belief.covariance[run]), True
+        for each in range(belief.left[run]):
+            predicted = predict_member(
+                each, gaussians, control, duration_s, parameters, use, memory.filters[0]
+            )
+            well = predicted and well
+        return well
+
+    def keep_possible(run: int, belief: Belief) -> None:
+        """End what is next to impossible: the others move to the front."""
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        probability, log_probability = belief.probability[run], belief.log_probability[run]
+        count = belief.left[run]
+        least = IMPOSSIBLE * probability[likeliest_of(probability[:count])]
+        kept, total = 0, 0.0
+        for each in range(count):
+            if probability[each] >= least:
+                if kept < each:
+                    copy_gaussian(mean[each], covariance[each], mean[kept], covariance[kept])
+                    probability[kept], log_probability[kept] = probability[each], log_probability[each]
+                    belief.member[run, kept] = belief.member[run, each]
+                total += probability[kept]
+                kept += 1
+        for each in range(kept):
+            probability[each] /= total
+            log_probability[each] -= np.log(total)
+        belief.left[run] = kept
+
+    def merge_agreeing(run: int, belief: Belief, memory: Memory) -> None:
+        """Make one Gaussian of all, where their means differ by next to nothing of what is unknown."""
+        count = belief.left[run]
+        mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
+        probability = belief.probability[run, :count]
+        gather(mean, covariance, probability, memory)
+        likeliest = likeliest_of(probability)
+        if not cholesky(memory.factor, memory.carried[likeliest], t):
+            return
+        apart = 0.0
+        for each in range(count):
+            for row in range(t):
+                entry = memory.away[each, row]
+                for k in range(row):
+                    entry -= memory.factor[row, k] * memory.shift[k]
+                memory.shift[row] = entry / memory.factor[row, row]
+                apart += probability[each] * memory.shift[row] * memory.shift[row]
+        if apart < AGREED:
+            mix(probability, memory, mean[0], covariance[0])
+            belief.member[run, 0] = belief.member[run, likeliest]
+            probability[0], belief.log_probability[run, 0] = 1.0, 0.0
+            belief.left[run] = 1
+
+    def of_run(update: Function) -> Function:
+        def update_run(
+            run: int,
+            belief: Belief,
+            data: Floats,
+            parameters: Any,
+            gate: Floats,
+            use: int,
+            memory: Memory,
+            note: Note,
+        ) -> int:
+            count = belief.left[run]
+            weights = belief.probability[run, :count], belief.log_probability[run, :count]
+            gaussians = Gaussian(belief.mean[run, :count], belief.covariance[run, :count])
+            told = update(gaussians, weights, data, parameters, gate, use, memory, note)
+            if told == ALL_WELL and count > 1:
+                keep_possible(run, belief)
+                merge_agreeing(run, belief, memory)
+            return told
+
+        return update_run
+
+    def estimate(run: int, belief: Belief, mixtures: Mixtures, row: int, memory: Memory) -> None:
+        count = belief.left[run]
+        probability = belief.probability[run, :count]
+        for each in range(members):
+            mixtures.probability[row, each] = 0.0
+        for each in range(count):
+            mixtures.probability[row, belief.member[run, each]] = probability[each]
+        gather(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
+        mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+
+    def memory(sets: tuple[Any, ...]) -> Memory:
+        notes = np.empty((members, slots)), np.empty((members, slots, slots)), np.empty((members, 3))
+        return Memory(
+            (inner.memory(sets),),
+            centre=np.empty(n),
+            away=np.empty((members, t)),
+            carried=np.empty((members, t, t)),
+            shift=np.empty(t),
+            notes=Note(*notes),
+            open_gate=np.full(most + 1, np.inf),
+            factor=np.empty((t, t)),
+        )
+
+    updates = (
+        of_run(weighed_update(stage, number, update)) for number, update in enumerate(inner.updates)
+    )
+    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes)
+
+
+def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
+    """The direction (t,) in which a covariance (t, t) is widest of all turns, and its variance there.
+
+    Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
+    """
+    direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
+    for kind, _ in things(kinds):
+        end = begin + TANGENT_WIDTHS[kind]
+        if kind != "linear":
+            variances, axes = np.linalg.eigh(covariance[begin:end, begin:end])
+            if variances[-1] > (1.0 + ALIKE) * variance:
+                direction[:], variance = 0.0, float(variances[-1])
+                alike = axes[:, variances >= (1.0 - ALIKE) * variance]
+                within = alike @ alike.T  # of every axis what is in the directions that are widest
+                axis = within[:, np.argmax(np.round(np.diagonal(within), 9))]
+                direction[begin:end] = axis / np.linalg.norm(axis)
+        begin = end
+    return direction, variance
+
+
+def cut(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
+    """A Gaussian as a row of narrower ones, across its widest turn.
+
+    Returns:
+        the weights (members,), zero where there is no member; the means (members, n); the covariance
+        (t, t) of each. That of the mixture is the Gaussian's own, but for what is beyond a half turn.
+    """
+    direction, variance = widest(kinds, covariance)
+    apart = 2.0 * np.pi / members
+    offsets, own = (np.arange(members) - members // 2) * apart, (0.5 * apart) ** 2
+    weights, means = np.zeros(members), np.tile(mean, (members, 1))
+    if variance <= own:
+        weights[members // 2] = 1.0
+        return weights, means, covariance
+    weights = np.exp(-0.5 * offsets**2 / (variance - own))
+    weights[weights < IMPOSSIBLE] = 0.0
+    gain, add = covariance @ direction / variance, retraction(kinds)
+    for each in np.flatnonzero(weights):
+        add(means[each], offsets[each] * gain)
+    return weights / weights.sum(), means, covariance - (variance - own) * np.outer(gain, gain)
+
+
+class Banked(Mixing):
+    """A bank of filters; the probabilities of its members are on the topic `modes`."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """How far each member is turned from the prior's mean."""
+        count = self.parameters.members
+        return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
+
+    def start(self, whole: Mapping[str, Ragged]) -> State:
+        """The state at every run's prior, which is cut; see `Filter.start`."""
+        state, members = super().start(whole), self.parameters.members
+        mean, covariance = state.carried.belief
+        runs = len(mean)
+        belief = Belief(
+            np.repeat(mean[:, None], members, axis=1),
+            np.repeat(covariance[:, None], members, axis=1),
+            np.zeros((runs, members)),
+            np.zeros((runs, members)),
+            np.zeros((runs, members), np.int64),
+            np.ones(runs, np.int64),
+        )
+        for run in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))).tolist():
+            parts = cut(self.stage.model.kinds, mean[run], covariance[run], members)
+            weights, means, narrow = parts
+            member = np.flatnonzero(weights)
+            count = len(member)
+            belief.mean[run, :count], belief.covariance[run] = means[member], narrow
+            belief.probability[run, :count] = weights[member]
+            belief.log_probability[run, :count] = np.log(weights[member])
+            belief.member[run, :count], belief.left[run] = member, count
+        return state._replace(carried=state.carried._replace(belief=belief))
+
+
+def _lacks(model: Model, inner: Method) -> str:
+    if set(model.kinds) == {"linear"}:
+        return "an angle or an orientation in its state, across which to cut its prior"
+    return inner.lacks(model)
+
+
+@lru_cache(maxsize=64)
+def _banked(name: str, variant: str, members: int) -> Method:
+    """The method of so many filters of this name."""
+    inner = filter_with(name, variant)
+
+    def steps(stage: Stage) -> Steps:
+        return bank_steps(stage, inner.steps(stage), members)
+
+    lacks = partial(_lacks, inner=inner)
+    return replace(BANK, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
+
+
+def _made_for(parameters: BankParameters) -> Method:
+    name, variant = named_filter(parameters.filter, "bank", "for the members of a bank")
+    return _banked(name, variant, parameters.members)
+
+
+BANK = Method(
+    "bank of filters from a prior cut across its widest angle; the filter follows the name: bank:ekf",
+    BankParameters,
+    no_steps,
+    lacks=partial(_lacks, inner=FILTERS["ekf"]),
+    variant="filter",
+    made_for=_made_for,
+    filtering=Banked,
+)

@@ -1,0 +1,1 @@
+"""Particle filters of any model; begin with `particles`."""

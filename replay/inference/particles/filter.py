@@ -1,0 +1,289 @@
+"""The particle filter as an estimator, which a run's first measurement seeds, and as a method."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, NonNegativeInt
+
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Integers
+from replay.engine.compiling.compile import compiled
+from replay.engine.philox import WORDS, fill_normals, run_key
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import reason_stream
+from replay.engine.streams.results import ALL_WELL, named
+from replay.inference.kalman.methods import Method, MethodParameters, no_steps
+from replay.inference.kalman.steps import (
+    Steps,
+    workspace,
+)
+from replay.inference.linear_algebra.gaussian import (
+    no_innovation,
+)
+from replay.inference.linear_algebra.manifold import retraction
+from replay.inference.model.model import Model, Sensor, trial_state
+from replay.inference.model.settings import trial_parameters
+from replay.inference.model.stage import Stage
+from replay.inference.particles.particles import (
+    Cloud,
+    Clouds,
+    ParticleMemory,
+    SensorMemory,
+    moving,
+    summing_up,
+)
+from replay.inference.particles.update import weighing
+from replay.inference.run.events import joined, of_rows
+from replay.inference.run.filtering import Filter, State
+from replay.inference.run.recursion import Estimates, Happenings, Innovations
+
+MOST_PARTICLES = 1_000_000
+
+
+class ParticleParameters(MethodParameters):
+    """The number of particles, and when they are resampled.
+
+    That is where their effective number, 1 / sum w^2, is below the share `resample_below` of all. With
+    `cloud` every estimate comes with all its particles. Random numbers depend on `seed` and on the
+    run's first measurement.
+    """
+
+    particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000
+    resample_below: Annotated[float, Field(ge=0, le=1)] = 0.5
+    seed: NonNegativeInt = 0
+    cloud: bool = False
+
+
+def particle_steps(stage: Stage, particles: int, resample_below: float) -> Steps:
+    """The steps of a bootstrap filter."""
+    model, motion, sensors = stage.model, stage.motion, stage.sensors
+    n, t = model.size, model.tangent
+    by_control = model.controls if motion.control_noise else 0
+    noises = by_control + (motion.noises or (t if motion.noise else 0))
+
+    def memory(_: tuple[Any, ...]) -> ParticleMemory:
+        numbers = np.empty(-(-particles * noises // WORDS) * WORDS)
+        return ParticleMemory(
+            least_effective=resample_below * particles,
+            numbers=numbers,
+            words=np.empty(len(numbers), np.uint64),
+            drawn=numbers[: particles * noises].reshape(particles, noises),
+            control=np.empty(model.controls),
+            noise=np.empty(motion.noises),
+            lower=np.empty((t, t)),
+            chosen=np.empty(particles, np.int64),
+            spare=np.empty((particles, n)),
+            likelihood=np.empty(particles),
+            sensors=tuple(_sensor_memory(each, particles) for each in sensors)
+            or (_sensor_memory(None, particles),),
+            work=workspace(stage),
+        )
+
+    updates = tuple(weighing(stage, number) for number in range(len(sensors)))
+    return Steps(memory, moving(stage, by_control), updates, summing_up(model))
+
+
+def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
+    m, noises = (len(sensor.measured), sensor.noises) if sensor else (0, 0)
+    count = particles if noises else 1
+    return SensorMemory(
+        no_innovation(0, m),
+        np.empty((particles, m)),
+        np.empty((count, m, m)),
+        np.empty(count),
+        np.empty(m, np.int64),
+    )
+
+
+_draw_normals = compiled(fill_normals, allocates=False)
+
+
+class ParticleFilter(Filter):
+    """A filter whose runs begin when their first measurement, which seeds them, is there."""
+
+    def start(self, whole: Mapping[str, Ragged]) -> State:
+        """The state at every run's prior, see `Filter.start`."""
+        state = super().start(whole)
+        prior, particles = state.carried.belief, self.parameters.particles
+        runs, n = prior.mean.shape
+        t = self.stage.model.tangent
+        cloud = Cloud(
+            prior,
+            np.zeros((runs, particles, n)),
+            np.full((runs, particles), 1.0 / particles),
+            np.zeros((runs, particles, t)),
+            np.zeros((runs, t)),
+            np.zeros((runs, 2), np.uint64),
+            np.zeros(runs, np.int64),
+        )
+        return state._replace(carried=state.carried._replace(belief=cloud))
+
+    @property
+    def cannot_rewind(self) -> str:
+        """See `Filter.cannot_rewind`."""
+        return "all particles would have to be kept for every message of the window"
+
+    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+        """Filter events of the runs in which something was measured; those of the others wait."""
+        if state.kept is not None:
+            happenings = joined(state.kept, happenings)
+        sensed = np.flatnonzero(happenings.source >= 0)
+        place = np.searchsorted(sensed, happenings.offsets)
+        is_new = (place[1:] > place[:-1]) & (state.carried.belief.counter == 0)
+        first = {run: sensed[place[run]] for run in np.flatnonzero(is_new).tolist()}
+        columns = happenings.time_ns, happenings.source, happenings.data
+        after = self.begun(state, {run: [each[at] for each in columns] for run, at in first.items()})
+        is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(happenings.offsets))
+        waiting = None if is_ready.all() else of_rows(happenings, ~is_ready)
+        ready = happenings if is_ready.all() else of_rows(happenings, is_ready)
+        after, made = super().follow(after._replace(kept=waiting), ready)
+        return after, [*made, *self.cautions(happenings.time_ns, first, len(place) - 1)]
+
+    def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
+        """On the topic `started` of runs that begin at these rows: which parameters cannot change."""
+        options = self.parameters
+        moving = {*(options.estimate_time_s or ())}
+        moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
+        constant = [name for name in options.estimate or () if name not in moving]
+        if not constant or not first:
+            return []
+        stream = reason_stream(
+            f"/estimates/{self.name}/started",
+            schemas.STARTED,
+            time_ns[[*first.values()]],
+            np.zeros(len(first), np.int64),
+            [
+                f"{', '.join(constant)} is constant, and particles have only the values that were drawn "
+                "at the start; give estimate_drift, or take a Gaussian filter such as ekf"
+            ],
+        )
+        return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
+
+    def finish(self, state: State) -> list[Ragged]:
+        """What waited for a control or a measurement that did not come; then the prior seeds the run."""
+        state, made = self.ended(state)
+        if state.kept is None:
+            return made
+        prior = state.carried.belief.prior
+        unseeded = np.flatnonzero(state.carried.belief.counter == 0).tolist()
+        after = self.begun(state, {run: [prior.mean[run], prior.covariance[run]] for run in unseeded})
+        return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
+
+    def begun(self, state: State, seeds: Mapping[int, list[Any]]) -> State:
+        """The state with particles drawn from the priors of some runs, each seeded by its data."""
+        if not seeds:
+            return state
+        carried = state.carried
+        cloud = carried.belief._replace(
+            states=carried.belief.states.copy(),
+            key=carried.belief.key.copy(),
+            counter=carried.belief.counter.copy(),
+        )
+        for run, first in seeds.items():
+            cloud.key[run] = run_key(self.parameters.seed, map(np.asarray, first))
+            cloud.counter[run] = 1
+            if carried.failure[run] == ALL_WELL:
+                cloud.counter[run] = draw(self.stage.model, cloud, run)
+        return state._replace(carried=carried._replace(belief=cloud))
+
+    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+        """Estimates, with particles where they are wanted, and innovations to be filled in."""
+        (end, times, mean, covariance), innovations = super().no_results(due, noted, slots)
+        rows, particles = len(times), self.parameters.particles * self.parameters.cloud
+        states = np.empty((rows, particles, self.stage.model.size))
+        weight = np.empty((rows, particles))
+        return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
+
+    def told(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
+        """The streams of estimates and of the effective number, and where they are wanted particles."""
+        model, (rows, particles) = self.stage.model, clouds.weight.shape
+        stem = f"/estimates/{self.name}"
+        effective = make_stream(
+            f"{stem}/effective",
+            schemas.EFFECTIVE_PARTICLES,
+            clouds.time_ns,
+            particles=np.full(rows, self.parameters.particles),
+            effective=clouds.effective,
+        )
+        made = [self.states(Estimates(*clouds[:4]), offsets), Ragged(effective, offsets)]
+        if self.parameters.cloud:
+            metadata = {**named(model.state), "truth": self.truth}
+            size = make_stream(
+                f"{stem}/particles",
+                schemas.ESTIMATE_SIZE,
+                clouds.time_ns,
+                metadata=metadata,
+                elements=np.full(rows, particles),
+            )
+            cloud = make_stream(
+                f"{stem}/particle",
+                schemas.DENSITY_ESTIMATE,
+                np.repeat(clouds.time_ns, particles),
+                metadata=metadata,
+                weight=clouds.weight.ravel(),
+                mean=clouds.states.reshape(-1, model.size),
+                covariance=np.zeros((rows * particles, model.tangent**2)),
+            )
+            made += [Ragged(size, offsets), Ragged(cloud, offsets * particles)]
+        return made
+
+
+def draw(model: Model, cloud: Cloud, run: int) -> int:
+    """Draw the particles of a run from its prior; returns its counter after that."""
+    states, t = cloud.states[run], model.tangent
+    numbers = np.empty(-(-len(states) * t // WORDS) * WORDS)
+    counter = _draw_normals(numbers, np.empty(len(numbers), np.uint64), cloud.key[run], 0)
+    lower = np.linalg.cholesky(cloud.prior.covariance[run])
+    drawn = numbers[: len(states) * t].reshape(len(states), t)
+    states[:] = cloud.prior.mean[run]
+    # not by the matrix product, whose round-off depends on the number of cores
+    retraction(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
+    return counter
+
+
+@lru_cache(maxsize=64)
+def _of_so_many(particles: int, resample_below: float) -> Method:
+    def steps(stage: Stage) -> Steps:
+        return particle_steps(stage, particles, resample_below)
+
+    return Method(**{**vars(BOOTSTRAP), "steps": steps, "made_for": None})
+
+
+def _made_for(parameters: ParticleParameters) -> Method:
+    return _of_so_many(parameters.particles, parameters.resample_below)
+
+
+def _lacks_likelihood(model: Model) -> str:
+    """A sensor whose noise enters other than linearly, and which states no likelihood."""
+    parameters = trial_parameters(model)
+    for sensor in model.sensors:
+        if not sensor.noises or sensor.log_likelihood is not None:
+            continue
+        about = (0.7,) * sensor.about_size
+        steps = np.linspace(0.3, 0.7, sensor.noises)
+        with np.errstate(all="ignore"):
+            try:
+                at = [
+                    np.array(
+                        sensor.measure(trial_state(model.kinds), tuple(k * steps), about, parameters)
+                    )
+                    for k in range(3)
+                ]
+            except Exception:  # is said when the model is bound, see `model.check_sensor`
+                continue
+        if not np.allclose(at[2] - at[1], at[1] - at[0], rtol=1e-9, atol=1e-9, equal_nan=True):
+            return f"a likelihood of its sensor {sensor.topic}"
+    return ""
+
+
+BOOTSTRAP = Method(
+    "bootstrap particle filter; the number of particles follows the name, as in particles:2000",
+    ParticleParameters,
+    no_steps,
+    lacks=_lacks_likelihood,
+    variant="particles",
+    made_for=_made_for,
+    filtering=ParticleFilter,
+)

@@ -1,0 +1,304 @@
+"""The bootstrap particle filter: many states, each moved with noise of its own and then weighed.
+
+Wherever noise enters, by addition, through the control or by the motion itself, it is drawn. What was
+measured weighs the particles by its likelihood; they are resampled before a prediction where few of them
+count. Mean and covariance are those of the weighted particles, in the tangent space.
+
+Gordon, Salmond and Smith, IEE Proceedings F 140(2), 1993; systematic resampling: Kitagawa 1996.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.philox import Words, fill_normals, philox, unit
+from replay.inference.kalman.predict import nothing
+from replay.inference.kalman.regression import settling
+from replay.inference.kalman.steps import (
+    Gaussian,
+    Workspace,
+)
+from replay.inference.linear_algebra.gaussian import (
+    Innovation,
+    semidefinite_cholesky,
+)
+from replay.inference.linear_algebra.manifold import differencing, retraction
+from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
+from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from replay.inference.model.model import Model
+from replay.inference.model.stage import Stage
+from replay.sampling.resampling import choose_systematically
+
+
+class Cloud(NamedTuple):
+    """The particles of all runs; first axis = run.
+
+    Attributes:
+        prior: what they are drawn from.
+        states: (runs, N, n).
+        weight: (runs, N), of sum 1.
+        offsets, shift: (runs, N, t), (runs, t) to work in: the states as seen from their mean.
+        key, counter: (runs, 2), (runs,) of the run's random numbers; the counter is 0 where nothing was
+            drawn yet.
+    """
+
+    prior: Gaussian
+    states: Floats
+    weight: Floats
+    offsets: Floats
+    shift: Floats
+    key: Words
+    counter: Integers
+
+
+class Clouds(NamedTuple):
+    """Estimates as the recursion fills them in (`recursion.Estimates`), with all particles or none.
+
+    `effective` (n,) is the effective number of particles.
+    """
+
+    end: Integers
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    effective: Floats
+    states: Floats
+    weight: Floats
+
+
+class SensorMemory(NamedTuple):
+    """What the update by one sensor of m components works in.
+
+    Attributes:
+        innovation: of the cloud as a whole.
+        differences: (N, m) measured less predicted.
+        noise: (1 or N, m, m) its covariance, then its factor; one for each particle where it differs.
+        determinant: (1 or N,) log det of the covariance.
+        kept: (m,) the components that are used.
+    """
+
+    innovation: Innovation
+    differences: Floats
+    noise: Floats
+    determinant: Floats
+    kept: Integers
+
+
+class ParticleMemory(NamedTuple):
+    """What the steps of one core work in.
+
+    Attributes:
+        least_effective: the effective number below which particles are resampled.
+        numbers, words, drawn: normals, what they are made of, and normals as (N, noises of the motion).
+        control, noise: (controls,), (noises of the motion,) as drawn for one particle.
+        lower: (t, t) factor of the covariance of additive noise.
+        chosen, spare: (N,), (N, n) for resampling.
+        likelihood: (N,) logarithms.
+        sensors: one for each sensor.
+        work: for derivatives by noise.
+    """
+
+    least_effective: float
+    numbers: Floats
+    words: Words
+    drawn: Floats
+    control: Floats
+    noise: Floats
+    lower: Floats
+    chosen: Integers
+    spare: Floats
+    likelihood: Floats
+    sensors: tuple[SensorMemory, ...]
+    work: Workspace
+
+
+def moving(stage: Stage, by_control: int) -> Function:
+    """The prediction: every particle moves with noise of its own, after resampling where that is due.
+
+    The first `by_control` draws of a particle are errors of the control.
+    """
+    model, motion = stage.model, stage.motion
+    read_state, fill, add = tuple_of(model.size), filling(model.size), retraction(model.kinds)
+    drive, move = _driving(stage), _moved(stage, by_control)
+    is_additive = motion.noise is not None and not motion.noises
+    spread = _additive_noise(stage, by_control) if is_additive else _no_noise
+    scatter = add if is_additive else nothing
+
+    def predict(
+        run: int,
+        cloud: Cloud,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        memory: ParticleMemory,
+    ) -> bool:
+        states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
+        cloud.counter[run] = resample(states, cloud.weight[run], key, cloud.counter[run], memory)
+        cloud.counter[run] = fill_normals(memory.numbers, memory.words, key, cloud.counter[run])
+        if not spread(states, offsets, duration_s, parameters, memory):
+            return False
+        for i in range(len(states)):
+            drawn = memory.drawn[i]
+            driven = drive(control, drawn, duration_s, parameters, memory)
+            fill(states[i], move(read_state(states[i]), driven, drawn, duration_s, parameters, memory))
+            scatter(states[i], offsets[i])
+        return True
+
+    return predict
+
+
+def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
+    """Resample where the effective number of particles is too small; returns the counter after it."""
+    if not effective_number(weight) < memory.least_effective:
+        return counter
+    choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
+    for i in range(len(weight)):
+        for k in range(states.shape[1]):
+            memory.spare[i, k] = states[memory.chosen[i], k]
+    for i in range(len(weight)):
+        weight[i] = 1.0 / len(weight)
+        for k in range(states.shape[1]):
+            states[i, k] = memory.spare[i, k]
+    return counter + 1
+
+
+def effective_number(weight: Floats) -> float:
+    """How many particles of equal weight are worth as much as these (N,): 1 / sum w^2."""
+    squared = 0.0
+    for i in range(len(weight)):
+        squared += weight[i] * weight[i]
+    return 1.0 / squared
+
+
+def _driving(stage: Stage) -> Function:
+    """`drive(control, drawn, duration_s, parameters, memory)`: what drives a particle, as a tuple."""
+    controls, variances = stage.model.controls, stage.motion.control_noise
+    read, fill = tuple_of(controls), filling(controls)
+    if variances is None:
+
+        def as_stated(
+            control: Floats, drawn: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
+        ) -> Any:
+            return read(control)
+
+        return as_stated
+
+    def with_error(
+        control: Floats, drawn: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
+    ) -> Any:
+        fill(memory.control, variances(duration_s, parameters))
+        for k in range(controls):
+            memory.control[k] = control[k] + np.sqrt(memory.control[k]) * drawn[k]
+        return read(memory.control)
+
+    return with_error
+
+
+def _moved(stage: Stage, first: int) -> Function:
+    """`moved(state, driven, drawn, duration_s, parameters, memory)`: a state after the motion."""
+    move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
+    if not noises:
+
+        def without(
+            state: Any,
+            driven: Any,
+            drawn: Floats,
+            duration_s: float,
+            parameters: Any,
+            memory: ParticleMemory,
+        ) -> Any:
+            return move(state, driven, duration_s, parameters)
+
+        return without
+    assert variances is not None
+    read, fill = tuple_of(noises), filling(noises)
+
+    def with_noise(
+        state: Any,
+        driven: Any,
+        drawn: Floats,
+        duration_s: float,
+        parameters: Any,
+        memory: ParticleMemory,
+    ) -> Any:
+        fill(memory.noise, variances(state, duration_s, parameters))
+        for k in range(noises):
+            memory.noise[k] = np.sqrt(memory.noise[k]) * drawn[first + k]
+        return move(state, driven, read(memory.noise), duration_s, parameters)
+
+    return with_noise
+
+
+def _no_noise(
+    states: Floats, offsets: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
+) -> bool:
+    return True
+
+
+def _additive_noise(stage: Stage, first: int) -> Function:
+    """`spread(states, offsets, duration_s, parameters, memory)`: draws of the additive noise.
+
+    They are tangent vectors, at the states before they move. Noise is factored anew only where it is
+    not that of the particle before. False where a covariance is not positive semidefinite.
+    """
+    t, noise = stage.model.tangent, stage.motion.noise
+    assert noise is not None
+    read_state = tuple_of(stage.model.size)
+    add_noise = adding_noise(t, stage.motion.noise_block)
+    read_lower, offset, fill = lower_of(t), offset_of(t), filling(t)
+
+    def factored(lower: Floats, variances: Any) -> bool:
+        for row in range(t):
+            for column in range(t):
+                lower[row, column] = 0.0
+        add_noise(lower, variances)
+        return semidefinite_cholesky(lower, lower, t)
+
+    def spread(
+        states: Floats, offsets: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
+    ) -> bool:
+        before, drawn = noise(read_state(states[0]), duration_s, parameters), memory.drawn[:, first:]
+        if not factored(memory.lower, before):
+            return False
+        lower = read_lower(memory.lower)
+        for i in range(len(states)):
+            found = noise(read_state(states[i]), duration_s, parameters)
+            if found != before:
+                before = found
+                if not factored(memory.lower, found):
+                    return False
+                lower = read_lower(memory.lower)
+            fill(offsets[i], offset(lower, drawn, i))
+        return True
+
+    return spread
+
+
+def summing_up(model: Model) -> Function:
+    """The estimate: intrinsic mean and covariance of the weighted particles, and these where wanted."""
+    n, t = model.size, model.tangent
+    subtract, settle, moments = differencing(model.kinds), settling(model.kinds), moments_of(0, t)
+    weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}
+
+    def estimate(run: int, cloud: Cloud, clouds: Clouds, row: int, _: ParticleMemory) -> None:
+        states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]
+        mean, covariance, shift = clouds.mean[row], clouds.covariance[row], cloud.shift[run]
+        if straight:
+            weighted_mean(weight, states, mean)
+            moments(weight, states, states, mean, covariance, covariance)
+        else:
+            for k in range(n):
+                mean[k] = states[0, k]
+            for i in range(len(states)):
+                subtract(states[i], mean, offsets, i)
+            settle(weight, offsets, mean, shift)
+            moments(weight, offsets, offsets, shift, covariance, covariance)
+        clouds.effective[row] = effective_number(weight)
+        for i in range(clouds.states.shape[1]):
+            clouds.weight[row, i] = weight[i]
+            for k in range(n):
+                clouds.states[row, i, k] = states[i, k]
+
+    return estimate

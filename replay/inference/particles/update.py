@@ -1,0 +1,259 @@
+"""The update of particles: each is weighed by the likelihood of what was measured."""
+
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.steps import (
+    NOT_EXPLAINED,
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Note,
+)
+from replay.inference.kalman.update import note_numbers, noting, reading, sensor_noise
+from replay.inference.linear_algebra.gaussian import (
+    LOG_TWO_PI,
+    cholesky,
+    keep_measured,
+    whiten,
+    widening,
+    wrap,
+)
+from replay.inference.linear_algebra.linearization import Input, derivative
+from replay.inference.linear_algebra.tuples import filling, tuple_of
+from replay.inference.model.stage import Stage
+from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory
+
+
+def weighing(stage: Stage, number: int) -> Function:
+    """The update by sensor `number`: every particle is weighed by the likelihood of what was measured.
+
+    What is told of the innovation, its NIS and the gate are of the cloud's first two moments; the
+    log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
+    and a particle that lacks another one keeps its share of the weight: nothing is said of it.
+    """
+    sensor = stage.sensors[number]
+    m, tell = len(sensor.measured), noting(stage, number)
+    compare, likelihood = _comparing(stage, number), _likelihood(stage, number)
+    angular = tuple(kind == "angle" for kind in sensor.measured.values())
+
+    def update(
+        run: int,
+        cloud: Cloud,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        memory: ParticleMemory,
+        note: Note,
+    ) -> int:
+        present = 0
+        for j in range(m):
+            present += not np.isnan(data[j])
+        if present == 0:
+            return NOTHING_MEASURED
+        weight, own = cloud.weight[run], memory.sensors[number]
+        compare(cloud.states[run], data, parameters, memory)
+        kept = keep_predicted(own)
+        innovate(weight, own, kept, angular)
+        tell(own.innovation, note)
+        size = keep_measured(own.innovation)
+        squared, determinant = whiten(own.innovation, size)
+        if np.isnan(squared):
+            return NOT_POSITIVE_DEFINITE
+        accepted = size > 0 and squared <= gate[size]
+        note_numbers(note, squared, determinant, size, accepted, 1.0)
+        if not accepted:
+            return ALL_WELL
+        factor_kept(own, kept)
+        for i in range(len(weight)):
+            memory.likelihood[i] = likelihood(cloud.states[run], i, data, parameters, own, kept)
+        note.numbers[1] = reweigh(weight, memory.likelihood)
+        return NOT_EXPLAINED if np.isnan(note.numbers[1]) else ALL_WELL
+
+    return update
+
+
+def _comparing(stage: Stage, number: int) -> Function:
+    """`compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
+    model, sensor = stage.model, stage.sensors[number]
+    m, measure = len(sensor.measured), sensor.measure
+    angular = tuple(kind == "angle" for kind in sensor.measured.values())
+    read_state, read_about, fill = tuple_of(model.size), reading(sensor).about, filling(m)
+    add_noise = sensor_noise(sensor)
+
+    def predict_alike(
+        states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
+    ) -> None:
+        fill(memory.work.predicted, measure(read_state(states[i]), read_about(data), parameters))
+
+    predict = predict_alike
+    if sensor.noises:
+        entering = Input("noise", ("linear",) * sensor.noises, "noise_gain", zero=True)
+        kinds = tuple(sensor.measured.values())
+        inputs = [Input("state", model.kinds), entering]
+        linearise = derivative(measure, inputs, kinds, "predicted")
+
+        def predict_with_noise(
+            states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
+        ) -> None:
+            linearise(read_state(states[i]), read_about(data), parameters, memory.work)
+            no_covariance(memory.sensors[number].noise[i])
+            add_noise(memory.sensors[number].noise[i], data, parameters, memory.work)
+
+        predict = predict_with_noise
+
+    def compare(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory) -> None:
+        own = memory.sensors[number]
+        if len(own.noise) == 1:
+            no_covariance(own.noise[0])
+            add_noise(own.noise[0], data, parameters, memory.work)
+        for i in range(len(states)):
+            predict(states, i, data, parameters, memory)
+            for j in range(m):
+                own.differences[i, j] = wrap(data[j] - memory.work.predicted[j], angular[j])
+
+    return compare
+
+
+def no_covariance(matrix: Floats) -> None:
+    """Fill a matrix with zeros."""
+    for row in range(len(matrix)):
+        for column in range(len(matrix)):
+            matrix[row, column] = 0.0
+
+
+def keep_predicted(own: SensorMemory) -> int:
+    """Note the components that are measured and that some particle predicts; returns how many."""
+    size = 0
+    for j in range(len(own.kept)):
+        for i in range(len(own.differences)):
+            if not np.isnan(own.differences[i, j]):
+                own.kept[size] = j
+                size += 1
+                break
+    return size
+
+
+def is_told(own: SensorMemory, i: int, size: int) -> bool:
+    """Whether a particle predicts all components that are used."""
+    for a in range(size):
+        if np.isnan(own.differences[i, own.kept[a]]):
+            return False
+    return size > 0
+
+
+def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, ...]) -> None:
+    """Fill the innovation of the cloud: mean and covariance of the differences, and the noise.
+
+    The differences are taken from that of the first particle which has one, where no angle is cut.
+    """
+    mean, spread, _ = own.innovation
+    for j in range(len(mean)):
+        mean[j] = np.nan
+        for k in range(len(mean)):
+            spread[j, k] = 0.0
+    for a in range(size):
+        mean[own.kept[a]] = 0.0
+    first, total = -1, 0.0
+    for i in range(len(weight)):
+        if not is_told(own, i, size):
+            continue
+        first = i if first < 0 else first
+        total += weight[i]
+        noise = own.noise[i if len(own.noise) > 1 else 0]
+        for a in range(size):
+            j = own.kept[a]
+            away = wrap(own.differences[i, j] - own.differences[first, j], angular[j])
+            mean[j] += weight[i] * away
+            for b in range(a + 1):
+                k = own.kept[b]
+                other = wrap(own.differences[i, k] - own.differences[first, k], angular[k])
+                spread[j, k] += weight[i] * (away * other + noise[j, k])
+    for a in range(size):
+        j = own.kept[a]
+        mean[j] = mean[j] / total
+        for b in range(a + 1):
+            k = own.kept[b]
+            spread[j, k] = spread[k, j] = spread[j, k] / total - mean[j] * mean[k]
+    for a in range(size):
+        j = own.kept[a]
+        mean[j] = wrap(own.differences[first, j] + mean[j], angular[j])
+
+
+def factor_kept(own: SensorMemory, size: int) -> None:
+    """Make of the noise of the components that are used its factor, at the front, and log det.
+
+    That is NaN where the covariance is not positive definite.
+    """
+    for number in range(len(own.noise)):
+        noise, determinant = own.noise[number], 1.0
+        for a in range(size):
+            for b in range(a + 1):
+                noise[a, b] = noise[own.kept[a], own.kept[b]]
+        if not cholesky(noise, noise, size):
+            own.determinant[number] = np.nan
+            continue
+        for a in range(size):
+            determinant *= noise[a, a]
+        own.determinant[number] = 2.0 * np.log(determinant)
+
+
+def _likelihood(stage: Stage, number: int) -> Function:
+    """`likelihood(states, i, data, parameters, own, size)`: log p of what was measured, at particle i.
+
+    The model's own, or that of Gaussian noise; NaN where the particle says nothing of it.
+    """
+    sensor = stage.sensors[number]
+    if sensor.log_likelihood is None:
+        return gaussian_likelihood
+    stated, read_state, read = sensor.log_likelihood, tuple_of(stage.model.size), reading(sensor)
+    read_measured, read_about = read.measured, read.about
+
+    def likelihood(
+        states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
+    ) -> float:
+        return stated(read_state(states[i]), read_measured(data), read_about(data), parameters)
+
+    return likelihood
+
+
+def gaussian_likelihood(
+    states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
+) -> float:
+    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `widening`."""
+    number = i if len(own.noise) > 1 else 0
+    difference, factor, squared = own.differences[i], own.noise[number], 0.0
+    for a in range(size):
+        entry = difference[own.kept[a]]
+        for b in range(a):
+            entry -= factor[a, b] * difference[b]
+        difference[a] = entry / factor[a, a]
+        squared += difference[a] * difference[a]
+    factor = widening(squared, size, parameters)
+    known = own.determinant[number] + size * LOG_TWO_PI
+    return -0.5 * (squared / factor + known + size * np.log(factor))
+
+
+def reweigh(weight: Floats, likelihood: Floats) -> float:
+    """Multiply weights (N,) of sum 1 by likelihoods, whose logarithms are given, and norm them.
+
+    Returns log sum w p. Where a likelihood is NaN, the particle gets the mean of the others. NaN, and
+    weights of no use, where none is above zero.
+    """
+    best = -np.inf
+    for i in range(len(weight)):
+        if weight[i] > 0.0 and likelihood[i] > best:
+            best = likelihood[i]
+    share, total = 0.0, 0.0
+    for i in range(len(weight)):
+        if not np.isnan(likelihood[i]):
+            share += weight[i]
+            weight[i] *= np.exp(likelihood[i] - best)
+            total += weight[i]
+    mean = total / share
+    for i in range(len(weight)):
+        weight[i] *= 1.0 / mean if not np.isnan(likelihood[i]) else 1.0
+    return best + np.log(mean) if best > -np.inf else np.nan

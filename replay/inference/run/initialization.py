@@ -1,0 +1,428 @@
+"""Where a filter begins in a log that does not say so, and where its plane lies.
+
+A log without a prior gets one at the first message that measures the state, see `model.Start`. It is so
+much wider than that message that the message itself, used like any other, is what counts. The origin of
+a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream, Topic, make_stream, schemas
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.replaying.estimator import Opened, Opening
+from replay.engine.streams.blocks import Block, Ragged, merge_events
+from replay.engine.streams.failures import reason_stream
+from replay.engine.streams.geodetic import in_plane, origins_of
+from replay.engine.streams.results import gaussian_stream, named
+from replay.engine.vectors.tangent import tangent_components, things
+from replay.inference.model.binding import Found, measures_state
+from replay.inference.model.model import Sensor, Start
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.settings import complaint_of, reading_settings
+from replay.inference.model.stage import Stage
+from replay.inference.run.events import World, data_columns, happenings_of, sensor_table
+from replay.inference.run.recursion import CONTROL, Happenings
+
+WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
+FOREVER_NS = np.iinfo(np.int64).max
+CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a filter looks for in the first messages of a log.
+
+    Attributes:
+        name: what its output topics begin with, after `/estimates/`.
+        found: its topics.
+        stage: the model as the log states it, with the sensors at hand.
+        settings: (1 + sensors, fields) numbers of motion and sensors.
+        assumed: the parameters among them that the log does not state.
+    """
+
+    name: str
+    found: Found
+    stage: Stage
+    settings: Floats
+    assumed: Mapping[str, float]
+
+    @property
+    def opening(self) -> Opening | None:
+        """How it is found; None where the log states all."""
+        needs_origin = self.found.geodetic if self.found.origin is None else ()
+        needs_messages = not self.found.has_prior or self._suspect is not None
+        wanted = [*needs_origin, *(self._starting if needs_messages else ())]
+        topics = tuple(dict.fromkeys(topic.name for topic in wanted))
+        return Opening(topics, self.find) if topics else None
+
+    @property
+    def _suspect(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
+        start = self.stage.model.start
+        return start.suspect if start is not None else None
+
+    @cached_property
+    def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
+        """The sensors that measure the state itself, with their numbers; none of a thing without."""
+        return [
+            (number, sensor, topic)
+            for number, (sensor, topic) in enumerate(self.found.sensors)
+            if measures_state(self.stage.model, sensor)
+        ]
+
+    @property
+    def _starting(self) -> list[Topic]:
+        """The topics whose first message is where to begin."""
+        control = [] if self.found.control is None else [self.found.control]
+        drives = [*control, *(topic for _, topic in self.found.instead)]
+        if self.stage.model.finds_start:
+            return [*drives, *(topic for _, topic in self.found.sensors)]
+        needs_drives = self._aligns or not self._measuring
+        return [*(drives if needs_drives else []), *(topic for _, _, topic in self._measuring)]
+
+    @property
+    def _aligns(self) -> bool:
+        """Whether fixes alone have to tell the whole state, and can."""
+        model = self.stage.model
+        sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
+        return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
+
+    def find(self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], clock: Clock) -> Opened:
+        """What is found in the first messages; raises BadInput where none of them can be used."""
+        found: dict[str, Ragged] = {}
+        told: list[Ragged] = []
+        facts: list[_Fact] = []
+        origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
+        for topic in self.found.geodetic if origins is None else ():
+            fixes = first[topic.name]
+            time_ns, has_one, rows = _first_of(fixes, clock, None)
+            found[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            origins = origins_of(found[topic.name])
+            told.append(self._told_origin(found[topic.name]))
+            what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
+            facts.append(_Fact(what, time_ns, has_one))
+        if not self.found.has_prior:
+            prior, begun = self._prior(first, whole, clock, origins)
+            found[self.found.prior.name] = prior
+            facts += begun
+        elif self._suspect is not None:
+            facts += self._suspected(self._suspect, first, whole, origins)
+        return Opened(found, [*told, *self._told(facts)])
+
+    def _prior(
+        self,
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        clock: Clock,
+        origins: Floats | None,
+    ) -> tuple[Ragged, list["_Fact"]]:
+        """The priors of all runs, and what is to be told of them."""
+        model, runs = self.stage.model, _runs(first)
+        mean, sigma = unknown(model.state, model.start)
+        covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
+        begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
+        if model.finds_start:
+            facts = self._found(first, whole, origins, begun)
+        elif self._measuring:
+            facts = self._at_first(first, clock, origins, begun)
+        else:
+            facts = self._at_zero(first, clock, begun)
+        if self._aligns:
+            aligned = self._aligned(first, clock, origins, begun)
+            others = [fact._replace(is_so=fact.is_so & ~aligned.is_so) for fact in facts]
+            facts = [aligned, *others, self._unaligned(aligned, begun)]
+        has_begun = begun.time_ns < FOREVER_NS
+        facts += [
+            _Fact(self._assumption(name, number), begun.time_ns, has_begun)
+            for name, number in self.assumed.items()
+        ]
+        stream = gaussian_stream(
+            self.found.prior.name,
+            begun.time_ns[has_begun],
+            begun.mean[has_begun],
+            begun.covariance[has_begun],
+            named(model.state),
+        )
+        return _of_runs(stream, has_begun), facts
+
+    def _unaligned(self, aligned: "_Fact", begun: "_Begun") -> "_Fact":
+        """That fixes did not tell all where a run begins without."""
+        [measured] = [sensor.measured for _, sensor, _ in self._measuring]
+        names = ", ".join(name for name in self.stage.model.state if name not in measured)
+        text = (
+            f"{names}: unknown at the start, since with these noise densities the path between the "
+            "first fixes does not tell it; state the densities of your sensors first, or give a prior"
+        )
+        return _Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
+
+    def _assumption(self, name: str, number: float) -> str:
+        """The sentence for a parameter that is assumed, with what it means where the model says that."""
+        meaning = " ".join((self.stage.model.parameters.model_fields[name].description or "").split())
+        said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
+        return f"{said} ({meaning.rstrip('.')})" if meaning else said
+
+    @property
+    def _without(self) -> str:
+        return f"the log has no prior ({self.found.prior.name}): it begins"
+
+    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+        """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
+        for topic in self._starting:
+            found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
+            begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
+        begun.covariance[:] *= CERTAIN**2
+        where = "at zero, where its frame is"
+        return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+
+    def _found(
+        self,
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        origins: Floats | None,
+        begun: "_Begun",
+    ) -> list["_Fact"]:
+        """Begin all runs where the model finds them; raises BadInput where it finds none."""
+        model = self.stage.model
+        assert model.start is not None
+        assert model.start.find is not None
+        given, parameters = self._given(first, whole, origins)
+        how = [""] * len(begun.time_ns)
+        for run in range(len(how)):
+            try:
+                streams = {name: ragged.of_run(run) for name, ragged in given.items()}
+                started = model.start.find(streams, parameters)
+            except BadInput as error:
+                if run == len(how) - 1 and not any(how):
+                    raise BadInput(f"estimator {self.name}: {error}") from error
+                continue
+            begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
+            begun.covariance[run], how[run] = started.covariance, started.how
+        return [
+            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            for words in dict.fromkeys(filter(None, how))
+        ]
+
+    def _given(
+        self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], origins: Floats | None
+    ) -> tuple[dict[str, Ragged], Any]:
+        """The first messages and the maps, by the model's names for their topics, and the parameters."""
+        model, control = self.stage.model, self.found.control
+        given = {}
+        if model.control is not None and control is not None:
+            given[model.control.topic] = first[control.name]
+        for sensor, topic in self.found.sensors:
+            ragged = first[topic.name]
+            if origins is not None and topic in self.found.geodetic:
+                ragged = in_plane(ragged, origins)
+            given[sensor.topic] = ragged
+            given |= {each.topic: whole[each.topic] for each in sensor.maps}
+        return given, reading_settings(number_fields(model.parameters))(self.settings, 0)
+
+    def _suspected(
+        self,
+        suspect: Callable[[Mapping[str, Stream], Any], list[str]],
+        first: Mapping[str, Ragged],
+        whole: Mapping[str, Ragged],
+        origins: Floats | None,
+    ) -> list["_Fact"]:
+        """What the model suspects of the first messages of runs whose prior is known."""
+        given, parameters = self._given(first, whole, origins)
+        said = [
+            suspect({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
+            for run in range(_runs(first))
+        ]
+        time_ns, _, _ = _first_of(next(iter(given.values())), "publish_time", None)
+        return [
+            _Fact(text, time_ns, np.array([text in of_run for of_run in said]))
+            for text in dict.fromkeys(text for of_run in said for text in of_run)
+        ]
+
+    def _at_first(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> list["_Fact"]:
+        """Begin all runs at their first message that measures components of the state."""
+        chosen = np.full(len(begun.time_ns), -1)
+        for number, _, topic in self._measuring:
+            ragged = first[topic.name]
+            table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
+            found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
+            for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
+                begun.time_ns[run], chosen[run] = found_ns[run], number
+                begun.mean[run], sigma = self._about(number, table.data[rows[run]])
+                begun.covariance[run] = sigma**2 * np.eye(len(sigma))
+        if (chosen < 0).all():
+            raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
+        return [
+            _Fact(
+                f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
+            )
+            for number, _, topic in self._measuring
+        ]
+
+    def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
+        """The mean and the much wider sigmas of a state that one message tells of."""
+        model, sensor = self.stage.model, self.stage.sensors[number]
+        mean, sigma = unknown(model.state, model.start)
+        components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+        size = len(sensor.measured)
+        for place, (name, variance) in enumerate(
+            zip(sensor.measured, data[size + _diagonal(size)], strict=True)
+        ):
+            if not np.isnan(data[place]):
+                mean[list(model.state).index(name)] = data[place]
+                row = components.index(name)
+                sigma[row] = min(WIDER * np.sqrt(variance), sigma[row])
+        return mean, sigma
+
+    def _aligned(
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
+    ) -> "_Fact":
+        """Begin runs just after the first fixes that, with the path between them, tell all."""
+        numbers = [number for number, _, _ in self._measuring]
+        sensors = tuple(self.found.sensors[number] for number in numbers)
+        found = self.found._replace(sensors=sensors)
+        stage = self.stage._replace(sensors=tuple(sensor for sensor, _ in sensors))
+        settings = self.settings[[0, *(1 + number for number in numbers)]]
+        names = [topic.name for topic in self._starting]
+        streams = {name: first[name] for name in names}
+        block = Block(streams, merge_events(streams, clock))
+        happenings, _ = happenings_of(stage, found, block, World({}, origins), settings)
+        is_aligned = np.zeros(len(begun.time_ns), bool)
+        for run in range(len(is_aligned)):
+            solved = self._align(happenings, run, stage, settings)
+            if solved is not None:
+                begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
+                is_aligned[run] = True
+        return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+
+    def _align(
+        self, happenings: Happenings, run: int, stage: Stage, settings: Floats
+    ) -> tuple[int, Floats, Floats] | None:
+        """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
+        model = stage.model
+        assert model.start is not None
+        assert model.start.align is not None
+        parameters = reading_settings(number_fields(model.parameters))(settings, 0)
+        state, control = (0.0,) * model.size, np.zeros(model.controls)
+        path: list[Any] = []
+        places: list[Floats] = []
+        spreads: list[Floats] = []
+        begin, end = happenings.offsets[run : run + 2]
+        _, first = data_columns(stage)
+        before_ns = first_ns = 0
+        for event in range(begin, end):
+            time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
+            duration_s = (time_ns - before_ns) * 1e-9
+            if event > begin and duration_s > 0.0:
+                state = model.motion.move(state, tuple(control), duration_s, parameters)
+            before_ns, data = time_ns, happenings.data[event]
+            if source == CONTROL:
+                own = data[first : first + len(control)]
+                control = np.where(np.isnan(own), control, own)
+            elif source >= 0:
+                size = len(stage.sensors[source].measured)
+                lower = np.zeros((size, size))
+                lower[np.tril_indices(size)] = data[size : size + size * (size + 1) // 2]
+                first_ns = first_ns or time_ns
+                path.append(state)
+                places.append(data[:size])
+                spreads.append(lower + np.tril(lower, -1).T)
+                solved = model.start.align(
+                    *map(np.array, (path, places, spreads)), (time_ns - first_ns) * 1e-9, parameters
+                )
+                if solved is not None:
+                    return time_ns + 1, *solved
+        return None
+
+    def _complaints(self) -> str:
+        complaints = [
+            complaint_of(self.stage.model, sensor, topic.name) for _, sensor, topic in self._measuring
+        ]
+        return "; ".join(complaints)
+
+    def _told_origin(self, fixes: Ragged) -> Ragged:
+        """The origins as fixes, on a topic of their own."""
+        stream = fixes.stream
+        columns: dict[str, Any] = {
+            name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
+        }
+        topic = f"/estimates/{self.name}/origin"
+        told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
+        return Ragged(told, fixes.offsets)
+
+    def _told(self, facts: list["_Fact"]) -> list[Ragged]:
+        """What was assumed, on the topic `started`: a message for each sentence and run."""
+        if not facts:
+            return []
+        texts, times, which = zip(*facts, strict=True)
+        is_said = np.stack(which, axis=1)
+        stream = reason_stream(
+            f"/estimates/{self.name}/started",
+            schemas.STARTED,
+            np.stack(times, axis=1)[is_said],
+            np.nonzero(is_said)[1],
+            texts,
+        )
+        return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
+
+
+class _Begun(NamedTuple):
+    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+
+
+class _Fact(NamedTuple):
+    """A sentence, when it is told (runs,), and in which runs (runs,)."""
+
+    text: str
+    time_ns: Integers
+    is_so: Booleans
+
+
+def _diagonal(size: int) -> Integers:
+    """Where the diagonal stands among the rows of a lower triangle."""
+    rows = np.arange(1, size + 1)
+    return np.cumsum(rows) - 1
+
+
+def _runs(first: Mapping[str, Ragged]) -> int:
+    return next(iter(first.values())).runs
+
+
+def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
+    sigmas = start.sigmas if start else {}
+    kinds = list(state.values())
+    mean = np.zeros(len(kinds))
+    for kind, columns in things(kinds):
+        if kind in ("axis", "quaternion"):
+            mean[columns.start] = 1.0
+    names = [name for name, _ in tangent_components(list(state), kinds)]
+    return mean, np.array([sigmas.get(name, np.nan) for name in names])
+
+
+def _first_of(
+    ragged: Ragged, clock: Clock, usable: Booleans | None
+) -> tuple[Integers, Booleans, Integers]:
+    """The first usable message of every run (runs,): its stamp, whether there is one, its row."""
+    every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
+    place = np.searchsorted(every, ragged.offsets)
+    has_one = place[1:] > place[:-1]
+    rows = np.zeros(ragged.runs, np.int64)
+    rows[has_one] = every[place[:-1][has_one]]
+    time_ns = np.zeros(ragged.runs, np.int64)
+    time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
+    return time_ns, has_one, rows
+
+
+def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
+    """A stream of one message for each of some runs."""
+    return Ragged(stream, np.append(0, np.cumsum(has_one)))

@@ -1,0 +1,4 @@
+"""Smoothers: the backward pass over a filter, iterated smoothing, and the bound of all of it.
+
+Begin with `backward_pass`.
+"""

@@ -1,0 +1,336 @@
+"""The affine filter about a trajectory: how a pass of Gauss-Newton goes forward.
+
+With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
+vectors d_k from there, which lie in flat space:
+
+    d_k = E(-r) F d_(k-1) - r + noise of covariance Jr(r) Q Jr(r)',   r = x_k (-) f(x_(k-1))
+
+with the rotation E and the right Jacobian Jr, units but for orientations. No inverse of Q is needed:
+where it is singular, x_k keeps to what noise can reach, and the cost is that of the noise. A robust loss
+takes part by reweighting.
+
+Bell, SIAM J. Optim. 4(3), 1994.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.inference.kalman.predict import motion_derivative, motion_noise
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    Note,
+    Steps,
+    Workspace,
+    gaussian_filter,
+    workspace,
+)
+from replay.inference.kalman.update import reading, sensor_derivative, whitening
+from replay.inference.linear_algebra.gaussian import (
+    moved_covariance,
+    scalar_update,
+)
+from replay.inference.linear_algebra.manifold import differencing, is_flat, resetting, retraction
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.model.stage import Stage
+from replay.inference.smoothing.backward_pass import (
+    Chain,
+    ForwardMemory,
+    smoothing_steps,
+)
+
+LOSSES = ("square", "huber", "cauchy")
+NOTHING_LEFT = 1e-12  # of a variance, beside what other components say of it
+
+
+class Factors(NamedTuple):
+    """Covariances of steps as `factor_by_pivots` gives them, first axis = step.
+
+    Attributes:
+        factor, order, rank: (steps, t, t), (steps, t), (steps,); a rank of -1 where none is known.
+    """
+
+    factor: Floats
+    order: Integers
+    rank: Integers
+
+
+def no_factors(count: int, t: int) -> Factors:
+    """Of so many steps none is known."""
+    return Factors(np.empty((count, t, t)), np.empty((count, t), np.int64), np.full(count, -1))
+
+
+class Trajectory(NamedTuple):
+    """Where everything is linearised, and what a pass over it finds.
+
+    Attributes:
+        mean: (nodes, n) the states.
+        noises: of the steps to all nodes, as the pass before found them: there the cost was the least,
+            or the pass goes over the same states once more.
+        kept: (nodes, n) the states of the least cost so far.
+        node: (events,) of every event the node of its stamp.
+        scale: (nodes, t) variances of the start; over the damping those of the states as they stand.
+        loss: (2,) an index of LOSSES, and its scale.
+        damping: (1,) of this pass.
+        cost, held: (1,) of the trajectory, with the noise as it is there and as it is at `kept`.
+        noise, found: (t, t) the covariance of a step, and its factor.
+        offset, column: (1, t), (t,).
+    """
+
+    mean: Floats
+    noises: Factors
+    kept: Floats
+    node: Integers
+    scale: Floats
+    loss: Floats
+    damping: Floats
+    cost: Floats
+    held: Floats
+    noise: Floats
+    found: Factors
+    offset: Floats
+    column: Floats
+
+
+def affine_steps(stage: Stage) -> Steps:
+    """The steps of the affine filter about a `Trajectory`, the only one of `memory`'s sets."""
+    sensors = tuple(affine_sensor(stage, number) for number in range(len(stage.sensors)))
+    steps = gaussian_filter(stage, affine_motion(stage), sensors, partial(workspace, stage))
+    chained = smoothing_steps(stage, steps)
+    advance, hold = chained.predict, damped
+
+    def predict(
+        run: int,
+        belief: Chain,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        memory: ForwardMemory,
+    ) -> bool:
+        if not advance(run, belief, control, duration_s, parameters, use, memory):
+            return False
+        trajectory = memory.filter.samples[0]
+        hold(belief.mean[run], belief.covariance[run], trajectory, trajectory.node[use])
+        return True
+
+    return chained._replace(predict=predict)
+
+
+def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) -> None:
+    """Measure every component of the state as it stands, one after the other."""
+    damping, column = trajectory.damping[0], trajectory.column
+    if damping == 0.0:
+        return
+    for component in range(len(mean)):
+        for row in range(len(mean)):
+            column[row] = covariance[row, component]
+        variance = column[component] + trajectory.scale[node, component] / damping
+        if variance > 0.0:
+            scalar_update(mean, covariance, column, variance, -mean[component])
+
+
+def affine_motion(stage: Stage) -> Function:
+    """Prediction of the tangent vector at one stamp to that at the next."""
+    model, motion = stage.model, stage.motion
+    linearise = motion_derivative(model, motion, by_state=True)
+    add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+    flat, carry = is_flat(model.kinds), carrying(model.kinds)
+    turn = resetting(model.kinds)
+
+    def predict(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
+        trajectory, step = work.samples[0], work.step
+        node, noise, offset = trajectory.node[use], trajectory.noise, trajectory.offset[0]
+        state = read_state(trajectory.mean[node - 1])
+        linearise(state, read_control(control), duration_s, parameters, work)
+        noise[:] = 0.0
+        add_noise(state, noise, duration_s, parameters, work)
+        if not reach(trajectory, node, work.state):
+            return False
+        if not flat:
+            turn(offset, noise)
+            turn(offset, noise.T)
+            carry(offset, work.transition, step)
+        for row in range(len(step)):
+            step[row] = -offset[row]
+            for k in range(len(step)):
+                step[row] += work.transition[row, k] * mean[k]
+        moved_covariance(covariance, work.transition, work.product)
+        for row in range(len(step)):
+            mean[row] = step[row]
+            for column in range(len(step)):
+                covariance[row, column] += noise[row, column]
+        return True
+
+    return predict
+
+
+def carrying(kinds: tuple[str, ...]) -> Function:
+    """`carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
+
+    Takes tangent vectors at one state to those at the state that lies `offset` from it.
+    """
+    turn, turn_back = resetting(kinds), resetting(kinds, back=True)
+
+    def carry(offset: Floats, rows: Floats, step: Floats) -> None:
+        for row in range(len(step)):
+            step[row] = -offset[row]
+        turn_back(step, rows)
+        turn(offset, rows)
+
+    return carry
+
+
+def reaching(kinds: tuple[str, ...]) -> Function:
+    """`reach(trajectory, node, origin)`: how far a state is from where it comes from; False if unknown.
+
+    Fills `offset`, and adds its square in units of the noise to the costs. Where noise has no part the
+    state is moved to what it can reach.
+    """
+    add, subtract = retraction(kinds), differencing(kinds)
+
+    def reach(trajectory: Trajectory, node: int, origin: Floats) -> bool:
+        offset, whitened = trajectory.offset[0], trajectory.column
+        noises, (factors, orders, ranks) = trajectory.noises, trajectory.found
+        factor, order = factors[0], orders[0]
+        rank = ranks[0] = factor_by_pivots(trajectory.noise, factor, order, whitened)
+        if rank < 0:
+            return False
+        subtract(trajectory.mean[node], origin, trajectory.offset, 0)
+        squared = held = whitened_square(offset, trajectory.found, 0, whitened)
+        if rank < len(offset):
+            for k in range(rank, len(offset)):
+                offset[order[k]] = 0.0
+                for j in range(rank):
+                    offset[order[k]] += factor[order[k], j] * whitened[j]
+            for row in range(len(origin)):
+                trajectory.mean[node, row] = origin[row]
+            add(trajectory.mean[node], offset)
+        if noises.rank[node] >= 0:
+            held = whitened_square(offset, noises, node, whitened)
+        for row in range(len(offset)):
+            noises.order[node, row] = order[row]
+            for column in range(rank):
+                noises.factor[node, row, column] = factor[row, column]
+        noises.rank[node] = rank
+        trajectory.cost[0] += 0.5 * squared
+        trajectory.held[0] += 0.5 * held
+        return not np.isnan(squared + held)
+
+    return reach
+
+
+def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Floats) -> float:
+    """The square of an offset in units of a noise, where that has a part; fills `whitened`."""
+    factor, order, squared = factors.factor[step], factors.order[step], 0.0
+    for k in range(factors.rank[step]):
+        entry = offset[order[k]]
+        for j in range(k):
+            entry -= factor[order[k], j] * whitened[j]
+        whitened[k] = entry / factor[order[k], k]
+        squared += whitened[k] ** 2
+    return squared
+
+
+def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floats) -> int:
+    """Cholesky's factor of a positive semidefinite matrix: its rank, or -1 where it is none.
+
+    The row with the largest share of its diagonal entry left comes next; shares below NOTHING_LEFT are
+    round-off. Fills `order`, and `factor` (t, rank), whose row order[k] ends in column k.
+    """
+    size = len(matrix)
+    for row in range(size):
+        order[row], left[row] = row, matrix[row, row]
+    for rank in range(size):
+        best, most = -1, NOTHING_LEFT
+        for k in range(rank, size):
+            row = order[k]
+            share = left[row] / matrix[row, row] if matrix[row, row] > 0.0 else left[row]
+            if not share >= -NOTHING_LEFT:
+                return -1
+            if share > most:
+                best, most = k, share
+        if best < 0:
+            return rank
+        order[rank], order[best] = order[best], order[rank]
+        chosen = order[rank]
+        pivot = factor[chosen, rank] = np.sqrt(left[chosen])
+        for k in range(rank + 1, size):
+            row = order[k]
+            entry = matrix[row, chosen]
+            for j in range(rank):
+                entry -= factor[row, j] * factor[chosen, j]
+            factor[row, rank] = entry / pivot
+            left[row] -= factor[row, rank] ** 2
+    return size
+
+
+def affine_sensor(stage: Stage, number: int) -> Function:
+    """The update of the tangent vector by sensor `number`, one component after the other."""
+    model, sensor = stage.model, stage.sensors[number]
+    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
+    noise_enters = sensor.noises > 0
+
+    def update(
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        work: Workspace,
+        note: Note,
+    ) -> int:
+        trajectory, innovation = work.samples[0], work.innovations[number]
+        node, about, column = trajectory.node[use], read_about(data), trajectory.column
+        if noise_enters:
+            linearise(read_state(trajectory.kept[node]), about, parameters, work)
+            _, squared = whiten_residual(data, parameters, work)
+            trajectory.held[0] += robust(squared, trajectory.loss)[0]
+        linearise(read_state(trajectory.mean[node]), about, parameters, work)
+        size, squared = whiten_residual(data, parameters, work)
+        if np.isnan(squared):
+            return NOT_POSITIVE_DEFINITE
+        cost, weight = robust(squared, trajectory.loss)
+        trajectory.cost[0] += cost
+        if not noise_enters:
+            trajectory.held[0] += cost
+        for i in range(size):
+            variance, difference = 1.0 / weight, innovation.difference[i]
+            for row in range(len(mean)):
+                entry = 0.0
+                for k in range(len(mean)):
+                    entry += covariance[row, k] * innovation.cross_covariance[k, i]
+                column[row] = entry
+                variance += innovation.cross_covariance[row, i] * entry
+                difference -= innovation.cross_covariance[row, i] * mean[row]
+            if not variance > 0.0:
+                return NOT_POSITIVE_DEFINITE
+            scalar_update(mean, covariance, column, variance, difference)
+        return NOTHING_MEASURED  # that is of interest later: nothing is noted
+
+    return update
+
+
+def robust(squared: float, loss: Floats) -> tuple[float, float]:
+    """The cost of a residual whose square is given, and the weight that has its derivative."""
+    bound = loss[1] ** 2
+    if loss[0] == 1.0 and squared > bound:
+        length = np.sqrt(squared)
+        return loss[1] * (length - 0.5 * loss[1]), loss[1] / length
+    if loss[0] == 2.0:
+        return 0.5 * bound * np.log1p(squared / bound), 1.0 / (1.0 + squared / bound)
+    return 0.5 * squared, 1.0

@@ -1,0 +1,317 @@
+"""The way back over a filter: its estimates, corrected by all that was measured later.
+
+A filter goes forward. At every stamp that has an estimate, a node, it leaves its Gaussian and what ties
+it to the node before; from the last node the way leads back. For a step from k to k + 1 with the
+prediction (m-, P-) and D, the covariance of the state before with the state after it,
+
+    G = D P-^-1,  ms_k = m_k (+) G (ms_(k+1) (-) m-),  Ps_k = (P_k - G D') + G Ps_(k+1) G'
+
+with the derivative's D for extended filters and that of the samples for the others. Several predictions
+between two nodes are one such step: their G multiply. Where the state is no vector, (+) and (-) and the
+tangent spaces of the covariances are those of `replay.inference.model.corrections`.
+
+Rauch, Tung and Striebel, AIAA Journal 3(8), 1965; Sarkka, IEEE TAC 53(3), 2008.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.compiling.compile import compile_over_runs
+from replay.inference.kalman.steps import Note, Steps
+from replay.inference.linear_algebra.gaussian import (
+    copy_gaussian,
+    moved_covariance,
+    multiply,
+    semidefinite_cholesky,
+)
+from replay.inference.linear_algebra.manifold import tangent_size
+from replay.inference.model.corrections import Kinds, comparing, correcting, sloping
+from replay.inference.model.model import Correction
+from replay.inference.model.stage import Stage
+from replay.inference.run.recursion import Estimates
+
+FOREVER_NS = np.iinfo(np.int64).max
+
+
+# The way forward
+
+
+class Chain(NamedTuple):
+    """What is believed of the states, and of how they came from the last node; first axis = run.
+
+    Attributes:
+        mean, covariance: the filter's, (runs, n) and (runs, t, t).
+        predicted, slope: (runs, n) the last prediction, before it was corrected, and (runs, t) its
+            tangent, see `replay.inference.model.model.Correction`.
+        gain, rest: (runs, t, t) G and P - G D' of the predictions since the last node.
+        predictions: (runs,) how many these are.
+    """
+
+    mean: Floats
+    covariance: Floats
+    predicted: Floats
+    slope: Floats
+    gain: Floats
+    rest: Floats
+    predictions: Integers
+
+
+class Nodes(NamedTuple):
+    """Estimates as the filter fills them in, and how each came from the one before; see `Chain`."""
+
+    end: Integers
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    predicted: Floats
+    slope: Floats
+    gain: Floats
+    rest: Floats
+
+
+class ForwardMemory(NamedTuple):
+    """What the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
+
+    filter: Any
+    rest: Floats
+    turned: Floats
+    factor: Floats
+    product: Floats
+
+
+def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
+    """The steps of a filter that leaves nodes; its `predict` fills `Workspace.product`."""
+    model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
+    find_slope = sloping(model.kinds, model.correct)
+
+    def predict(
+        run: int,
+        belief: Chain,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        memory: ForwardMemory,
+    ) -> bool:
+        rest, turned, product = memory.rest, memory.turned, memory.product
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        for row in range(t):
+            for column in range(t):
+                rest[row, column] = covariance[row, column]
+        if not predict_filter(run, belief, control, duration_s, parameters, use, memory.filter):
+            return False
+        cross = memory.filter.product
+        for row in range(t):
+            for column in range(t):
+                turned[row, column] = cross[row, column]
+        if not solve_semidefinite(covariance, turned, memory.factor):
+            return False
+        for row in range(t):
+            for column in range(row + 1):
+                entry = rest[row, column]
+                for k in range(t):
+                    entry -= turned[k, row] * cross[k, column]
+                rest[row, column] = rest[column, row] = entry
+        lengthen(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
+        belief.predictions[run] += 1
+        find_slope(mean, covariance, belief.slope[run])
+        for row in range(len(mean)):
+            belief.predicted[run, row] = mean[row]
+        return True
+
+    def estimate(run: int, belief: Chain, nodes: Nodes, row: int, memory: ForwardMemory) -> None:
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        copy_gaussian(mean, covariance, nodes.mean[row], nodes.covariance[row])
+        still = belief.predictions[run] == 0
+        for i in range(len(mean)):
+            nodes.predicted[row, i] = belief.predicted[run, i]
+            belief.predicted[run, i] = mean[i]
+        for i in range(t):
+            nodes.slope[row, i] = belief.slope[run, i]
+            for j in range(t):
+                unit = 1.0 if i == j else 0.0
+                nodes.gain[row, i, j] = unit if still else belief.gain[run, i, j]
+                nodes.rest[row, i, j] = 0.0 if still else belief.rest[run, i, j]
+        belief.predictions[run] = 0
+
+    def memory(sets: tuple[Any, ...]) -> ForwardMemory:
+        return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
+
+    updates = tuple(_with_memory(update) for update in steps.updates)
+    return Steps(memory, predict, updates, estimate, steps.sampled, steps.resumes)
+
+
+def _with_memory(update: Function) -> Function:
+    def update_filter(
+        run: int,
+        belief: Chain,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        use: int,
+        memory: ForwardMemory,
+        note: Note,
+    ) -> int:
+        return update(run, belief, data, parameters, gate, use, memory.filter, note)
+
+    return update_filter
+
+
+def lengthen(
+    gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
+) -> None:
+    """Make one step of the steps so far and the next, which it uses up: G G1, and A + G A1 G'."""
+    t = len(gain)
+    if predictions == 0:
+        for row in range(t):
+            for column in range(t):
+                gain[row, column] = next_gain[row, column]
+                rest[row, column] = next_rest[row, column]
+        return
+    moved_covariance(next_rest, gain, product)
+    multiply(gain, next_gain, product)
+    for row in range(t):
+        for column in range(t):
+            rest[row, column] += next_rest[row, column]
+            gain[row, column] = product[row, column]
+
+
+def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
+    """Make X of B in place, A X = B, by Cholesky's factor of A, which goes into `factor`.
+
+    A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
+    is in the range of A. False where A is not positive semidefinite.
+    """
+    size, columns = len(matrix), right.shape[1]
+    if not semidefinite_cholesky(factor, matrix, size):
+        return False
+    for row in range(size):
+        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
+        for k in range(row):
+            for column in range(columns):
+                right[row, column] -= factor[row, k] * right[k, column]
+        for column in range(columns):
+            right[row, column] *= scale
+    for row in range(size - 1, -1, -1):
+        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
+        for k in range(row + 1, size):
+            for column in range(columns):
+                right[row, column] -= factor[k, row] * right[k, column]
+        for column in range(columns):
+            right[row, column] *= scale
+    return True
+
+
+# The way back
+
+
+class Later(NamedTuple):
+    """The node behind a piece: in which runs there is one, and these, smoothed, a row for each run."""
+
+    is_there: Integers
+    nodes: Nodes
+
+
+class BackMemory(NamedTuple):
+    """What the way back of one core works in: a Gaussian, what carries it, and a step's vectors."""
+
+    mean: Floats
+    covariance: Floats
+    product: Floats
+    rest: Floats
+    change: Floats
+    state: Floats
+    transition: Floats
+    step: Floats
+    slope: Floats
+
+
+@lru_cache(maxsize=64)
+def going_back(kinds: Kinds, correct: Correction | None = None) -> Function:
+    """The same over all runs, compiled; see `way_back`."""
+    return compile_over_runs(way_back(kinds, correct), allocates=False, title="a smoother's way back")
+
+
+def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
+    """The loop over the nodes of one run, from its last to its first."""
+    move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
+    find_slope, t = sloping(kinds, correct), tangent_size(kinds)
+
+    def go_back(mean: Floats, covariance: Floats, nodes: Nodes, node: int, work: BackMemory) -> None:
+        """Move the Gaussian of `work` from a node to the one before, whose filtered one is given."""
+        gain, rest, step, change = nodes.gain[node], nodes.rest[node], work.step, work.change[0]
+        for row in range(t):
+            work.slope[row] = nodes.slope[node, row]
+        compare(nodes.predicted[node], work.mean, work.covariance, work)
+        for row in range(t):
+            entry = 0.0
+            for k in range(t):
+                entry += gain[row, k] * change[k]
+            step[row] = entry
+        moved_covariance(work.covariance, gain, work.product)
+        for row in range(t):
+            for column in range(t):
+                work.covariance[row, column] += rest[row, column]
+        find_slope(mean, covariance, work.slope)
+        for row in range(len(mean)):
+            work.mean[row] = mean[row]
+        move(work.mean, work.covariance, work)
+
+    def smooth(
+        run: int,
+        nodes: Nodes,
+        offsets: Integers,
+        stop: Integers,
+        lag_ns: int,
+        later: Later,
+        start: Integers,
+        smoothed: Estimates,
+        work: BackMemory,
+    ) -> None:
+        """Smooth the nodes of a piece that lie before row stop[run], into the rows from start[run] on.
+
+        Each comes back from the last node within the lag; `later` then holds the first of them.
+        """
+        begin, through, reached = offsets[run], offsets[run + 1] - 1, -1
+        at = through
+        for row in range(stop[run] - 1, begin - 1, -1):
+            while nodes.time_ns[through] - nodes.time_ns[row] > lag_ns:
+                through -= 1
+            if through != reached:
+                at = reached = through
+                copy_gaussian(nodes.mean[at], nodes.covariance[at], work.mean, work.covariance)
+                if later.is_there[run]:
+                    behind = later.nodes
+                    copy_gaussian(behind.mean[run], behind.covariance[run], work.mean, work.covariance)
+                    go_back(nodes.mean[at], nodes.covariance[at], behind, run, work)
+            while at > row:
+                go_back(nodes.mean[at - 1], nodes.covariance[at - 1], nodes, at, work)
+                at -= 1
+            place = start[run] + row - begin
+            smoothed.time_ns[place] = nodes.time_ns[row]
+            copy_gaussian(work.mean, work.covariance, smoothed.mean[place], smoothed.covariance[place])
+        if stop[run] > begin:
+            later.is_there[run] = True
+            first = later.nodes
+            copy_gaussian(work.mean, work.covariance, first.mean[run], first.covariance[run])
+            copy_gaussian(
+                nodes.predicted[begin], nodes.gain[begin], first.predicted[run], first.gain[run]
+            )
+            copy_gaussian(nodes.slope[begin], nodes.rest[begin], first.slope[run], first.rest[run])
+
+    return smooth
+
+
+def no_later(runs: int, n: int, t: int) -> Later:
+    """Where nothing lies behind a piece, for so many runs of states with n components; see `Later`."""
+    wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t,), (t, t), (t, t)))
+    return Later(np.zeros(runs, bool), Nodes(np.arange(runs), np.empty(runs, np.int64), *wide))
+
+
+def back_memory(n: int, t: int) -> BackMemory:
+    """Memory for the way back of states with n components, and t in the tangent space."""
+    shapes = (n,), (t, t), (t, t), (t, t), (1, t), (n,), (t, t), (t,), (t,)
+    return BackMemory(*(np.empty(shape) for shape in shapes))

@@ -1,0 +1,131 @@
+"""The way back a fixed lag behind a filter, without going over the whole lag for every estimate.
+
+The lag is a window of steps that slides: as they compose, whatever brackets are put, a queue made of two
+stacks has the composition of all its steps at hand, at two compositions a node however many nodes the
+lag has. Where the means of a manifold have a part in the steps they do not compose.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.compiling.compile import compile_over_runs
+from replay.inference.linear_algebra.gaussian import copy_gaussian, moved_covariance
+from replay.inference.linear_algebra.manifold import differencing, retraction
+from replay.inference.run.recursion import Estimates
+from replay.inference.smoothing.backward_pass import BackMemory, Nodes, lengthen
+
+
+class Window(NamedTuple):
+    """The steps within the lag of the first node that is not smoothed yet, as two stacks.
+
+    Of the steps to the nodes up to `turned`, each node's row holds the composition of its own and all
+    behind it, up to there; those from there up to `through` are composed here. First axis = run; nodes
+    count from the first that is kept. A step is (G, b, A): deviations from the filter's means go back by
+    d_k = G d_(k+1) + b, covariances by P_k = A + G P_(k+1) G'.
+    """
+
+    turned: Integers
+    through: Integers
+    gain: Floats
+    shift: Floats
+    rest: Floats
+
+
+@lru_cache(maxsize=64)
+def sliding_over_runs(kinds: tuple[str, ...]) -> Function:
+    """The same over all runs, compiled; see `sliding`."""
+    return compile_over_runs(sliding(kinds), allocates=False, title="a smoother with a fixed lag")
+
+
+def sliding(kinds: tuple[str, ...]) -> Function:
+    """The loop over the nodes of one run in flat space, from its first to its last, a lag behind."""
+    add, subtract = retraction(kinds), differencing(kinds)
+
+    def take_in(
+        row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
+    ) -> None:
+        """The step to a node behind those of the window: its row gets b in place of the prediction."""
+        shift, change = nodes.predicted[row], work.change[0]
+        subtract(nodes.mean[row], shift, work.change, 0)
+        for i in range(len(shift)):
+            entry = 0.0
+            for k in range(len(shift)):
+                entry += nodes.gain[row, i, k] * change[k]
+            shift[i] = entry
+        gain, rest = window.gain[run], window.rest[run]
+        if is_first:
+            copy_gaussian(shift, nodes.gain[row], window.shift[run], gain)
+            copy_gaussian(shift, nodes.rest[row], window.shift[run], rest)
+        else:
+            extend(gain, window.shift[run], rest, nodes.gain[row], shift, nodes.rest[row], work)
+
+    def go_back(gain: Floats, shift: Floats, rest: Floats, work: BackMemory) -> None:
+        """Take deviation and covariance of `work` by a step."""
+        step, deviation = work.step, work.mean
+        for row in range(len(step)):
+            step[row] = shift[row]
+            for k in range(len(step)):
+                step[row] += gain[row, k] * deviation[k]
+        moved_covariance(work.covariance, gain, work.product)
+        for row in range(len(step)):
+            deviation[row] = step[row]
+            for column in range(len(step)):
+                work.covariance[row, column] += rest[row, column]
+
+    def slide(
+        run: int,
+        nodes: Nodes,
+        offsets: Integers,
+        stop: Integers,
+        lag_ns: int,
+        window: Window,
+        start: Integers,
+        smoothed: Estimates,
+        work: BackMemory,
+    ) -> None:
+        """Smooth the nodes before row stop[run] into the rows from start[run] on."""
+        begin, last = offsets[run], offsets[run + 1] - 1
+        turned, through = begin + window.turned[run], begin + window.through[run]
+        for row in range(begin, stop[run]):
+            if through < row:
+                turned = through = row
+            while through < last and nodes.time_ns[through + 1] - nodes.time_ns[row] <= lag_ns:
+                through += 1
+                take_in(through, through == turned + 1, nodes, window, run, work)
+            if turned <= row:
+                for k in range(through - 1, row, -1):
+                    gain, shift, rest = nodes.gain[k + 1], nodes.predicted[k + 1], nodes.rest[k + 1]
+                    extend(nodes.gain[k], nodes.predicted[k], nodes.rest[k], gain, shift, rest, work)
+                turned = through
+            work.mean[:] = 0.0
+            copy_gaussian(work.mean, nodes.covariance[through], work.mean, work.covariance)
+            if through > turned:
+                go_back(window.gain[run], window.shift[run], window.rest[run], work)
+            if turned > row:
+                go_back(nodes.gain[row + 1], nodes.predicted[row + 1], nodes.rest[row + 1], work)
+            place = start[run] + row - begin
+            smoothed.time_ns[place] = nodes.time_ns[row]
+            mean = smoothed.mean[place]
+            copy_gaussian(nodes.mean[row], work.covariance, mean, smoothed.covariance[place])
+            add(mean, work.mean)
+        window.turned[run], window.through[run] = turned - stop[run], through - stop[run]
+
+    return slide
+
+
+def extend(
+    gain: Floats,
+    shift: Floats,
+    rest: Floats,
+    next_gain: Floats,
+    next_shift: Floats,
+    next_rest: Floats,
+    work: BackMemory,
+) -> None:
+    """Make one step of a step and the next, in place of the first."""
+    for row in range(len(shift)):
+        for column in range(len(shift)):
+            shift[row] += gain[row, column] * next_shift[column]
+            work.rest[row, column] = next_rest[row, column]
+    lengthen(gain, rest, 1, next_gain, work.rest, work.product)

@@ -1,0 +1,207 @@
+"""Gauss-Newton on all states of a run, damped where a step would raise the cost.
+
+What is minimised, over the state at the prior's time and at every stamp after it, is
+
+    1/2 |x_0 (-) m_0|^2_P0 + 1/2 sum |x_k (-) f(x_(k-1))|^2_Q + sum rho(|y (-) h(x_k)|_R)
+
+A pass is an affine filter about the latest trajectory (`replay.inference.smoothing.affine`) and the way
+back over it (`replay.inference.smoothing.backward_pass`). Where a step would raise the cost it is taken
+again, damped (Levenberg and Marquardt): every state is measured as it stands, with the start's variances
+over the damping.
+
+Bell, SIAM J. Optim. 4(3), 1994; Sarkka and Svensson, ICASSP 2020.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.steps import Gaussian, Steps
+from replay.inference.linear_algebra.manifold import is_flat, resetting, retraction
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.settings import reading_settings
+from replay.inference.model.stage import Stage, title_of
+from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
+from replay.inference.smoothing.backward_pass import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
+
+SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
+ROUNDING = 1e-15
+COST_ROUNDING = 1e-6  # of one, or of the cost itself where larger: noise may depend on the state
+LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e12
+
+
+class Plan(NamedTuple):
+    """What a search is given: the prior (first axis = run), what drives before the first control.
+
+    And the first damping, and the most passes.
+    """
+
+    prior: Gaussian
+    start_ns: Integers
+    initial: Floats
+    damping: float
+    passes: int
+
+
+class Ended(NamedTuple):
+    """How the searches ended: passes, and whether converged (runs,).
+
+    Of every pass the cost, the damping and the largest step in standard deviations (runs, passes, 3).
+    """
+
+    passes: Integers
+    converged: Integers
+    told: Floats
+
+
+@lru_cache(maxsize=64)
+def searching(stage: Stage) -> tuple[Function, Steps]:
+    """The compiled search, and the steps that make its memory."""
+    steps = affine_steps(stage)
+    settings_of = reading_settings(number_fields(stage.model.parameters))
+    title = title_of(stage.model, "iterated smoother")
+    return compile_over_runs(search(stage, steps, settings_of), allocates=False, title=title), steps
+
+
+def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """The search of one run's trajectory, for `replay.engine.compiling.compile.compile_over_runs`."""
+    kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
+    follow, go_back = recursion(stage, steps, settings_of), way_back(("linear",) * t)
+    add, reach, turn = retraction(kinds), reaching(kinds), resetting(kinds)
+    flat, hold = is_flat(kinds), damped
+
+    def go_forward(
+        run: int,
+        happenings: Happenings,
+        settings: Floats,
+        gates: Floats,
+        plan: Plan,
+        carried: Carried,
+        nodes: Nodes,
+        offsets: Integers,
+        innovations: Innovations,
+        memory: ForwardMemory,
+    ) -> bool:
+        """Filter about the trajectory, and sum its cost; whether all went well."""
+        trajectory, belief, begin = memory.filter.samples[0], carried.belief, offsets[run]
+        mean, covariance = belief.mean[run], belief.covariance[run]
+        for row in range(t):
+            for column in range(t):
+                entry = plan.prior.covariance[run, row, column]
+                covariance[row, column] = trajectory.noise[row, column] = entry
+        trajectory.cost[0] = trajectory.held[0] = 0.0
+        if not reach(trajectory, begin, plan.prior.mean[run]):
+            return False
+        if not flat:
+            turn(trajectory.offset[0], covariance)
+            turn(trajectory.offset[0], covariance.T)
+        for row in range(t):
+            mean[row] = belief.predicted[run, row] = -trajectory.offset[0, row]
+        belief.predictions[run] = 0
+        hold(mean, covariance, trajectory, begin)
+        for row in range(len(plan.initial)):
+            carried.control[run, row] = plan.initial[row]
+        carried.time_ns[run], carried.failure[run] = plan.start_ns[run], ALL_WELL
+        nodes.end[run] = begin
+        follow(run, happenings, settings, gates, carried, nodes, innovations, memory)
+        whole = carried.failure[run] == ALL_WELL and nodes.end[run] == offsets[run + 1]
+        return whole and np.isfinite(trajectory.cost[0] + trajectory.held[0])
+
+    def move(
+        trajectory: Trajectory, kept: Floats, steps: Floats, begin: int, end: int
+    ) -> tuple[float, float, bool]:
+        """Move the trajectory from what is kept.
+
+        Returns the largest step, the sum of their squares, both in standard deviations of the start, and
+        whether these are nothing any more.
+        """
+        largest, squares, settled = 0.0, 0.0, True
+        for node in range(begin, end):
+            size = 0.0
+            for row in range(n):
+                trajectory.mean[node, row] = kept[node, row]
+                size = max(size, abs(kept[node, row]))
+            add(trajectory.mean[node], steps[node])
+            for row in range(t):
+                deviation, step = np.sqrt(trajectory.scale[node, row]), abs(steps[node, row])
+                settled = settled and step <= SETTLED * deviation + ROUNDING * size
+                if deviation > 0.0:
+                    largest = max(largest, step / deviation)
+                    squares += (step / deviation) ** 2
+        return largest, squares, settled
+
+    def search_run(
+        run: int,
+        happenings: Happenings,
+        settings: Floats,
+        gates: Floats,
+        plan: Plan,
+        carried: Carried,
+        nodes: Nodes,
+        offsets: Integers,
+        innovations: Innovations,
+        later: Later,
+        kept: Floats,
+        smoothed: Estimates,
+        ended: Ended,
+        scratch: Any,
+    ) -> None:
+        """Move `kept` (nodes, n) to the best trajectory of run `run`; the covariances go with it."""
+        memory, back = scratch
+        trajectory, begin, end = memory.filter.samples[0], offsets[run], offsets[run + 1]
+        ended.passes[run] = ended.converged[run] = 0
+        best, damping, again, last = np.inf, plan.damping, False, False
+        # the damping of the last step, and a gain that it must not miss by far
+        taken, promised = 0.0, 0.0
+        while begin < end:
+            trajectory.damping[0] = damping
+            well = go_forward(
+                run, happenings, settings, gates, plan, carried, nodes, offsets, innovations, memory
+            )
+            held, passes = trajectory.held[0], ended.passes[run]
+            slack, poor = COST_ROUNDING * max(1.0, best), False
+            if not again:
+                better = well and held <= best + slack
+                poor = not better or best - held < 0.25 * promised - slack
+                if better:
+                    best = trajectory.cost[0]
+                    copy_rows(trajectory.mean, kept, begin, end)
+                elif passes == 0:  # no start
+                    return
+            if poor:
+                damping, again = max(10.0 * taken, LEAST_DAMPING), True
+                taken, last = damping, damping > MOST_DAMPING
+            else:
+                later.is_there[run] = False
+                go_back(run, nodes, offsets, offsets[1:], FOREVER_NS, later, offsets, smoothed, back)
+                if last:
+                    return
+                largest, squares, settled = move(trajectory, kept, smoothed.mean, begin, end)
+                told = ended.told[run, passes]
+                told[0], told[1], told[2] = best, damping, largest
+                ended.passes[run] += 1
+                if settled and damping == 0.0:
+                    ended.converged[run] = 1
+                    copy_rows(trajectory.mean, kept, begin, end)
+                    return
+                taken, promised = damping, damping * squares
+                damping = 0.1 * damping if damping > 0.1 * LEAST_DAMPING else 0.0
+                again, last = False, passes + 1 == plan.passes
+            if again or last:
+                copy_rows(kept, trajectory.mean, begin, end)
+            if last:  # the covariances, which damping has no part in
+                damping, again = 0.0, True
+
+    return search_run
+
+
+def copy_rows(these: Floats, there: Floats, begin: int, end: int) -> None:
+    """Copy some rows of one array to the same of another."""
+    for row in range(begin, end):
+        for column in range(these.shape[1]):
+            there[row, column] = these[row, column]

@@ -1,0 +1,291 @@
+"""The iterated smoother: the states of a whole run that are most probable, given all measurements.
+
+It keeps the events of a run, smooths them once as the extended smoother does, and from there searches
+the trajectory of the least cost; see `replay.inference.smoothing.gauss_newton`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property, reduce
+from itertools import pairwise
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.errors import BadInput
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.streams.blocks import Ragged, copied, ragged_rows
+from replay.inference.kalman.methods import FILTERS, Method
+from replay.inference.kalman.steps import Gaussian, Steps
+from replay.inference.model.stage import Stage
+from replay.inference.run.events import data_columns, joined, last_of_stamps, of_rows, times_alone
+from replay.inference.run.filtering import State
+from replay.inference.run.recursion import NOTHING, Estimates, Happenings, no_results
+from replay.inference.smoothing import smoothers
+from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    Nodes,
+    back_memory,
+    no_later,
+    smoothing_steps,
+)
+from replay.inference.smoothing.gauss_newton import Ended, Plan, searching
+from replay.inference.smoothing.smoothers import Piece, Smoother, SmootherParameters
+
+
+class IteratedParameters(SmootherParameters):
+    """The start of the search, its damping, and the loss of outliers.
+
+    `start` is smoother (the extended filter, smoothed once), motion (the prior's mean, moved along) or
+    prior (that mean at all stamps). `damping` is that of the first step, in units of the information at
+    the start; with 0, Gauss-Newton is damped only where its cost would rise. With the losses huber and
+    cauchy a measurement whose whitened residual is longer than `loss_scale` counts less. The search
+    ends after `iterations` at most.
+    """
+
+    start: Literal["smoother", "motion", "prior"] = "smoother"
+    damping: NonNegativeFloat = 0.0
+    loss: Literal["square", "huber", "cauchy"] = "square"
+    loss_scale: PositiveFloat = 1.345
+    iterations: Annotated[PositiveInt, Field(le=1000)] = 50
+
+
+# As an estimator
+
+
+class Way(NamedTuple):
+    """Runs from their priors to their ends, as the extended smoother has them.
+
+    Attributes:
+        happenings: the events up to the last node, without those that a gate kept out.
+        node: (events,) of every event the node of its stamp.
+        nodes, offsets: the stamps, as the filter went through them; run r owns those from offsets[r] on.
+        states: the smoothed states there.
+        wanted: (nodes,) at which of them estimates are wanted.
+        made: the other outputs of the filter.
+    """
+
+    happenings: Happenings
+    node: Integers
+    nodes: Nodes
+    offsets: Integers
+    states: Estimates
+    wanted: Booleans
+    made: list[Ragged]
+
+
+class IteratedSmoother(Smoother):
+    """A smoother that keeps the events of the whole run, and at the end searches their trajectory."""
+
+    @cached_property
+    def lag_ns(self) -> int:
+        """The whole run."""
+        return FOREVER_NS
+
+    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+        """Keep the events."""
+        return state._replace(kept=(*state.kept, happenings)), []
+
+    def finish(self, state: State) -> list[Ragged]:
+        """The best trajectory, and how the search for it ended."""
+        state, _ = self.ended(state)
+        if not state.kept:
+            return []
+        way = self.smoothed_once(state)
+        kept, offsets = way.states, way.offsets
+        scale = np.diagonal(kept.covariance, axis1=1, axis2=2).copy()
+        if self.parameters.start == "motion":
+            kept.mean[:] = self._moved(state, way)
+        elif self.parameters.start == "prior":
+            kept.mean[:] = np.repeat(state.carried.belief.mean, np.diff(offsets), axis=0)
+        ended = self._search(state, way, scale)
+        rows = way.wanted
+        found = Estimates(kept.end, kept.time_ns[rows], kept.mean[rows], kept.covariance[rows])
+        states = self.states(found, ragged_rows(rows, offsets))
+        return [states, *way.made, *self._told(ended, way)]
+
+    def smoothed_once(self, state: State) -> "Way":
+        """The extended smoother's states at all stamps, from the prior's on."""
+        happenings = reduce(joined, (*self._first(state), *state.kept))
+        run = np.repeat(np.arange(len(state.tick)), np.diff(happenings.offsets))
+        asked, start_ns = happenings.is_due, state.carried.time_ns
+        happenings = happenings._replace(
+            is_due=last_of_stamps(happenings) & (happenings.time_ns >= start_ns[run])
+        )
+        _, (nodes, offsets), made = self.filtered(state, happenings)
+        stamp = np.cumsum(happenings.is_due) - happenings.is_due
+        stamp -= np.append(stamp, 0)[happenings.offsets[run]]  # counted in each run
+        known = stamp < np.diff(offsets)[run]  # a run that failed has no more
+        node = offsets[run] + stamp
+        wanted = np.zeros(offsets[-1], bool)
+        wanted[node[asked & known]] = True
+        states, _ = self.gone_back([Piece(nodes, offsets)])
+        used = of_rows(self._accepted(happenings, start_ns, made), known)
+        return Way(used, node[known], nodes, offsets, states, wanted, made)
+
+    def _moved(self, state: State, way: "Way") -> Floats:
+        """The prior's means, moved along all of every run as if nothing was measured."""
+        unseen = np.where(way.happenings.source >= 0, NOTHING, way.happenings.source)
+        _, (moved, reached), _ = self.filtered(state, way.happenings._replace(source=unseen))
+        if not np.array_equal(reached, way.offsets):
+            raise BadInput(
+                f"estimator {self.name}: start = motion: the prior cannot be moved along all of a run; "
+                "choose another start"
+            )
+        return moved.mean
+
+    def _first(self, state: State) -> list[Happenings]:
+        """The prior's time as an event; an interpolated control has made one already."""
+        control = self.stage.model.control
+        if control is not None and control.interpolated:
+            return []
+        runs, (width, _) = np.arange(len(state.tick) + 1), data_columns(self.stage)
+        return [times_alone(runs, state.carried.time_ns.copy(), width, is_due=False)]
+
+    def _accepted(
+        self, happenings: Happenings, start_ns: Integers, made: Sequence[Ragged]
+    ) -> Happenings:
+        """Events without the measurements that the gate kept out on the way forward."""
+        if self.parameters.gate_probability == 1.0:
+            return happenings
+        source = happenings.source.copy()
+        told = np.zeros(len(source), bool)
+        for number, sensor in enumerate(self.stage.sensors):
+            measured = happenings.data[:, : len(sensor.measured)]
+            told |= (source == number) & np.isfinite(measured).any(axis=1)
+        [innovations] = [each for each in made if each.stream.topic.endswith("/innovation")]
+        for run, (begin, end) in enumerate(pairwise(happenings.offsets)):
+            accepted = innovations.of_run(run)["accepted"]
+            told[begin:end] &= happenings.time_ns[begin:end] >= start_ns[run]
+            events = begin + np.flatnonzero(told[begin:end])[: len(accepted)]
+            source[events[accepted == 0]] = NOTHING
+        return happenings._replace(source=source)
+
+    def _search(self, state: State, way: Way, scale: Floats) -> Ended:
+        """Search the trajectories of all runs from the way's states, which they replace."""
+        stage, asked = self.stage, self.parameters
+        happenings, nodes, offsets, kept = way.happenings, way.nodes, way.offsets, way.states
+        loop, steps = searching(stage)
+        t, runs, count = stage.model.tangent, len(offsets) - 1, len(kept.mean)
+        _, innovations = no_results(np.zeros(1, int), np.arange(runs + 1), stage.model, 0)
+        belief = state.carried.belief
+        prior = Gaussian(belief.mean, belief.covariance)
+        plan = Plan(
+            prior,
+            state.carried.time_ns,
+            np.array(self.initial),
+            asked.damping,
+            asked.iterations,
+        )
+        chain = belief._replace(mean=np.empty((runs, t)), predicted=np.empty((runs, t)))
+        carried = copied(state.carried._replace(belief=chain))
+        vectors = nodes._replace(mean=np.empty((count, t)), predicted=np.empty((count, t)))
+        smoothed = kept._replace(mean=np.empty((count, t)))
+        later = no_later(runs, t, t)
+        ended = Ended(
+            np.zeros(runs, np.int64), np.zeros(runs, np.int64), np.zeros((runs, asked.iterations, 3))
+        )
+        loss = np.array([LOSSES.index(asked.loss), asked.loss_scale])
+        trajectory, noises = kept.mean.copy(), no_factors(count, t)
+
+        def scratch() -> Any:
+            own = Trajectory(
+                trajectory,
+                noises,
+                kept.mean,
+                way.node,
+                scale,
+                loss,
+                np.zeros(1),
+                np.zeros(1),
+                np.zeros(1),
+                np.empty((t, t)),
+                no_factors(1, t),
+                np.empty((1, t)),
+                np.empty(t),
+            )
+            return steps.memory((own,)), back_memory(t, t)
+
+        settings = np.repeat(self.settings[None], runs, axis=0)
+        gates = np.full_like(self.gates, np.inf)
+        loop(
+            runs, happenings, settings, gates, plan, carried, vectors, offsets, innovations, later,
+            kept.mean, smoothed, ended, scratch=scratch,
+        )  # fmt: skip
+        return ended
+
+    def _told(self, ended: Ended, way: Way) -> list[Ragged]:
+        """How the searches ended, and every pass of each, at the last node of its run."""
+        asked, some = self.parameters, np.diff(way.offsets) > 0
+        last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
+        passes, one = ended.passes, np.arange(len(some))
+        cost = ended.told[one, np.maximum(passes - 1, 0), 0]
+        t = self.stage.model.tangent
+        stated = {"start": asked.start, "damping": f"{asked.damping:g}", "loss": asked.loss}
+        stated |= {} if asked.loss == "square" else {"loss_scale": f"{asked.loss_scale:g}"}
+        solution = make_stream(
+            f"/estimates/{self.name}/solution",
+            schemas.SOLUTION,
+            last_ns[some],
+            metadata={"parameters": str(t), **stated},
+            iterations=passes[some],
+            converged=ended.converged[some],
+            rank=np.full(some.sum(), t),
+            cost=cost[some],
+        )
+        made = np.arange(asked.iterations) < passes[:, None]
+        run, number = np.nonzero(made)
+        iterations = make_stream(
+            f"/estimates/{self.name}/iteration",
+            schemas.ITERATION,
+            last_ns[run],
+            metadata=stated,
+            iteration=number,
+            **dict(zip(("cost", "damping", "largest_step"), ended.told[made].T, strict=True)),
+        )
+        return [
+            Ragged(solution, np.append(0, np.cumsum(some))),
+            Ragged(iterations, np.append(0, np.cumsum(passes))),
+        ]
+
+
+# As a method
+
+
+def _solved_at_the_end(stage: Stage) -> Steps:
+    """The way to the start: the extended filter's."""
+    return smoothing_steps(stage, FILTERS["ekf"].steps(stage))
+
+
+ITERATED = Method(
+    "iterated smoother: Gauss-Newton on all states of a run",
+    IteratedParameters,
+    _solved_at_the_end,
+    lacks=FILTERS["ekf"].lacks,
+    filtering=IteratedSmoother,
+)
+
+
+def _made_for(parameters: IteratedParameters) -> Method:
+    name, _, rest = parameters.forward.partition(":")
+    if name != "iterated":
+        assert smoothers.SMOOTHING.made_for is not None
+        own = sorted(set(IteratedParameters.model_fields) - set(SmootherParameters.model_fields))
+        for field in own:
+            if getattr(parameters, field) != IteratedParameters.model_fields[field].default:
+                raise BadInput(f"{field} is a setting of smoother:iterated, not of smoother:{name}")
+        return smoothers.SMOOTHING.made_for(parameters)
+    if rest:
+        raise BadInput(f"smoother:iterated uses the whole run and has no variants; leave out ':{rest}'")
+    return ITERATED
+
+
+SMOOTHING = replace(
+    smoothers.SMOOTHING,
+    summary=f"{smoothers.SMOOTHING.summary}; smoother:iterated is Gauss-Newton on the whole run",
+    parameters=IteratedParameters,
+    made_for=_made_for,
+)

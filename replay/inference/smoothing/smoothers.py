@@ -1,0 +1,289 @@
+"""Smoothers: filters that keep their nodes, and at the end, or a lag behind, go back over them.
+
+The steps that a filter leaves, and the way back over them, are in
+`replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
+`replay.inference.smoothing.fixed_lag`. Where the means of a manifold have a part in the steps, each
+estimate of a fixed lag comes back over the whole of it.
+"""
+
+import re
+import tempfile
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.arrays import Integers
+from replay.engine.streams.blocks import Ragged, copied
+from replay.inference.kalman.methods import (
+    FILTERS,
+    Method,
+    RegressionParameters,
+    UnscentedParameters,
+    filter_with,
+    named_filter,
+    no_steps,
+)
+from replay.inference.kalman.steps import Steps
+from replay.inference.linear_algebra.manifold import is_flat
+from replay.inference.model.model import Model
+from replay.inference.model.stage import Stage
+from replay.inference.run.filtering import Filter, State
+from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    Chain,
+    Nodes,
+    back_memory,
+    going_back,
+    no_later,
+    smoothing_steps,
+)
+from replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
+
+UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
+IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a temporary file
+
+
+class SmootherParameters(UnscentedParameters, RegressionParameters):
+    """The filter that goes forward, perhaps with a lag, as in `ekf:lag=500ms`.
+
+    Without a lag every estimate uses the whole run; with one, the messages up to so much later.
+    """
+
+    forward: str = "ekf"
+
+
+class Forward(NamedTuple):
+    """A filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
+
+    name: str
+    variant: str
+    lag_ns: int
+
+
+def parse_forward(text: str) -> Forward:
+    """What `SmootherParameters.forward` says; raises BadInput where it says nothing."""
+    before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
+    rest_on = before.removesuffix(":")
+    name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
+    if not has_lag:
+        return Forward(name, variant, FOREVER_NS)
+    found = re.fullmatch(rf"(\d+)({'|'.join(UNITS_NS)})", lag)
+    if found is None or int(found[1]) == 0:
+        raise BadInput(
+            f"lag={lag} is not a lag; give a whole number above zero and its unit, one of "
+            f"{', '.join(UNITS_NS)}, as in smoother:ekf:lag=500ms"
+        )
+    return Forward(name, variant, int(found[1]) * UNITS_NS[found[2]])
+
+
+# As an estimator
+
+
+class Piece(NamedTuple):
+    """Nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+
+    nodes: Nodes
+    offsets: Integers
+
+
+class Stored:
+    """A piece on disk, in a temporary file that is gone when nobody refers to it any more."""
+
+    def __init__(self, piece: Piece) -> None:
+        self.offsets = piece.offsets
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 lives as long as the piece
+        weakref.finalize(self, self._file.close)
+        for column in piece.nodes:
+            np.save(self._file, column)
+
+    def read(self) -> Piece:
+        """The piece, in memory."""
+        self._file.seek(0)
+        return Piece(Nodes(*(np.load(self._file) for _ in Nodes._fields)), self.offsets)
+
+
+def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
+    """A piece, on disk where it is too much beside those in memory."""
+    in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
+    size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
+    return new if size <= IN_MEMORY_BYTES else Stored(new)
+
+
+class Waiting(NamedTuple):
+    """The nodes within the lag, and the steps between them."""
+
+    piece: Piece
+    window: Window
+
+
+class Smoother(Filter):
+    """A filter that keeps its nodes, and at the end, or a lag behind, goes back over them."""
+
+    @cached_property
+    def lag_ns(self) -> int:
+        """How much later a message may be that an estimate uses."""
+        return parse_forward(self.parameters.forward).lag_ns
+
+    @property
+    def cannot_rewind(self) -> str:
+        """A smoother has its estimates from what came later in any case."""
+        return "a smoother uses later messages in any case; replay it in the order of the stamps"
+
+    def start(self, whole: Mapping[str, Ragged]) -> State:
+        """The state at every run's prior, see `Filter.start`."""
+        state = super().start(whole)
+        mean, covariance = state.carried.belief
+        gain, rest = (np.empty_like(covariance) for _ in range(2))
+        slope, none = np.zeros(covariance.shape[:2]), np.zeros(len(mean), np.int64)
+        chain = Chain(mean, covariance, mean.copy(), slope, gain, rest, none)
+        return state._replace(carried=state.carried._replace(belief=chain), kept=())
+
+    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+        """Nodes and innovations to be filled in."""
+        estimates, innovations = super().no_results(due, noted, slots)
+        end, times, mean, covariance = estimates
+        predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
+        gain, rest = (np.empty_like(covariance) for _ in range(2))
+        return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
+
+    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+        """Filter events, and smooth what the lag lets go."""
+        after, (nodes, offsets), made = self.filtered(state, happenings)
+        new = Piece(nodes, offsets)
+        if self.lag_ns == FOREVER_NS:  # nothing yet
+            nothing = self.states(*self.gone_back([new], offsets[:-1]))
+            return after._replace(kept=(*state.kept, stored(state.kept, new))), [nothing, *made]
+        piece, window = new, self._no_window(len(offsets) - 1)
+        if state.kept:
+            piece, window = _joined([state.kept.piece, new]), copied(state.kept.window)
+        begin, end = piece.offsets[:-1], piece.offsets[1:]
+        run = np.repeat(np.arange(len(begin)), end - begin)
+        newest_ns = np.append(piece.nodes.time_ns, 0)[end - 1]
+        is_ready = newest_ns[run] - piece.nodes.time_ns > self.lag_ns
+        stop = begin + np.bincount(run, is_ready, len(begin)).astype(np.int64)
+        smoothed = self.states(*self.lagging(piece, window, stop))
+        return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
+
+    def finish(self, state: State) -> list[Ragged]:
+        """What waited for later messages, and what those say of all before them."""
+        state, made = self.ended(state)
+        if self.lag_ns == FOREVER_NS:
+            return [*made, self.states(*self.gone_back(state.kept))]
+        if not state.kept:
+            return made
+        piece, window = copied(state.kept)
+        return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
+
+    def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[Estimates, Integers]:
+        """The estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
+
+        Changes the nodes, and the window, which then begins at row stop[run].
+        """
+        model = self.stage.model
+        if not is_flat(model.kinds):
+            return self.gone_back([piece], stop)
+        offsets = np.append(0, np.cumsum(stop - piece.offsets[:-1]))
+        smoothed = _no_estimates(offsets, model.size, model.tangent)
+        memory = partial(back_memory, model.size, model.tangent)
+        arguments = (piece.nodes, piece.offsets, stop, self.lag_ns, window, offsets, smoothed)
+        sliding_over_runs(model.kinds)(len(stop), *arguments, scratch=memory)
+        return smoothed, offsets
+
+    def _no_window(self, runs: int) -> Window:
+        t = self.stage.model.tangent
+        gain, rest = (np.empty((runs, t, t)) for _ in range(2))
+        turned, through = (np.zeros(runs, np.int64) for _ in range(2))
+        return Window(turned, through, gain, np.empty((runs, t)), rest)
+
+    def gone_back(
+        self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
+    ) -> tuple[Estimates, Integers]:
+        """The estimates at the nodes of all pieces, or of one those before row stop[run].
+
+        Run r owns offsets[r]:offsets[r + 1].
+        """
+        model, runs = self.stage.model, len(pieces[0].offsets) - 1 if pieces else 0
+        counts = [(piece.offsets[1:] if stop is None else stop) - piece.offsets[:-1] for piece in pieces]
+        offsets = np.append(0, np.cumsum(sum(counts, np.zeros(runs, np.int64))))
+        n, t = model.size, model.tangent
+        smoothed = _no_estimates(offsets, n, t)
+        later = no_later(runs, n, t)
+        start = offsets[1:].copy()
+        for kept, of_piece in zip(reversed(pieces), reversed(counts), strict=True):
+            piece = kept.read() if isinstance(kept, Stored) else kept
+            start -= of_piece
+            end = piece.offsets[:-1] + of_piece
+            memory = partial(back_memory, n, t)
+            arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
+            going_back(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+        return smoothed, offsets
+
+
+def _no_estimates(offsets: Integers, n: int, t: int) -> Estimates:
+    count = offsets[-1]
+    times, means = np.empty(count, np.int64), np.empty((count, n))
+    return Estimates(offsets[:-1], times, means, np.empty((count, t, t)))
+
+
+def _joined(pieces: Sequence[Piece]) -> Piece:
+    """Pieces as one, each run's nodes together."""
+    if len(pieces) == 1:
+        return pieces[0]
+    runs = np.arange(len(pieces[0].offsets) - 1)
+    run = np.concatenate([np.repeat(runs, np.diff(piece.offsets)) for piece in pieces])
+    order = np.argsort(run, kind="stable")
+    columns: Any = zip(*(piece.nodes[1:] for piece in pieces), strict=True)
+    offsets = sum((piece.offsets for piece in pieces), np.zeros(1, np.int64))
+    return Piece(Nodes(offsets[1:], *(np.concatenate(parts)[order] for parts in columns)), offsets)
+
+
+def _rows_from(piece: Piece, begin: Integers) -> Piece:
+    """The nodes of every run from row begin[run] on."""
+    counts = piece.offsets[1:] - begin
+    rows = np.arange(piece.offsets[-1]) >= np.repeat(begin, np.diff(piece.offsets))
+    columns: Any = (column[rows] for column in piece.nodes[1:])
+    offsets = np.append(0, np.cumsum(counts))
+    return Piece(Nodes(offsets[1:], *columns), offsets)
+
+
+# As a method
+
+
+@lru_cache(maxsize=64)
+def _smoother_of(name: str, variant: str) -> Method:
+    """The method that smooths what a filter estimates."""
+    inner = filter_with(name, variant)
+
+    def steps(stage: Stage) -> Steps:
+        return smoothing_steps(stage, inner.steps(stage))
+
+    def lacks(model: Model) -> str:
+        motions = (model.modes or {"": model.motion}).values()
+        if name == "analytic" and not all(motion.linear for motion in motions):
+            return "exact moments of its motion with the state before it"
+        return inner.lacks(model)
+
+    return replace(SMOOTHING, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
+
+
+def _made_for(parameters: SmootherParameters) -> Method:
+    forward = parse_forward(parameters.forward)
+    return _smoother_of(forward.name, forward.variant)
+
+
+SMOOTHING = Method(
+    "Rauch-Tung-Striebel smoother; the filter follows the name, as in smoother:ukf, and after it, if "
+    "wanted, a lag, as in smoother:ekf:lag=500ms",
+    SmootherParameters,
+    no_steps,
+    lacks=FILTERS["ekf"].lacks,
+    variant="forward",
+    made_for=_made_for,
+    filtering=Smoother,
+)

@@ -1,0 +1,185 @@
+"""How well scores verify and identify users: rates, ROC, equal error rate, cost of the likelihood ratio.
+
+Verification rate and relative rate increase: Zheng & Blasch, JAIF 2014, eq. 3. Cllr: Brummer & du Preez,
+Computer Speech & Language 2006. Scores are alike where they are great; a comparison is accepted where
+its score is not below the threshold.
+"""
+
+import operator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recorders.log import Stream, schemas
+from recorders.log.streams import concatenate
+from replay.judging.metrics.measuring import Metric, Output
+
+Floats = NDArray[np.float64]
+FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)
+
+
+class Roc(NamedTuple):
+    """Rates (n,) at falling thresholds, from nothing accepted to everything."""
+
+    threshold: Floats
+    false_accept: Floats
+    genuine_accept: Floats
+
+
+class Fused(NamedTuple):
+    """Fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
+
+    `fold` (users,) is that of the cross validation, `threshold` what the fusion decides by; None where
+    it has none. `is_ratio`: the scores are log-likelihood ratios.
+    """
+
+    score: Floats
+    probe: NDArray[np.int64]
+    gallery: NDArray[np.int64]
+    fold: NDArray[np.int64] | None
+    threshold: float | None
+    is_ratio: bool
+
+    @property
+    def genuine(self) -> NDArray[np.bool_]:
+        """Which comparisons are of the same user."""
+        return self.probe == self.gallery
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every probe is compared with every gallery entry."""
+        return len(self.score) == (int(self.gallery.max()) + 1) ** 2
+
+
+def fused_of(stream: Stream) -> Fused:
+    """What a fusion's output stream says."""
+    folds = stream.metadata.get("fold_of_user")
+    threshold = stream.metadata.get("threshold")
+    return Fused(
+        stream["scores"][:, 0],
+        stream["probe_id"].astype(np.int64),
+        stream["gallery_id"].astype(np.int64),
+        np.array(folds.split(","), np.int64) if folds else None,
+        float(threshold) if threshold else None,
+        stream.metadata.get("components") == "log_likelihood_ratio",
+    )
+
+
+def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None) -> Roc:
+    """The rates at every distinct score; `weight` (n,) counts comparisons more than once."""
+    order = np.argsort(-score, kind="stable")
+    falling = score[order]
+    counts = np.ones(len(score)) if weight is None else weight[order]
+    accepted = np.stack([np.cumsum(counts * ~genuine[order]), np.cumsum(counts * genuine[order])])
+    last = np.append(falling[1:] != falling[:-1], True)
+    rates = np.concatenate([np.zeros((2, 1)), accepted[:, last]], axis=1) / accepted[:, -1:]
+    return Roc(np.append(np.inf, falling[last]), *rates)
+
+
+def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
+    """The greatest genuine accept rate whose false accept rate is not above that given."""
+    last = np.searchsorted(curve.false_accept, false_accept, side="right") - 1
+    return curve.genuine_accept[last]
+
+
+def equal_error_rate(curve: Roc) -> float:
+    """The mean of false accepts and false rejects where they are closest: scores may be tied."""
+    reject = 1 - curve.genuine_accept
+    closest = int(np.argmin(np.abs(curve.false_accept - reject)))
+    return float(curve.false_accept[closest] + reject[closest]) / 2
+
+
+def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
+    """Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing."""
+    same = np.logaddexp(0, -ratio[genuine]).mean()
+    other = np.logaddexp(0, ratio[~genuine]).mean()
+    return float((same + other) / (2 * np.log(2)))
+
+
+def identified(scores: Floats) -> int:
+    """How many columns of scores (probes, gallery) have their greatest, the first of equals, at home."""
+    best = np.argmax(np.where(np.isnan(scores), -np.inf, scores), axis=0)
+    return int(np.count_nonzero(best == np.arange(len(best))))
+
+
+def verification_rate(fused: Fused) -> float:
+    """The share of right decisions (genuine is above the threshold), averaged over the folds.
+
+    The threshold is 0, as of a log-likelihood ratio, where the fusion states none.
+    """
+    right = (fused.score > (fused.threshold or 0.0)) == fused.genuine
+    if fused.fold is None:
+        return float(right.mean())
+    fold = fused.fold[fused.gallery]
+    rates = np.bincount(fold, weights=right.astype(float)) / np.bincount(fold)
+    return float(rates.mean())
+
+
+def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
+    """Absolute and relative increase of a rate over the mean of the single matchers' (eq. 3)."""
+    mean = float(np.mean(np.asarray(rates, float)))
+    increase = fused_rate - mean
+    return increase, increase / (1 - mean)
+
+
+def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
+    """GAR at the three FARs, and EER, (replicates, 4), of users drawn again with replacement.
+
+    A comparison counts as often as its probe's user was drawn times its gallery's; the user alone for
+    a genuine one. So the dependence of scores of one user is kept (Bolle, Ratha & Pankanti 2004).
+    """
+    users = int(fused.gallery.max()) + 1
+    order = np.argsort(-fused.score, kind="stable")
+    score, probe, gallery = fused.score[order], fused.probe[order], fused.gallery[order]
+    genuine = probe == gallery
+    results = np.empty((replicates, len(FALSE_ACCEPT_RATES) + 1))
+    for replicate in range(replicates):
+        drawn = np.bincount(rng.integers(0, users, users), minlength=users).astype(float)
+        weight = np.where(genuine, drawn[probe], drawn[probe] * drawn[gallery])
+        curve = roc(score, genuine, weight)
+        results[replicate] = *genuine_accept_at(curve, FALSE_ACCEPT_RATES), equal_error_rate(curve)
+    return results
+
+
+Runs = dict[int, list[Stream]]
+
+
+def _add(state: Runs, output: Output) -> Runs:
+    """The fused scores of every run; nothing of other outputs."""
+    if output.rows.stream.schema.full_name == schemas.SCORE_VECTOR.full_name and output.leaf == "fused":
+        for run in range(output.rows.runs):
+            state.setdefault(output.first_run + run, []).append(output.rows.of_run(run))
+    return state
+
+
+def _means(state: Runs) -> dict[str, float]:
+    """Rates of a fusion, means over the runs."""
+    runs = [_rates(fused_of(concatenate(parts))) for parts in state.values()]
+    return {name: float(np.mean([run[name] for run in runs])) for name in runs[0]} if runs else {}
+
+
+def _rates(fused: Fused) -> dict[str, float]:
+    values: dict[str, float] = {}
+    if fused.threshold is not None and not fused.is_complete:
+        values["verification_rate_percent"] = 100 * verification_rate(fused)
+    if fused.is_complete:
+        users = int(fused.gallery.max()) + 1
+        matrix = np.empty((users, users))
+        matrix[fused.probe, fused.gallery] = fused.score
+        values["identified_users"] = identified(matrix)
+        values["identified_percent"] = 100 * values["identified_users"] / users
+        curve = roc(fused.score, fused.genuine)
+        for rate, accepted in zip(
+            FALSE_ACCEPT_RATES, genuine_accept_at(curve, FALSE_ACCEPT_RATES), strict=True
+        ):
+            values[f"gar_at_far_{100 * rate:g}_percent".replace(".", "p")] = 100 * float(accepted)
+        values["eer_percent"] = 100 * equal_error_rate(curve)
+        if fused.is_ratio:
+            values["cllr_bits"] = cost_of_ratio(fused.score, fused.genuine)
+    return values
+
+
+VERIFICATION = Metric(
+    "verification and identification rates of fused scores", Output, dict, _add, operator.or_, _means
+)

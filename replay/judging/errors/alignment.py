@@ -1,0 +1,162 @@
+"""Alignment of estimates with truth: the least-squares transform of their positions.
+
+Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
+Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical alone: Zhang,
+Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry", IROS 2018.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream
+from recorders.models.orientation import compose
+from recorders.models.planar import wrap_angle
+from recorders.trajectories import Trajectory
+from replay.engine.streams.sources import LogSource
+from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.tangent import tangent_components, things
+
+Floats = NDArray[np.float64]
+Align = Literal["none", "yaw", "se2", "se3", "sim3"]
+
+# Components of one vector in the log's frame, which turn together; the first is the position.
+VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]
+HEADING = "heading_rad"
+# Of the two largest extents of a path, squared: rounding alone makes straight lines as wide as this.
+LEAST_WIDTH = 1e-10
+# The cosine of an angle that is none but for rounding: 1e-6 rad.
+LEAST_COSINE = 1 - 1e-12
+
+
+class Alignment(NamedTuple):
+    """The transform p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
+
+    rotation: Floats = np.eye(3)
+    translation_m: Floats = np.zeros(3)
+    scale: float = 1.0
+
+
+def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
+    """The transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
+
+    Args:
+        estimate_m: positions of the estimate.
+        truth_m: where they truly are.
+        align: "none"; "yaw" turns about the vertical and shifts; "se2" does so too, but leaves the
+            height as it is; "se3" turns and shifts; "sim3" scales as well.
+        where: what to call the estimate in a message.
+
+    Raises BadInput where the positions do not tell the rotation: too few, or all in one line.
+    """
+    if align == "none":
+        return Alignment()
+    estimate_mean, truth_mean = estimate_m.mean(axis=0), truth_m.mean(axis=0)
+    of_estimate, of_truth = estimate_m - estimate_mean, truth_m - truth_mean
+    cross = of_truth.T @ of_estimate  # (38), times n
+    if align in ("yaw", "se2"):
+        cosine, sine = cross[0, 0] + cross[1, 1], cross[1, 0] - cross[0, 1]
+        extent = np.linalg.norm(of_estimate[:, :2]) * np.linalg.norm(of_truth[:, :2])
+        is_told = np.hypot(cosine, sine) > LEAST_WIDTH * extent
+        rotation = Rotation.from_rotvec([0.0, 0.0, np.arctan2(sine, cosine)]).as_matrix()
+    else:
+        left, widths, right = np.linalg.svd(cross)
+        is_told = widths[1] > LEAST_WIDTH * widths[0]
+        proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
+        rotation = left * [1.0, 1.0, proper] @ right  # (40), (43)
+    if not is_told:
+        needed = (
+            "two apart in the plane" if align in ("yaw", "se2") else "three that are not in one line"
+        )
+        raise BadInput(
+            f"{where}: {len(estimate_m)} poses do not determine the {align} alignment, which needs "
+            f"{needed}; add poses, or "
+            "give another alignment"
+        )
+    scale = 1.0
+    if align == "sim3":  # (42): trace(D S) is the sum of the truth along the turned estimate
+        scale = float(np.sum(of_truth * (of_estimate @ rotation.T)) / np.sum(of_estimate**2))
+    translation_m = truth_mean - scale * rotation @ estimate_mean  # (41)
+    if align == "se2":
+        translation_m[2] = 0.0
+    return Alignment(rotation, translation_m, scale)
+
+
+def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
+    """The trajectory in the truth's frame."""
+    turned = alignment.scale * trajectory.position_m @ alignment.rotation.T
+    rotation = trajectory.rotation
+    return replace(
+        trajectory,
+        position_m=turned + alignment.translation_m,
+        rotation=None if rotation is None else alignment.rotation @ rotation,
+    )
+
+
+def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
+    """Gaussian estimates in the truth's frame with their covariances: NEES is of the aligned errors.
+
+    Positions and velocities turn, headings and orientations as well; the latter have their covariance in
+    the body's frame, where it stays. All other components are taken to be of the body.
+
+    Raises BadInput where a planar state would be turned out of its plane.
+    """
+    components = stated_components(estimates.metadata, {}, f"topic {estimates.topic}")
+    names, kinds = list(components), list(components.values())
+    tangent = [name for name, _ in tangent_components(names, kinds)]
+    mean = estimates["mean"].copy()
+    jacobian = np.eye(len(tangent))
+    is_flat = False
+    for vector in VECTORS:
+        there = [axis for axis, name in enumerate(vector) if name in components]
+        if not there:
+            continue
+        turn = alignment.scale * alignment.rotation[np.ix_(there, there)]
+        is_flat |= len(there) < 3
+        columns = [names.index(vector[axis]) for axis in there]
+        rows = [tangent.index(vector[axis]) for axis in there]
+        shift = alignment.translation_m[there] if vector == VECTORS[0] else 0.0
+        mean[:, columns] = mean[:, columns] @ turn.T + shift
+        jacobian[np.ix_(rows, rows)] = turn
+    if components.get(HEADING) == "angle":
+        is_flat = True
+        yaw_rad = np.arctan2(alignment.rotation[1, 0], alignment.rotation[0, 0])
+        column = names.index(HEADING)
+        mean[:, column] = wrap_angle(mean[:, column] + yaw_rad)
+    if is_flat and alignment.rotation[2, 2] < LEAST_COSINE:
+        raise BadInput(
+            f"topic {estimates.topic}: is planar, and the alignment would turn it out of its plane; "
+            "give --align se2"
+        )
+    quaternion = Rotation.from_matrix(alignment.rotation).as_quat(scalar_first=True)
+    for kind, columns_of in things(kinds):
+        if kind == "quaternion":
+            mean[:, columns_of] = compose(quaternion, mean[:, columns_of])
+    size = len(tangent)
+    covariance = jacobian @ estimates["covariance"].reshape(-1, size, size) @ jacobian.T
+    changed = {"mean": mean, "covariance": covariance.reshape(len(mean), size * size)}
+    return replace(estimates, columns={**estimates.columns, **changed})
+
+
+@dataclass(frozen=True, repr=False)
+class AlignedEstimates(LogSource):
+    """A log whose estimates of some topics are in the truth's frame."""
+
+    alignments: Mapping[str, Alignment] = field(default_factory=dict)
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Blocks of the log, estimates aligned."""
+        for block in super().blocks(topics, order, block_messages):
+            yield {
+                topic: aligned_estimates(stream, self.alignments[topic])
+                if topic in self.alignments
+                else stream
+                for topic, stream in block.items()
+            }

@@ -1,0 +1,313 @@
+"""Estimates against truth: alignment, errors, and whether the filter's own covariance can be believed.
+
+An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
+truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space
+(see `replay.engine.vectors.tangent`). NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 5.4.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Stream
+from replay.distributions import chi2
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import Source
+from replay.engine.vectors.components import (
+    Components,
+    match_components,
+    match_tangent,
+    stated_components,
+)
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.engine.vectors.tangent import (
+    WIDTHS,
+    are_kinds,
+    difference,
+    tangent_components,
+    things,
+    truth_at,
+)
+from replay.judging.errors.truths import Truths
+
+Floats = NDArray[np.float64]
+POSITION = ("x_m", "y_m", "z_m")
+BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator gets below
+
+
+class Quantity(NamedTuple):
+    """What an error figure shows of an estimate: its RMSE's name, its columns, the scale of its unit."""
+
+    rmse: str
+    columns: list[int]
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Errors:
+    """One estimate stream of an ensemble against its truth, where there is truth.
+
+    Attributes:
+        estimator: the estimator's label, such as `ekf`.
+        case: what it estimates, such as `robot1`; may be empty.
+        components: names of the d components of the tangent space; kinds: "linear", "angle" or
+            "rotation" (about an axis of the body) each.
+        run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
+        elapsed_s: (n,) time since the run's epoch.
+        error: (n, d) estimate - truth.
+        covariance: (n, d, d) the estimator's own.
+        nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
+            definite.
+        without_truth: how many estimates had no truth within the gap limit.
+        unjudged: the estimate's components that the truth lacks, of which nothing is known here.
+        is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
+            are then what the squares of errors are at least.
+    """
+
+    estimator: str
+    case: str
+    components: tuple[str, ...]
+    kinds: tuple[str, ...]
+    run: NDArray[np.int64]
+    step: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    elapsed_s: Floats
+    error: Floats
+    covariance: Floats
+    nees: Floats
+    without_truth: int
+    unjudged: tuple[str, ...] = ()
+    is_bound: bool = False
+
+    @property
+    def squared(self) -> Floats:
+        """(n, d) the squares of the errors, of a bound what they are at least; infinite if too large."""
+        with np.errstate(over="ignore"):
+            return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
+
+    @property
+    def position(self) -> list[int]:
+        """The indices of the position's components."""
+        return [index for index, name in enumerate(self.components) if name in POSITION]
+
+    @property
+    def rotation(self) -> list[int]:
+        """The indices of an orientation's components, which are a rotation vector in rad."""
+        return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
+
+    @property
+    def main(self) -> Quantity:
+        """The position, else the orientation, else the first component."""
+        if self.position:
+            return Quantity("position_rmse_m", self.position)
+        if self.rotation:
+            return Quantity("orientation_rmse_deg", self.rotation, float(np.degrees(1)))
+        return Quantity(f"rmse_{self.components[0]}", [0])
+
+
+# The fields of `Errors` that have an entry per estimate.
+PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
+
+
+def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
+    """Some rows of errors."""
+    return replace(errors, **{name: getattr(errors, name)[rows] for name in PER_ROW})
+
+
+class Innovations(NamedTuple):
+    """One innovation stream of an ensemble; `degrees` is the number of measured components.
+
+    `log_likelihood` is NaN where the estimator states none, and None of a log from before it was stated.
+    """
+
+    estimator: str
+    case: str
+    run: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    accepted: NDArray[np.bool_]
+    squared: Floats
+    degrees: NDArray[np.int64]
+    log_likelihood: Floats | None = None
+
+
+def split_topic(topic: str) -> tuple[str, str]:
+    """Estimator and case of an estimate topic: /estimates/ESTIMATOR/CASE.../LEAF."""
+    parts = topic.removeprefix("/estimates/").split("/")
+    return parts[0], "/".join(parts[1:-1])
+
+
+def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
+    """Where the mean of `runs` chi-square values lies with this probability if all is well.
+
+    A mean NEES of 3 components over 50 runs is credible within
+
+    >>> [round(bound, 3) for bound in chi_square_interval(3, 50)]
+    [2.36, 3.716]
+    """
+    tail = 0.5 * (1 - probability)
+    interval = np.asarray(chi2.ppf([tail, 1 - tail], degrees * runs)) / runs
+    return float(interval[0]), float(interval[1])
+
+
+def rmse_interval(
+    runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
+) -> tuple[Floats, Floats]:
+    """Where an RMSE over so many runs lies with this probability if the covariances P are right.
+
+    A sum of squared errors has mean tr P and variance 2 tr P^2, and nearly the distribution of a scaled
+    chi-square variable with these (Box 1954, theorem 3.1); exactly so where all variances are equal.
+
+    Args:
+        runs: (n,).
+        trace: (n,) the mean of tr P over the runs.
+        squared: (n,) that of tr P^2.
+        probability: of lying there.
+
+    Returns the lower and the upper bounds (n,); NaN where a covariance is zero or not finite.
+    """
+    quantiles = 0.5 - 0.5 * probability, 0.5 + 0.5 * probability
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = runs * trace**2 / squared
+        low, high = (np.sqrt(trace * chi2.ppf(each, degrees) / degrees) for each in quantiles)
+    return low, high
+
+
+def errors_of(
+    estimates: Ragged,
+    truths: Sequence[Truths],
+    gap_limit_s: float = 0.2,
+    *,
+    steps: NDArray[np.int64] | None = None,
+    first_run: int = 0,
+) -> Errors | None:
+    """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
+
+    An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, or the
+    truths have nothing in common with the estimates (see `unjudged`).
+
+    Args:
+        estimates: the stream, or a block of it.
+        truths: of every run.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        steps: (runs,) how many estimates of each run came before.
+        first_run: the number of the first run.
+
+    Raises BadInput where the stream does not say what its components are, or a truth states that one
+    is of another kind.
+    """
+    sources = [each.source for each in truths]
+    stream = estimates.stream
+    components = _components(stream)
+    truth_topic = stream.metadata.get("truth", "")
+    lacking = unjudged(estimates, sources)
+    judged = {name: kind for name, kind in components.items() if name not in lacking}
+    if not judged or not all(truth_topic in source.topics for source in sources):
+        return None
+    names, kinds = list(judged), list(judged.values())
+    truth = np.concatenate(
+        [
+            reference(truth, truth_topic, judged, estimates.of_run(run), gap_limit_s)
+            for run, truth in enumerate(truths)
+        ]
+    )
+    where = f"topic {stream.topic}"
+    columns = match_components(stream.metadata, judged, where)
+    mean = stream["mean"].reshape(len(stream), len(components))[:, columns]
+    error = difference(mean, truth, kinds)
+    tangent = tangent_components(names, kinds)
+    size = len(tangent_components(list(components), list(components.values())))
+    known = np.isfinite(error).all(axis=1)
+    counts = np.diff(estimates.offsets)
+    run = np.repeat(np.arange(len(counts)), counts)
+    before = estimates.offsets[:-1] if steps is None else estimates.offsets[:-1] - steps
+    step = np.arange(len(stream)) - np.repeat(before, counts)
+    epochs = np.array([source.epoch_ns for source in sources])
+    rows = match_tangent(stream.metadata, judged, where)
+    covariance = stream["covariance"].reshape(len(stream), size, size)[known][:, rows][:, :, rows]
+    is_bound = BOUND in stream.metadata
+    nees = normalized_error_squared(error[known], covariance)
+    return Errors(
+        *split_topic(stream.topic),
+        tuple(name for name, _ in tangent),
+        tuple(kind for _, kind in tangent),
+        first_run + run[known],
+        step[known],
+        stream.publish_time_ns[known],
+        (stream.publish_time_ns - epochs[run])[known] * 1e-9,
+        error[known],
+        covariance,
+        np.full(len(nees), np.nan) if is_bound else nees,
+        int((~known).sum()),
+        lacking,
+        is_bound,
+    )
+
+
+def unjudged(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
+    """The components of a Gaussian estimate stream that the truth of some run lacks.
+
+    All of an axis or a quaternion where it lacks one of theirs; none where a run has no truth topic at
+    all. Raises BadInput where the stream does not say what its components are.
+    """
+    components = _components(estimates.stream)
+    names = list(components)
+    topic = estimates.stream.metadata.get("truth", "")
+    if not all(topic in source.topics for source in sources):
+        return ()
+    there = set(names).intersection(
+        *(stated_components(source.topics[topic].metadata, {}, topic) for source in sources)
+    )
+    return tuple(
+        name
+        for _, columns in things(list(components.values()))
+        if not there.issuperset(names[columns])
+        for name in names[columns]
+    )
+
+
+def _components(stream: Stream) -> dict[str, Any]:
+    """Names and kinds of an estimate's components; raises BadInput where it does not state them."""
+    names = stream.components
+    kinds = stream.metadata.get("kinds", "").split(",")
+    if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):
+        raise BadInput(
+            f"topic {stream.topic}: the channel's metadata must name components and, for each, a kind "
+            f"out of {', '.join(WIDTHS)}; an axis has two in a row, a quaternion four"
+        )
+    return dict(zip(names, kinds, strict=True))
+
+
+def reference(
+    truths: Truths, topic: str, components: Components, estimates: Stream, gap_limit_s: float
+) -> Floats:
+    """The truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+
+    Raises BadInput where the truth lacks a component.
+    """
+    times = estimates.publish_time_ns
+    truth = truths.around(topic, times, gap_limit_s, estimates.topic)
+    if len(truth) == 0:
+        return np.full((len(estimates), len(components)), np.nan)
+    columns = match_components(truth.metadata, components, f"{truths.source.name}: topic {topic}")
+    known = replace(truth, columns={"state": truth["state"][:, columns]})
+    return truth_at(known, times, list(components.values()), gap_limit_s)
+
+
+def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
+    """The innovations of an ensemble whose first run has this number."""
+    estimator, case = split_topic(stream.stream.topic)
+    return Innovations(
+        estimator,
+        case,
+        first_run + np.repeat(np.arange(stream.runs), np.diff(stream.offsets)),
+        stream.stream.publish_time_ns,
+        stream["accepted"] != 0,
+        stream["normalised_innovation_squared"],
+        np.isfinite(stream["innovation"]).sum(axis=1),
+        stream.stream.columns.get("log_likelihood"),
+    )

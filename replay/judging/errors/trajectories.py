@@ -1,0 +1,428 @@
+"""Trajectories against truth: absolute and relative pose errors, APE and RPE.
+
+Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems",
+IROS 2012; conventions and names are those of evo (https://github.com/MichaelGrupp/evo): figures agree.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput, choices
+from recorders.log import Stream, make_stream, schemas
+from recorders.trajectories import Trajectory
+from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.tangent import states_at, tangent_components, things
+from replay.judging.errors.alignment import HEADING, Align, Alignment, aligned, alignment_of
+from replay.judging.errors.evaluation import POSITION
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+DeltaUnit = Literal["m", "frames", "s"]
+Association = Literal["nearest", "interpolated"]
+POSE_KINDS = ("linear",) * 3 + ("quaternion",) * 4
+# Grids for the time offset are no longer than this.
+MOST_STEPS = 1 << 20
+# From the correlation's best place to the best offset it is a few steps.
+MOST_MOVES = 50
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How an estimated trajectory is compared with the true one.
+
+    Attributes:
+        align: see `alignment_of`.
+        delta: over how much of the way relative errors are.
+        delta_unit: "m" of the estimate's path, "frames" (poses) or "s".
+        association: each pose of the shorter trajectory belongs to the "nearest" one of the longer in
+            time, as with evo, or the truth is "interpolated" at the stamps of the estimate.
+        max_difference_s: up to which stamps belong together, for the nearest.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        time_offset_s: added to the estimate's stamps; "estimate" finds it.
+
+    Raises BadInput where a number is out of range.
+    """
+
+    align: Align = "none"
+    delta: float = 1.0
+    delta_unit: DeltaUnit = "frames"
+    association: Association = "nearest"
+    max_difference_s: float = 0.01
+    gap_limit_s: float = 0.2
+    time_offset_s: float | Literal["estimate"] = 0.0
+
+    def __post_init__(self) -> None:
+        known = {"align": Align, "delta_unit": DeltaUnit, "association": Association}
+        for name, kind in known.items():
+            value, names = getattr(self, name), get_args(kind)
+            if value not in names:
+                raise BadInput(f"{name} is '{value}'; {choices(str(value), names)}")
+        if not 0 < self.delta < np.inf:
+            raise BadInput(f"delta is {self.delta:g}; give a positive number, such as 10 with unit m")
+        if self.delta_unit == "frames" and self.delta != round(self.delta):
+            raise BadInput(f"delta is {self.delta:g} frames; give a whole number, or the unit m or s")
+        for name in ("max_difference_s", "gap_limit_s"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise BadInput(f"{name} is {getattr(self, name):g}; give seconds, such as 0.01")
+        offset_s = self.time_offset_s
+        if offset_s != "estimate" and not (isinstance(offset_s, int | float) and abs(offset_s) <= 1e9):
+            raise BadInput(f"time_offset_s is {offset_s}; give seconds, or 'estimate'")
+
+
+class Compared(NamedTuple):
+    """An estimated trajectory against the true one, pose by pose.
+
+    Attributes:
+        estimate: the poses that have truth, aligned with it.
+        truth: at these poses.
+        alignment: that was applied.
+        time_offset_s: that was added to the estimate's stamps.
+        without_truth: how many poses of the estimate have no truth.
+        absolute_m, absolute_deg: (n,) APE; degrees are None where one has no rotation.
+        last: (k,) the poses that the pairs of RPE end at.
+        relative_m, relative_deg: (k,) RPE.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    alignment: Alignment
+    time_offset_s: float
+    without_truth: int
+    absolute_m: Floats
+    absolute_deg: Floats | None
+    last: Integers
+    relative_m: Floats
+    relative_deg: Floats | None
+
+
+def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> Compared:
+    """Associate, align, and take the errors.
+
+    Raises BadInput where no poses belong together, they do not tell the alignment, or the way is shorter
+    than the delta.
+    """
+    for each in (estimate, truth):
+        if not len(each):
+            raise BadInput(f"{each.name}: has no poses; give a trajectory with poses")
+    offset_s = comparison.time_offset_s
+    if offset_s == "estimate":
+        offset_s = estimated_offset_s(estimate, truth, comparison.align)
+    if offset_s:
+        _stamps(truth)  # without which the offset would go unnoticed
+        estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
+    matched, true = associate(estimate, truth, comparison)
+    if matched.rotation is None or true.rotation is None:
+        matched, true = replace(matched, rotation=None), replace(true, rotation=None)
+    alignment = alignment_of(matched.position_m, true.position_m, comparison.align, estimate.name)
+    matched = aligned(matched, alignment)
+    first, last = _pairs(matched, true, comparison)
+    return Compared(
+        matched,
+        true,
+        alignment,
+        offset_s,
+        len(estimate) - len(matched),
+        np.linalg.norm(matched.position_m - true.position_m, axis=1),
+        _angle_deg(matched.rotation, true.rotation),
+        last,
+        np.linalg.norm(_way(matched, first, last) - _way(true, first, last), axis=1),
+        _angle_deg(_turn(matched, first, last), _turn(true, first, last)),
+    )
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, comparison: Comparison
+) -> tuple[Trajectory, Trajectory]:
+    """The poses of both that belong together; by their places where one has no stamps."""
+    times, true_times = estimate.time_ns, truth.time_ns
+    if times is None or true_times is None:
+        if len(estimate) != len(truth):
+            raise BadInput(
+                f"{(estimate if times is None else truth).name}: has no stamps, so that poses are "
+                f"paired by their order; but {estimate.name} has {len(estimate)} and {truth.name} "
+                f"{len(truth)}: give both with stamps"
+            )
+        return estimate, truth
+    limit_s = comparison.max_difference_s
+    if comparison.association == "interpolated":
+        limit_s = comparison.gap_limit_s
+        at, known = _interpolated(truth, times, limit_s)
+        found = estimate.take(known), at
+    elif len(estimate) <= len(truth):
+        rows, true_rows = _nearest(times, true_times, round(limit_s * 1e9))
+        found = estimate.take(rows), truth.take(true_rows)
+    else:
+        true_rows, rows = _nearest(true_times, times, round(limit_s * 1e9))
+        found = estimate.take(rows), truth.take(true_rows)
+    if not len(found[0]):
+        first, last = times[[0, -1]] * 1e-9
+        true_first, true_last = true_times[[0, -1]] * 1e-9
+        raise BadInput(
+            f"{estimate.name}: has no stamps within {limit_s:g} s of those of {truth.name}: it is from "
+            f"{first:.3f} to {last:.3f} s, the truth from {true_first:.3f} to {true_last:.3f} s; give "
+            "files of one run, a wider limit, or a time offset"
+        )
+    return found
+
+
+def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
+    """The times with one of the others within a limit, and the nearest of these; of two the first."""
+    right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
+    left = (right - 1).clip(0)
+    nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
+    rows = np.flatnonzero(np.abs(among[nearest] - times) <= most_ns)
+    return rows, nearest[rows]
+
+
+def _interpolated(
+    truth: Trajectory, time_ns: Integers, gap_limit_s: float
+) -> tuple[Trajectory, NDArray[np.bool_]]:
+    """The truth at those stamps that it is known at, and which these are."""
+    poses = truth.position_m
+    if truth.rotation is not None:
+        quaternion = Rotation.from_matrix(truth.rotation).as_quat(scalar_first=True)
+        poses = np.hstack([poses, quaternion])
+    kinds = POSE_KINDS[: poses.shape[1]]
+    poses = states_at(_stamps(truth), poses, time_ns, kinds, gap_limit_s)
+    known = np.asarray(np.isfinite(poses).all(axis=1))
+    rotation = None
+    if truth.rotation is not None:
+        rotation = Rotation.from_quat(poses[known, 3:], scalar_first=True).as_matrix()
+    return Trajectory(truth.name, poses[known, :3], rotation, time_ns[known]), known
+
+
+def _stamps(trajectory: Trajectory) -> Integers:
+    """The stamps of a trajectory that needs some."""
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: has no stamps; give a trajectory with stamps, such as TUM")
+    return trajectory.time_ns
+
+
+def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
+    """First and last poses of consecutive parts of the way, each just over the delta."""
+    unit, delta = comparison.delta_unit, comparison.delta
+    steps: NDArray = np.ones(len(estimate) - 1)
+    if unit == "m":
+        steps = np.linalg.norm(np.diff(estimate.position_m, axis=0), axis=1)
+    elif unit == "s":
+        steps = np.diff(_stamps(truth if estimate.time_ns is None else estimate))
+        delta = round(delta * 1e9)
+    ends, gone = [0], 0.0
+    for row, step in enumerate(steps.tolist(), 1):
+        gone += step
+        if gone >= delta:
+            ends.append(row)
+            gone = 0.0
+    if len(ends) < 2:
+        length = steps.sum() * (1e-9 if unit == "s" else 1.0)
+        raise BadInput(
+            f"{estimate.name}: the part with truth is {length:.6g} {unit} long; give a smaller delta "
+            f"than {comparison.delta:g}"
+        )
+    return np.array(ends[:-1]), np.array(ends[1:])
+
+
+def _way(trajectory: Trajectory, first: Integers, last: Integers) -> Floats:
+    """The ways (k, 3) of pairs, each seen from its first pose where that is known."""
+    way = trajectory.position_m[last] - trajectory.position_m[first]
+    rotation = trajectory.rotation
+    return way if rotation is None else np.einsum("kji,kj->ki", rotation[first], way)
+
+
+def _turn(trajectory: Trajectory, first: Integers, last: Integers) -> Floats | None:
+    """The rotations (k, 3, 3) of pairs, each seen from its first pose."""
+    rotation = trajectory.rotation
+    return None if rotation is None else rotation[first].transpose(0, 2, 1) @ rotation[last]
+
+
+def _angle_deg(left: Floats | None, right: Floats | None) -> Floats | None:
+    """Angles (n,) of the rotations from one matrix (n, 3, 3) to the other."""
+    if left is None or right is None:
+        return None
+    return np.degrees(Rotation.from_matrix(left.transpose(0, 2, 1) @ right).magnitude())
+
+
+def statistics(error: Floats) -> dict[str, float]:
+    """What evo tells of errors (n,), which are not negative."""
+    return {
+        "rmse": float(np.sqrt(np.mean(error**2))),
+        "mean": float(np.mean(error)),
+        "median": float(np.median(error)),
+        "std": float(np.std(error)),
+        "min": float(np.min(error)),
+        "max": float(np.max(error)),
+    }
+
+
+def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
+    """APE and RPE over all poses of runs, as `ape_translation_rmse_m`; how many poses and pairs."""
+    errors: dict[tuple[str, str], list] = {
+        ("ape_translation", "m"): [run.absolute_m for run in runs],
+        ("ape_rotation", "deg"): [run.absolute_deg for run in runs],
+        ("rpe_translation", "m"): [run.relative_m for run in runs],
+        ("rpe_rotation", "deg"): [run.relative_deg for run in runs],
+    }
+    values: dict[str, float] = {}
+    for (what, unit), parts in errors.items():
+        known = [part for part in parts if part is not None]
+        if len(known) == len(parts):
+            found = statistics(np.concatenate(known))
+            values |= {f"{what}_{name}_{unit}": value for name, value in found.items()}
+    return values | {
+        "poses": sum(len(run.absolute_m) for run in runs),
+        "poses_without_truth": sum(run.without_truth for run in runs),
+        "rpe_pairs": sum(len(run.relative_m) for run in runs),
+    }
+
+
+def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
+    """What to add to the estimate's stamps, in s, so that it is nearest to the truth.
+
+    From where the speeds of both correlate most, which no alignment changes, the search goes down to the
+    offset with the least RMSE of aligned positions.
+
+    Raises BadInput where one has no stamps, or its speed never changes.
+    """
+    from scipy.optimize import minimize_scalar  # which takes long to import
+
+    trajectories = [estimate, truth]
+    times: list[Floats] = [_stamps(each).astype(float) * 1e-9 for each in trajectories]
+    step_s = max(float(np.median(np.diff(each))) if len(each) > 2 else 0.0 for each in times)
+    spans = [each[-1] - each[0] for each in times]
+    step_s = max(step_s, *(span / MOST_STEPS for span in spans))
+    speeds = []
+    for trajectory, time_s, span_s in zip(trajectories, times, spans, strict=True):
+        grid = np.arange(span_s // step_s + 1 if step_s else 1, dtype=float)
+        position_m = _positions_at(trajectory, time_s, time_s[0] + step_s * grid)
+        speed = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+        if len(speed) < 2 or np.ptp(speed) <= 1e-6 * speed.max():
+            raise BadInput(
+                f"{trajectory.name}: its speed never changes, so that no time offset can be found; "
+                "give the offset in s"
+            )
+        speeds.append(speed - speed.mean())
+    offset_s = float(times[1][0] - times[0][0] + _best_lag(*speeds) * step_s)
+
+    def covered(offset_s: float) -> NDArray[np.bool_]:
+        return (times[1][0] <= times[0] + offset_s) & (times[0] + offset_s <= times[1][-1])
+
+    least = covered(offset_s).sum() / 2  # of few poses the RMSE is small anywhere
+
+    def rmse_m(offset_s: float) -> float:
+        inside = covered(offset_s)
+        if inside.sum() < least:
+            return np.inf
+        there = estimate.position_m[inside]
+        true = _positions_at(truth, times[1], times[0][inside] + offset_s)
+        found = alignment_of(there, true, align, estimate.name)
+        error = found.scale * there @ found.rotation.T + found.translation_m - true
+        return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+    for _ in range(MOST_MOVES):
+        around = offset_s - 2 * step_s, offset_s + 2 * step_s
+        before_s = offset_s
+        offset_s = float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
+        if abs(offset_s - before_s) < step_s:
+            break
+    return offset_s
+
+
+def _best_lag(estimate: Floats, truth: Floats) -> int:
+    """How many places later the first signal correlates most with the other.
+
+    Pearson's correlation of what overlaps, which is half of the shorter one at least.
+    """
+    from scipy.signal import correlate, correlation_lags  # which takes long to import
+
+    everywhere = np.ones_like(estimate), np.ones_like(truth)
+    count = np.rint(correlate(everywhere[1], everywhere[0]))
+    sums = correlate(everywhere[1], estimate), correlate(truth, everywhere[0])
+    squares = correlate(everywhere[1], estimate**2), correlate(truth**2, everywhere[0])
+    variances = [count * square - each**2 for each, square in zip(sums, squares, strict=True)]
+    least = [1e-9 * variance.max() for variance in variances]
+    product = np.maximum(variances[0], least[0]) * np.maximum(variances[1], least[1])
+    correlation = (count * correlate(truth, estimate) - sums[0] * sums[1]) / np.sqrt(product)
+    correlation[2 * count < min(len(estimate), len(truth))] = -np.inf
+    return int(correlation_lags(len(truth), len(estimate))[np.argmax(correlation)])
+
+
+def _positions_at(trajectory: Trajectory, time_s: Floats, at_s: Floats) -> Floats:
+    return np.stack([np.interp(at_s, time_s, axis) for axis in trajectory.position_m.T], axis=1)
+
+
+def trajectory_of(stream: Stream) -> Trajectory | None:
+    """The poses that a truth or an estimate stream states; None where it states no position.
+
+    What the position lacks is zero, as the height of a robot in the plane; a heading is a rotation about
+    the vertical. Poses that are not finite are left out.
+    """
+    components = stated_components(stream.metadata, {}, f"topic {stream.topic}")
+    names, kinds = list(components), list(components.values())
+    if POSITION[0] not in names or len(set(names).intersection(POSITION)) < 2:
+        return None
+    column = "mean" if "mean" in stream.columns else "state"
+    state = stream[column].reshape(len(stream), len(names))
+    state, stamps = state[known := np.isfinite(state).all(axis=1)], stream.publish_time_ns[known]
+    position_m = np.zeros((len(state), 3))
+    for axis, name in enumerate(POSITION):
+        if name in names:
+            position_m[:, axis] = state[:, names.index(name)]
+    rotation = None
+    turns = [columns for kind, columns in things(kinds) if kind == "quaternion"]
+    if len(turns) == 1:
+        rotation = Rotation.from_quat(state[:, turns[0]], scalar_first=True).as_matrix()
+    elif components.get(HEADING) == "angle":
+        rotation = Rotation.from_euler("z", state[:, [names.index(HEADING)]]).as_matrix()
+    return Trajectory(stream.topic, position_m, rotation, stamps)
+
+
+def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
+    """A trajectory as an estimate stream, in those of the truth's components that it states.
+
+    It states no covariance: that is zero, of which there is no NEES.
+
+    Raises BadInput where the trajectory has no stamps, or the truth none of its components.
+    """
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    stated = stated_components(truth.metadata, {}, f"topic {truth.topic}")
+    columns = {
+        name: trajectory.position_m[:, axis] for axis, name in enumerate(POSITION) if name in stated
+    }
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation)
+        quaternion = [name for name, kind in stated.items() if kind == "quaternion"]
+        if len(quaternion) == 4:
+            columns |= zip(quaternion, turned.as_quat(scalar_first=True).T, strict=True)
+        elif stated.get(HEADING) == "angle":
+            columns[HEADING] = turned.as_euler("ZYX")[:, 0]
+    if not columns:
+        raise BadInput(f"{trajectory.name}: topic {truth.topic} states no position to judge it by")
+    kinds = [stated[name] for name in columns]
+    width = len(tangent_components(list(columns), kinds))
+    count = len(trajectory)
+    return make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        trajectory.time_ns,
+        metadata={"components": ",".join(columns), "kinds": ",".join(kinds), "truth": truth.topic},
+        mean=np.stack(list(columns.values()), axis=1),
+        covariance=np.zeros((count, width * width)),
+    )
+
+
+def truth_of(trajectory: Trajectory, topic: str) -> Stream:
+    """A trajectory as a truth stream; raises BadInput where it has no stamps."""
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    names, state = [*POSITION], trajectory.position_m
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation).as_quat(scalar_first=True)
+        names, state = [*names, "qw", "qx", "qy", "qz"], np.hstack([state, turned])
+    metadata = {"components": ",".join(names), "kinds": ",".join(POSE_KINDS[: len(names)])}
+    return make_stream(topic, schemas.TRUTH_STATE, trajectory.time_ns, metadata=metadata, state=state)

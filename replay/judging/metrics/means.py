@@ -1,0 +1,162 @@
+"""What estimators tell of themselves, as means over the runs for spans of time.
+
+Such are the probabilities of modes, the effective share of particles, and messages that came late.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from replay.engine.arrays import Floats
+from replay.engine.replaying.late import OLDER
+from replay.engine.streams.failures import sentences_of
+from replay.judging.metrics.measuring import Output
+from replay.judging.metrics.sums import BinnedSums
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Spans of time: at most so many, of a millisecond times a power of two.
+SPANS = 1024
+SPAN_NS = 1_000_000
+MODES, SMOOTHED_MODES, EFFECTIVE = "modes", "smoothed_modes", "effective_share"
+# What became of messages that came late.
+DROPPED, INSERTED, WAITED = "dropped", "inserted", "waited for"
+LATE = (DROPPED, INSERTED, WAITED)
+
+
+class Told(NamedTuple):
+    """What one output tells.
+
+    Attributes:
+        what: one of the names above.
+        names: of the values.
+        values: (n, names), NaN in rows that tell nothing.
+    """
+
+    what: str
+    names: tuple[str, ...]
+    values: Floats
+
+
+def told_by(output: Output) -> Told | None:
+    """What an output tells that has a mean over time; None where it is of another kind."""
+    stream = output.rows.stream
+    schema = stream.schema.full_name
+    if schema == schemas.MODE_PROBABILITIES.full_name:
+        what = SMOOTHED_MODES if output.leaf == SMOOTHED_MODES else MODES
+        return Told(what, tuple(stream.components), stream["probability"])
+    if schema == schemas.EFFECTIVE_PARTICLES.full_name:
+        return Told(EFFECTIVE, (EFFECTIVE,), (stream["effective"] / stream["particles"])[:, None])
+    if schema == schemas.SKIPPED.full_name:
+        is_older = np.array([OLDER in reason for reason in sentences_of(stream)], bool)
+        late_s = np.where(is_older, _late_s(stream), np.nan)
+        return Told(DROPPED, ("late_s",), late_s[:, None])
+    if schema == schemas.REWOUND.full_name:
+        values = np.column_stack([_late_s(stream), stream["repeated"]])
+        return Told(INSERTED, ("late_s", "repeated"), values)
+    if schema == schemas.WAITED.full_name:
+        return Told(WAITED, ("late_s",), _late_s(stream)[:, None])
+    return None
+
+
+def _late_s(stream: Stream) -> Floats:
+    """How long after they were measured messages (n,) were taken."""
+    return (stream.log_time_ns - stream.publish_time_ns).astype(np.float64) * 1e-9
+
+
+@dataclass
+class Means:
+    """Sums over the runs of what one stream tells.
+
+    Attributes:
+        estimator, case: whose it is.
+        what, names: see `Told`.
+        sums: by time since the epoch, of that time in seconds and of every value.
+    """
+
+    estimator: str
+    case: str
+    what: str
+    names: tuple[str, ...]
+    sums: BinnedSums = field(repr=False)
+
+    def add(self, output: Output, values: Floats) -> None:
+        """Take in a block."""
+        rows = output.rows
+        epochs_ns = np.array([source.epoch_ns for source in output.sources], np.int64)
+        elapsed_ns = rows.stream.publish_time_ns - np.repeat(epochs_ns, np.diff(rows.offsets))
+        tells = np.isfinite(values[:, 0])
+        columns = np.column_stack([elapsed_ns * 1e-9, values])
+        self.sums.add(elapsed_ns[tells], columns[tells])
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """One row per span of time: its mean time, how many messages, and the mean of every value."""
+        import pandas as pd  # which takes long to import
+
+        _, count, sums = self.sums.filled()
+        means = pd.DataFrame(sums / count[:, None], columns=["elapsed_s", *self.names])
+        means.insert(0, "estimator", self.estimator)
+        means.insert(1, "case", self.case)
+        means.insert(3, "messages", count.astype(np.int64))
+        return means
+
+
+class MeansOfAll:
+    """The means of all streams of a replay."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, Means] = {}
+
+    def add(self, output: Output) -> None:
+        """Take in a block of a stream, if it tells anything of the kind."""
+        told = told_by(output)
+        if told is None or not len(told.values):
+            return
+        topic, (what, names, values) = output.rows.stream.topic, told
+        if topic not in self._of:
+            sums = BinnedSums(1 + len(names), width=SPAN_NS, limit=SPANS)
+            self._of[topic] = Means(output.estimator, output.case, what, names, sums)
+        self._of[topic].add(output, values)
+
+    def merge(self, other: "MeansOfAll") -> None:
+        """Take in the sums of other runs."""
+        for topic, means in other._of.items():
+            if topic in self._of:
+                self._of[topic].sums.merge(means.sums)
+            else:
+                self._of[topic] = means
+
+    def _tables(self, *wanted: str) -> "Iterator[tuple[str, pd.DataFrame]]":
+        """What is told and its table, of every stream that tells one of what is wanted."""
+        for means in self._of.values():
+            if means.what in wanted and len(table := means.table):
+                yield means.what, table
+
+    def modes(self) -> "Iterator[pd.DataFrame]":
+        """How probable modes are: a row per span of time and mode."""
+        for what, table in self._tables(MODES, SMOOTHED_MODES):
+            fixed = ["index", "estimator", "case", "elapsed_s", "estimates"]
+            wide = table.rename(columns={"messages": "estimates"}).reset_index()
+            long = wide.melt(fixed, var_name="mode", value_name="probability")
+            long = long.sort_values("index", kind="stable").drop(columns="index")
+            long.insert(2, "smoothed", what == SMOOTHED_MODES)
+            yield long
+
+    def effective(self) -> "Iterator[pd.DataFrame]":
+        """What share of the particles is effective: a row per span of time."""
+        for _, table in self._tables(EFFECTIVE):
+            yield table.rename(columns={"messages": "estimates"})
+
+    def late(self) -> "Iterator[pd.DataFrame]":
+        """Messages that came late: a row per span of time and what became of them.
+
+        `late_s` is their mean delay, `repeated` how many others were used again for one on average.
+        """
+        for what, table in self._tables(*LATE):
+            table.insert(2, "became", what)
+            yield table

@@ -1,0 +1,284 @@
+"""The metrics of any estimator: errors, consistency, innovations, failures, coverage, solutions.
+
+NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recorders.log import schemas
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.judging.errors.evaluation import POSITION, Errors, Floats, Innovations, chi_square_interval
+from replay.judging.metrics.measuring import Metric, Output, Sums, metric_of_sums
+from replay.judging.metrics.sums import BinnedSums
+
+
+def squares(errors: Errors) -> Sums:
+    """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
+    found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
+    found |= squares_by_name(errors.squared, errors.components, errors.kinds)
+    return found | {rmse_of(name): np.nan for name in errors.unjudged}
+
+
+def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
+    """Sums of squares (n, d) by the name of their RMSE, see `squares`."""
+    found: Sums = {}
+    totals = np.sum(squared, axis=0)
+    position = [index for index, name in enumerate(components) if name in POSITION]
+    rotation = [index for index, kind in enumerate(kinds) if kind == "rotation"]
+    if position:
+        found["position_rmse_m"] = float(totals[position].sum())
+    if rotation:
+        found["orientation_rmse_deg"] = np.degrees(np.degrees(totals[rotation].sum()))
+    for column, name in enumerate(components):
+        if column not in position:
+            found[rmse_of(name)] = float(totals[column])
+    return found
+
+
+def accuracy(sums: Sums) -> dict[str, float]:
+    """RMSE of position, orientation and every other component over all runs and steps.
+
+    NaN, which is written as null, for a component that the truth lacks.
+    """
+    if not sums:
+        return {}
+    count = sums["estimates"]
+    values = {
+        name: float(np.sqrt(value / count)) if count else np.nan
+        for name, value in sums.items()
+        if name not in ("estimates", "estimates_without_truth") and (count or np.isnan(value))
+    }
+    return values | {"estimates_without_truth": sums["estimates_without_truth"]}
+
+
+def rmse_of(component: str) -> str:
+    """What the RMSE of a component is called: `turn_rmse_radps` of `turn_radps`."""
+    quantity, _, unit = component.rpartition("_")
+    return f"{quantity}_rmse_{unit}".strip("_")
+
+
+@dataclass
+class Consistent:
+    """Sums of NEES: over all, and by step over the runs.
+
+    Attributes:
+        count, total: of finite NEES of the state.
+        places, of_places: of the position alone.
+        missing: estimates without a NEES, their covariance being singular.
+        by_step: NEES in one column.
+        components: how many the state has.
+    """
+
+    count: int
+    total: float
+    places: int
+    of_places: float
+    missing: int
+    by_step: BinnedSums
+    components: int
+
+
+def _no_nees() -> Consistent:
+    return Consistent(0, 0.0, 0, 0.0, 0, BinnedSums(1), 0)
+
+
+def _add_nees(state: Consistent, errors: Errors) -> Consistent:
+    if errors.is_bound:
+        return state
+    finite = np.isfinite(errors.nees)
+    state.count += int(finite.sum())
+    state.total += float(errors.nees[finite].sum())
+    state.missing += int((~finite).sum())
+    state.components = len(errors.components)
+    if errors.position and len(errors.position) < len(errors.components):
+        block = errors.covariance[:, errors.position][:, :, errors.position]
+        squared = normalized_error_squared(errors.error[:, errors.position], block)
+        known = squared[np.isfinite(squared)]
+        state.places += len(known)
+        state.of_places += float(known.sum())
+    state.by_step.add(errors.step, errors.nees[:, None])
+    return state
+
+
+def _merge_nees(first: Consistent, second: Consistent) -> Consistent:
+    first.count += second.count
+    first.total += second.total
+    first.places += second.places
+    first.of_places += second.of_places
+    first.missing += second.missing
+    first.components = max(first.components, second.components)
+    first.by_step.merge(second.by_step)
+    return first
+
+
+def consistency(state: Consistent) -> dict[str, float]:
+    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
+    if state.count == 0:
+        return {}
+    values = {"nees": state.total / state.count}
+    if state.missing:  # of singular covariances there is none
+        values["estimates_without_nees"] = float(state.missing)
+    if state.places:
+        values["position_nees"] = state.of_places / state.places
+    _, runs, sums = state.by_step.filled()
+    low, high = step_bounds(runs, state.components)
+    nees = sums[:, 0] / runs
+    values["nees_steps_within_95"] = float(((nees >= low) & (nees <= high)).mean())
+    return values
+
+
+def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Floats, Floats]:
+    """Where the mean NEES of `size` components lies over so many runs (n,): low and high (n,)."""
+    counts, place = np.unique(runs, return_inverse=True)
+    bounds = np.array([chi_square_interval(size, int(count), probability) for count in counts])
+    return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
+
+
+def _nis(innovations: Innovations) -> Sums:
+    return {
+        "messages": len(innovations.squared),
+        "squared": float(innovations.squared.sum()),
+        "degrees": int(innovations.degrees.sum()),
+        "accepted": int(innovations.accepted.sum()),
+    }
+
+
+def innovation(sums: Sums) -> dict[str, float]:
+    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
+    if not sums.get("messages"):
+        return {}
+    gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
+    if not sums["degrees"]:  # all said nothing of their states
+        return gated
+    return {"nis_per_component": sums["squared"] / sums["degrees"], **gated}
+
+
+def _log_likelihoods(innovations: Innovations) -> Sums:
+    """NaN where one of what was let in is not stated."""
+    stated = innovations.log_likelihood
+    let_in = np.array([np.nan]) if stated is None else stated[innovations.accepted]
+    return {"log_likelihood": float(let_in.sum()), "runs": set(np.unique(innovations.run).tolist())}
+
+
+def likelihood(sums: Sums) -> dict[str, float]:
+    """The log-likelihood of a run's measurements as the filter predicted them: the mean over the runs.
+
+    Of the measurements that a gate let in alone, so that it is no measure to tune a gate by. Nothing
+    where the estimator does not state it of all of them.
+    """
+    if not sums.get("runs") or not np.isfinite(sums["log_likelihood"]):
+        return {}
+    return {"log_likelihood": sums["log_likelihood"] / len(sums["runs"])}
+
+
+def _failed(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name != schemas.FAILURE.full_name:
+        return {}
+    return {"runs": set((output.first_run + np.flatnonzero(np.diff(output.rows.offsets))).tolist())}
+
+
+def failures(sums: Sums) -> dict[str, float]:
+    """How many runs failed."""
+    return {"failed_runs": float(len(sums["runs"]))} if sums else {}
+
+
+def covered(output: Output) -> Sums:
+    """Of the runs' spans, how many seconds there are and were estimated; measurements not used."""
+    schema = output.rows.stream.schema.full_name
+    if schema == schemas.SKIPPED.full_name:
+        return {"skipped": len(output.rows)}
+    if schema != schemas.COVERAGE.full_name:
+        return {}
+    spans_ns = output.rows["end_time_ns"] - output.rows.stream.publish_time_ns
+    return {
+        "span_s": float(spans_ns.sum() * 1e-9),
+        "estimated_s": float(output.rows["estimated_s"].sum()),
+    }
+
+
+def coverage(sums: Sums) -> dict[str, float]:
+    """What share of the span the other figures are of, and how many measurements were not used."""
+    if "skipped" in sums:
+        return {"skipped_measurements": float(sums["skipped"])}
+    share = estimated_share(sums)
+    return {} if share is None else {"estimated_share": share}
+
+
+def estimated_share(sums: Sums) -> float | None:
+    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
+
+
+def _solved(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name == schemas.ITERATION.full_name:
+        starts = output.rows["iteration"] == 0
+        return {"starts": int(starts.sum()), "start_cost": float(output.rows["cost"][starts].sum())}
+    if output.rows.stream.schema.full_name != schemas.SOLUTION.full_name:
+        return {}
+    converged = output.rows["converged"] != 0
+    states_start = "start" in output.rows.stream.metadata
+    return {
+        "solutions": len(converged),
+        "converged": int(converged.sum()),
+        "iterations": set(output.rows["iterations"][converged].tolist()),
+        **({"cost": float(output.rows["cost"].sum())} if states_start else {}),
+    }
+
+
+def solution(sums: Sums) -> dict[str, float]:
+    """How the batch solutions ended: the share that converged, and the most iterations of one.
+
+    Where a start is stated, also the mean cost at the end; of single iterations that at the start.
+    """
+    if sums.get("starts"):
+        return {"start_cost": sums["start_cost"] / sums["starts"]}
+    if not sums.get("solutions"):
+        return {}
+    values = {"converged_share": sums["converged"] / sums["solutions"]}
+    if sums["iterations"]:
+        values["most_iterations"] = float(max(sums["iterations"]))
+    if "cost" in sums:
+        values["cost"] = sums["cost"] / sums["solutions"]
+    return values
+
+
+def _effective(output: Output) -> Sums:
+    if output.rows.stream.schema.full_name != schemas.EFFECTIVE_PARTICLES.full_name:
+        return {}
+    shares = output.rows["effective"] / output.rows["particles"]
+    return {"estimates": len(shares), "shares": float(shares.sum())}
+
+
+def effective(sums: Sums) -> dict[str, float]:
+    """What share of a filter's particles counts, 1 / (N sum w^2): the mean over all estimates."""
+    return {"effective_share": sums["shares"] / sums["estimates"]} if sums.get("estimates") else {}
+
+
+ACCURACY = metric_of_sums(
+    "RMSE of position and other components against truth", Errors, squares, accuracy
+)
+CONSISTENCY = Metric(
+    "NEES against its chi-square bounds", Errors, _no_nees, _add_nees, _merge_nees, consistency
+)
+INNOVATION = metric_of_sums(
+    "NIS, and the share of measurements that a gate kept out", Innovations, _nis, innovation
+)
+LIKELIHOOD = metric_of_sums(
+    "log-likelihood of the measurements, per run", Innovations, _log_likelihoods, likelihood
+)
+FAILURES = metric_of_sums(
+    "how many runs an estimator could not follow to the end", Output, _failed, failures
+)
+COVERAGE = metric_of_sums(
+    "what share of the span was estimated, and what was not used", Output, covered, coverage
+)
+SOLUTION = metric_of_sums("how many batch solutions converged, and how fast", Output, _solved, solution)
+PARTICLES = metric_of_sums(
+    "what share of the particles is effective, their weights being unequal",
+    Output,
+    _effective,
+    effective,
+)

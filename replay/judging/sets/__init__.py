@@ -1,0 +1,1 @@
+"""Sets of points and regions against the truth; begin with `distances`."""

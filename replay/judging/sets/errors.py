@@ -1,0 +1,149 @@
+"""Estimated sets against the true ones, step by step: OSPA and GOSPA with its parts.
+
+A set estimate is a pair of streams: its size, and its elements (see `schemas.ESTIMATE_SIZE`). The true
+set at a time are all targets whose truth has the estimate's components and is known then.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from replay.engine.streams.blocks import Ragged
+from replay.engine.vectors.components import Components
+from replay.judging.errors.evaluation import POSITION, reference, split_topic
+from replay.judging.errors.truths import Truths
+from replay.judging.metrics.measuring import Sums, metric_of_sums
+from replay.judging.sets.distances import gospa, ospa
+
+Floats = NDArray[np.float64]
+CUTOFF_M = 10.0
+ORDER = 2.0
+
+
+class SetErrors(NamedTuple):
+    """A set estimate of an ensemble, judged: one row (n,) per run and step.
+
+    Distances are in m; localisation, missed and false are GOSPA's parts in m^2. `estimated` and `true`
+    are the numbers of targets.
+    """
+
+    estimator: str
+    case: str
+    run: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    elapsed_s: Floats
+    ospa: Floats
+    gospa: Floats
+    localisation: Floats
+    missed: Floats
+    false: Floats
+    estimated: NDArray[np.int64]
+    true: NDArray[np.int64]
+
+
+def set_errors(
+    outputs: Mapping[str, Ragged],
+    truths: Sequence[Truths],
+    *,
+    cutoff_m: float = CUTOFF_M,
+    gap_limit_s: float = 0.2,
+    first_run: int = 0,
+) -> dict[str, SetErrors]:
+    """Judge every set estimate, by its topic, among a replay's outputs, or a block of them.
+
+    Left out are those whose targets have no truths in some run; `first_run` is the number of the first.
+    """
+    found = {}
+    for topic, sizes in outputs.items():
+        elements = outputs.get(f"{topic.rpartition('/')[0]}/element")
+        if sizes.stream.schema.full_name != schemas.ESTIMATE_SIZE.full_name or elements is None:
+            continue
+        components = sizes.stream.components
+        targets = [_targets(each, components) for each in truths]
+        if components and all(targets):
+            judge = partial(_judge_run, cutoff_m=cutoff_m, gap_limit_s=gap_limit_s)
+            runs = [
+                judge(sizes.of_run(run), elements.of_run(run), targets[run], truths[run])
+                for run in range(len(truths))
+            ]
+            number = np.repeat(np.arange(len(runs)), [len(each) for each in runs])
+            time_ns = sizes.stream.publish_time_ns
+            epochs = np.array([each.source.epoch_ns for each in truths])
+            elapsed_s = (time_ns - epochs[number]) * 1e-9
+            rows = np.concatenate(runs)
+            judged = (*rows[:, :6].T, *rows[:, 6:].T.astype(np.int64))
+            run_number = first_run + number
+            found[topic] = SetErrors(*split_topic(topic), run_number, time_ns, elapsed_s, *judged)
+    return found
+
+
+def _targets(truths: Truths, components: Sequence[str]) -> list[str]:
+    """The topics of targets whose truths have exactly these components."""
+    stated = truths.source.topics
+    return [
+        topic
+        for topic in truths.topics
+        if sorted(stated[topic].metadata.get("components", "").split(",")) == sorted(components)
+    ]
+
+
+def _judge_run(
+    sizes: Stream,
+    elements: Stream,
+    targets: Sequence[str],
+    truths: Truths,
+    *,
+    cutoff_m: float,
+    gap_limit_s: float,
+) -> Floats:
+    """Rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
+    place = [name for name in POSITION if name in sizes.components]
+    state: Components = dict.fromkeys(place, "linear")
+    states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in targets]
+    true = np.stack(states, axis=1)
+    columns = [sizes.components.index(name) for name in place]
+    ends = np.cumsum(sizes["elements"].astype(np.int64))
+    rows = np.empty((len(sizes), 7))
+    for step, end in enumerate(ends):
+        estimated = elements["mean"][end - sizes["elements"][step] : end][:, columns]
+        there = true[step][np.isfinite(true[step]).all(axis=1)]
+        parts = gospa(estimated, there, cutoff_m, ORDER)
+        counts = len(estimated), len(there)
+        rows[step] = ospa(estimated, there, cutoff_m, ORDER), *parts, *counts
+    return rows
+
+
+def _sums(found: SetErrors) -> Sums:
+    return {
+        "steps": len(found.run),
+        "ospa": float(found.ospa.sum()),
+        "gospa": float(found.gospa.sum()),
+        "localisation": float(found.localisation.sum()),
+        "missed": float(found.missed.sum()),
+        "false": float(found.false.sum()),
+        "excess": int((found.estimated - found.true).sum()),
+    }
+
+
+def _means(sums: Sums) -> dict[str, float]:
+    steps = sums.get("steps")
+    if not steps:
+        return {}
+    per_target = CUTOFF_M**ORDER / 2.0
+    return {
+        "ospa_m": sums["ospa"] / steps,
+        "gospa_m": sums["gospa"] / steps,
+        "gospa_localisation_m": float(np.sqrt(sums["localisation"] / steps)),
+        "missed_targets": sums["missed"] / steps / per_target,
+        "false_targets": sums["false"] / steps / per_target,
+        "cardinality_error_targets": sums["excess"] / steps,
+    }
+
+
+SETS = metric_of_sums(
+    "OSPA and GOSPA with its parts of estimated sets, cutoff 10 m", SetErrors, _sums, _means
+)

@@ -1,0 +1,1 @@
+"""Tracks against the targets that they should follow; begin with `tracks`."""

@@ -1,0 +1,193 @@
+"""Tracks against the trajectories of targets, judged at instants that no sensor sets.
+
+At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
+alpha 2). The pairs say how far a track is from its target, for how much of the time a target is
+followed, and how often by another track than before (switch) or after a gap (break).
+
+Where the reference knows some of the targets alone, a track of another one is no false track. Those that
+are farther than a limit from all targets with a reference are counted on their own, as unreferenced.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.streams.measurements import PLANE, read_vectors
+from replay.engine.streams.sources import Source
+from replay.judging.sets.distances import gospa, gospa_pairs
+
+CUTOFF_M = 20.0
+UNREFERENCED_M = 50.0
+# The first instant, when tracks have had time to begin, and how far apart the others are.
+SETTLE_S = 10.0
+PERIOD_S = 0.5
+NONE = -1
+
+
+class TracksAt(NamedTuple):
+    """The tracks at one instant: their numbers (n,), and where they are (n, 2)."""
+
+    number: Integers
+    place: Floats
+
+
+class TrackErrors(NamedTuple):
+    """Tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
+
+    Attributes:
+        gospa_all: (k,), of all tracks.
+        gospa, localisation, missed, false: (k,), without those that have no reference.
+        unreferenced: (k,), how many these are.
+        track: (targets, k), the track that each target is paired with, or NONE.
+        distance: (targets, k), NaN where it is not.
+        present: (targets, k), whether the target is there.
+    """
+
+    gospa_all: Floats
+    gospa: Floats
+    localisation: Floats
+    missed: Floats
+    false: Floats
+    unreferenced: Integers
+    track: Integers
+    distance: Floats
+    present: Booleans
+
+
+class Judged(NamedTuple):
+    """The instants (k,) at which the tracks of a run are judged, and the truths (targets, k, 2) then."""
+
+    time_ns: Integers
+    truths: Floats
+
+
+def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PERIOD_S) -> Judged:
+    """Instants from a while after the epoch to the end of the scans or of the first truth that ends.
+
+    Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
+    they are over before the first instant.
+    """
+    of: dict[str, list[str]] = {schemas.SCAN.full_name: [], schemas.TRUTH_STATE.full_name: []}
+    for topic in source.topics.values():
+        if topic.schema_name in of:
+            of[topic.schema_name].append(topic.name)
+    scans, truths = (source.read(topics) for topics in of.values())
+    if not scans or not truths:
+        raise BadInput(
+            f"{source.name}: has no scans or no truths, and tracks are judged by both; give a log with "
+            "them"
+        )
+    last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
+    last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
+    first_ns = source.epoch_ns + round(settle_s * 1e9)
+    at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
+    if not len(at_ns):
+        raise BadInput(
+            f"{source.name}: ends within {settle_s:g} s, and tracks are judged after these; give a "
+            "longer log"
+        )
+    places = [
+        [np.interp(at_ns - first_ns, truth.publish_time_ns - first_ns, axis) for axis in place.T]
+        for truth in truths.values()
+        for place in [read_vectors(truth, "state", PLANE)]
+    ]
+    return Judged(at_ns, np.array(places).transpose(0, 2, 1))
+
+
+def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
+    """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
+
+    `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
+    of each one `delay_ns` after its stamp.
+    """
+    names = tracks.components
+    place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
+    ends = np.append(0, np.cumsum(sizes["elements"].astype(np.int64)))
+    found = []
+    for time_ns, last in zip(
+        at_ns, np.searchsorted(sizes.publish_time_ns, at_ns - delay_ns, side="right"), strict=True
+    ):
+        rows = slice(ends[last - 1], ends[last]) if last else slice(0, 0)
+        later_s = (time_ns - sizes.publish_time_ns[last - 1]) * 1e-9 if last else 0.0
+        mean = tracks["mean"][rows]
+        moved = mean[:, place] + later_s * mean[:, velocity]
+        found.append(TracksAt(tracks["track_id"][rows].astype(np.int64), moved))
+    return found
+
+
+def track_errors(
+    tracks: Sequence[TracksAt],
+    truths: Floats,
+    cutoff_m: float = CUTOFF_M,
+    unreferenced_m: float = UNREFERENCED_M,
+) -> TrackErrors:
+    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there."""
+    targets_in_all, instants, _ = truths.shape
+    present = np.asarray(np.isfinite(truths).all(axis=2))
+    found = TrackErrors(
+        gospa_all=np.zeros(instants),
+        gospa=np.zeros(instants),
+        localisation=np.zeros(instants),
+        missed=np.zeros(instants),
+        false=np.zeros(instants),
+        unreferenced=np.zeros(instants, np.int64),
+        track=np.full((targets_in_all, instants), NONE),
+        distance=np.full((targets_in_all, instants), np.nan),
+        present=present,
+    )
+    for instant, at in enumerate(tracks):
+        targets = np.flatnonzero(present[:, instant])
+        true = truths[targets, instant]
+        away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
+        known = (away <= unreferenced_m).any(axis=1)
+        place = at.place[known]
+        found.gospa_all[instant] = gospa(at.place, true, cutoff_m).total
+        parts = gospa(place, true, cutoff_m)
+        found.gospa[instant], found.localisation[instant] = parts.total, parts.localisation
+        found.missed[instant], found.false[instant] = parts.missed, parts.false
+        found.unreferenced[instant] = np.count_nonzero(~known)
+        estimate, paired = gospa_pairs(place, true, cutoff_m)
+        found.track[targets[paired], instant] = at.number[known][estimate]
+        found.distance[targets[paired], instant] = away[known][estimate, paired]
+    return found
+
+
+def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
+    """The means over the instants, and of each target, from 1 on, RMSE and coverage.
+
+    Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed.
+    """
+    alone = cutoff_m**2 / 2.0
+    figures = {
+        "gospa_m": float(errors.gospa.mean()),
+        "gospa_all_m": float(errors.gospa_all.mean()),
+        "localisation_m2": float(errors.localisation.mean()),
+        "missed_targets": float(errors.missed.mean()) / alone,
+        "false_targets": float(errors.false.mean()) / alone,
+        "unreferenced_targets": float(errors.unreferenced.mean()),
+    }
+    switches = breaks = 0
+    for target, (track, distance, present) in enumerate(
+        zip(errors.track, errors.distance, errors.present, strict=True), start=1
+    ):
+        followed = np.flatnonzero(track != NONE)
+        figures[f"target{target}_rmse_m"] = (
+            float(np.sqrt(np.mean(distance[followed] ** 2))) if len(followed) else float("nan")
+        )
+        figures[f"target{target}_coverage"] = len(followed) / max(int(present.sum()), 1)
+        switches += int(np.count_nonzero(np.diff(track[followed])))
+        breaks += int(np.count_nonzero(np.diff(followed) > 1))
+    return figures | {"switches": float(switches), "breaks": float(breaks)}
+
+
+def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
+    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `track_distances`."""
+    numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
+    found = np.full((len(numbers), len(tracks), 2), np.nan)
+    for instant, at in enumerate(tracks):
+        found[np.searchsorted(numbers, at.number), instant] = at.place
+    return found

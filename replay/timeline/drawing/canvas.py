@@ -1,0 +1,293 @@
+"""What there is to draw (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
+
+A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
+that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`. Where stamps are
+no dates, as those of a simulated clock in a bag, `utc` is when they reached the recorder.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream, schemas
+from replay.engine.streams.sources import Source
+from replay.judging.errors.evaluation import Errors, Floats, split_topic
+
+Times = NDArray[np.int64]
+Colour = tuple[int, int, int]
+
+# Okabe and Ito's colours, told apart by everyone; red is kept for what went wrong.
+PALETTE: tuple[Colour, ...] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (240, 228, 66),
+    (0, 114, 178),
+)
+TRUTH: Colour = (200, 200, 200)
+MUTED: Colour = (130, 130, 130)
+WRONG: Colour = (230, 60, 40)
+
+# What moves has at most so many rows per entity, evenly in time: several per pixel of a plot, and
+# several a second in a log of a quarter of an hour.
+DRAWN_ROWS = 5000
+# A stream is silent after so many of its usual intervals, but not before so long.
+GAP_INTERVALS = 5.0
+GAP_S = 1.0
+# Stamps before the year 2000 count from something else than 1970.
+DATES_FROM_NS = 946_684_800_000_000_000
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One run and what the estimators made of it.
+
+    Attributes:
+        source: the run's sensor streams and truth.
+        outputs: the estimators' streams of this run, by topic.
+        errors: the errors of this run's estimates, where there is truth.
+        focus: the case that is seen first; None is the first one.
+    """
+
+    source: Source
+    outputs: Mapping[str, Stream]
+    errors: Sequence[Errors]
+    focus: str | None = None
+
+    @property
+    def estimators(self) -> list[str]:
+        """The estimators' labels, in the order they were given."""
+        names = [split_topic(topic)[0] for topic in self.outputs]
+        return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
+
+    @property
+    def cases(self) -> list[str]:
+        """What is estimated, or has a truth: `robot1`, say. A log with a single one may call it ""."""
+        estimated = [split_topic(topic)[1] for topic in self.outputs]
+        found = {*estimated, *(_prefix(topic) for topic in self._truths)}
+        return sorted(found, key=_natural) or [""]
+
+    def colour(self, estimator: str) -> Colour:
+        """The one colour of an estimator, everywhere."""
+        return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
+
+    def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
+        """The non-empty output streams of a case that have this schema, with their estimators."""
+        return [
+            (split_topic(topic)[0], stream)
+            for topic, stream in self.outputs.items()
+            if split_topic(topic)[1] == case
+            and stream.schema.full_name == schema.full_name
+            and len(stream)
+        ]
+
+    def errors_of(self, case: str) -> list[Errors]:
+        """The non-empty errors of a case."""
+        return [errors for errors in self.errors if errors.case == case and len(errors.error)]
+
+    def truths_of(self, case: str) -> list[Stream]:
+        """The non-empty truth streams of a case."""
+        truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
+        return [truth for truth in truths if len(truth)]
+
+    def topics_near(self, case: str) -> list[str]:
+        """The run's sensor topics below a case, and those that are below none; see `unread`."""
+        others = [f"/{other}/" for other in self.cases if other != case and other]
+        elsewhere = ("/estimates/", *others)
+        return [
+            topic
+            for topic in self.source.topics
+            if not topic.startswith(elsewhere) and topic not in self.unread
+        ]
+
+    @cached_property
+    def unread(self) -> dict[str, str]:
+        """The run's topics whose messages are no columns, such as images, and why."""
+        found: dict[str, str] = {}
+        for topic in self.source.topics:
+            try:
+                self.source.empty(topic)
+            except BadInput as error:
+                found[topic] = str(error)
+        return found
+
+    def read(self, topic: str) -> Stream:
+        """One of the run's topics, whole."""
+        return self.source.read([topic])[topic]
+
+    @property
+    def dates(self) -> "Dates | None":
+        """What stamps are as dates, by the topic with most messages; None where they are dates."""
+        streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
+        return dates_of(max(streams, key=len)) if streams else None
+
+    @property
+    def _truths(self) -> list[str]:
+        schema_name = schemas.TRUTH_STATE.full_name
+        return [each.name for each in self.source.topics.values() if each.schema_name == schema_name]
+
+
+def _prefix(topic: str) -> str:
+    return topic.rpartition("/")[0].removeprefix("/")
+
+
+def _natural(name: str) -> list[tuple[str, int]]:
+    """The key that puts robot2 before robot10."""
+    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
+
+
+@dataclass(frozen=True)
+class Dates:
+    """Two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+
+    Between two stamps the difference is linear, and before the first and after the last it stays.
+    """
+
+    stamps_ns: Times
+    later_ns: Times
+
+    def of(self, time_ns: Times) -> Times:
+        """The dates of stamps (n,)."""
+        first_ns = self.later_ns[0]
+        drift_ns = np.interp(time_ns, self.stamps_ns, self.later_ns - first_ns)
+        found: Times = time_ns + first_ns + np.rint(drift_ns).astype(np.int64)
+        return found
+
+
+def dates_of(stream: Stream) -> Dates | None:
+    """The dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
+    if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
+        return None
+    return Dates(stamps_ns, logged_ns - stamps_ns)
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A recording and its clocks.
+
+    Attributes:
+        recording: where it goes.
+        epoch_ns: the run's time zero.
+        end_ns: when the last estimate or truth is.
+        steps_ns: the distinct times of estimates, which `step` counts.
+        is_still: nothing that moves is sent: it is there already.
+        dates: what stamps are as dates, where they are none themselves.
+    """
+
+    recording: rr.RecordingStream
+    epoch_ns: int
+    end_ns: int
+    steps_ns: Times
+    is_still: bool = False
+    dates: Dates | None = None
+
+    def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
+        """Send the rows of one entity, all at once."""
+        if len(time_ns) == 0 or self.is_still:
+            return
+        step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
+        date_ns = time_ns if self.dates is None else self.dates.of(time_ns)
+        index = [
+            rr.TimeColumn("step", sequence=np.maximum(step, 0)),
+            rr.TimeColumn("sim_time", duration=(time_ns - self.epoch_ns).astype("timedelta64[ns]")),
+            rr.TimeColumn("utc", timestamp=date_ns.astype("datetime64[ns]")),
+        ]
+        self.recording.send_columns(escaped(entity), index, columns, strict=True)
+
+    def fix(self, entity: str, *what: rr.AsComponents) -> None:
+        """Log what holds at all times, such as a style."""
+        self.recording.log(escaped(entity), *what, static=True, strict=True)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """How a scenario family is drawn: `draw` sends everything and returns the layout of its views."""
+
+    draw: Callable[[Canvas, Scene], rrb.Container | rrb.View]
+
+
+def draw_cases(
+    scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
+) -> rrb.Container | rrb.View:
+    """The layouts of all cases, in tabs where there are several."""
+    layouts = [draw_case(case) for case in scene.cases]
+    if len(layouts) == 1:
+        return layouts[0]
+    return rrb.Tabs(*layouts, active_tab=scene.cases.index(scene.focus or scene.cases[0]))
+
+
+def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
+    """A case's board, and to its right its plots if there are any."""
+    columns = [board, rrb.Vertical(*plots)] if plots else [board]
+    return rrb.Horizontal(*columns, name=case or "run")
+
+
+def entity_path(*parts: str) -> str:
+    """An entity from its parts; empty ones, such as the case of a log with one, are left out."""
+    return "/".join(part for part in parts if part)
+
+
+def escaped(entity: str) -> str:
+    """An entity as Rerun wants it written, whatever is in its parts: an estimator `ukf:2`, say."""
+    return "/".join(rr.escape_entity_path_part(part) for part in entity.split("/"))
+
+
+def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
+    """The rows to draw: all, or the last of each of `rows` equal spans of time."""
+    if len(time_ns) <= rows:
+        return np.arange(len(time_ns))
+    of_span = _spans(time_ns, rows)
+    return np.flatnonzero(np.append(of_span[1:] != of_span[:-1], True))
+
+
+def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
+    """The rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    if len(time_ns) <= rows:
+        return np.arange(len(time_ns))
+    return extremes(_spans(time_ns, rows // 2), values)
+
+
+def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
+    """The rows of the least and of the greatest value of every span, the first where several are.
+
+    `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
+    """
+    first = np.flatnonzero(np.diff(of_span, prepend=-1))
+    sizes = np.diff(first, append=len(of_span))
+    is_extreme = np.zeros(len(values), bool)
+    for extreme in (np.fmin, np.fmax):
+        rows = np.flatnonzero(values == np.repeat(extreme.reduceat(values, first), sizes))
+        is_extreme[rows[np.diff(of_span[rows], prepend=-1) > 0]] = True
+    return np.flatnonzero(is_extreme)
+
+
+def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
+    """In which of so many equal spans of time each stamp is, from zero on."""
+    span_ns = max((time_ns[-1] - time_ns[0]) / spans, 1.0)
+    return np.minimum((time_ns - time_ns[0]) / span_ns, spans - 1).astype(np.int64)
+
+
+def gap_limit_ns(time_ns: Times) -> int:
+    """How long a stream with these times, sorted, may be silent before it is missed."""
+    return int(max(GAP_INTERVALS * usual_interval_ns(time_ns), GAP_S * 1e9))
+
+
+def usual_interval_ns(time_ns: Times) -> float:
+    """The median between distinct times, sorted; zero where there is only one."""
+    intervals = np.diff(np.unique(time_ns))
+    return float(np.median(intervals)) if len(intervals) else 0.0
+
+
+def nice(value: float) -> float:
+    """The smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value))

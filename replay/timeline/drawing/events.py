@@ -1,0 +1,170 @@
+"""What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorders.log import Stream, schemas
+from replay.engine.streams.failures import sentences_of
+from replay.timeline.drawing.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
+
+NOT_SENSED = frozenset(
+    schema.full_name
+    for schema in (
+        schemas.LANDMARK,
+        schemas.TRUTH_STATE,
+        schemas.OUTAGE,
+        schemas.LINK_EVENT,
+        schemas.GAUSSIAN_ESTIMATE,
+    )
+)
+
+
+# What components say of a receiver's solution, as RTKLIB numbers them, and of a body.
+STATES: Mapping[str, Mapping[float, str]] = {
+    "quality": {
+        1: "solution fixed",
+        2: "solution float",
+        3: "solution SBAS",
+        4: "solution differential",
+        5: "solution single",
+        6: "solution PPP",
+    },
+    "standing": {0: "moves", 1: "stands: no velocity"},
+    "rolling": {0: "may slip", 1: "rolls: no velocity to the side or up"},
+}
+
+
+class Happened(NamedTuple):
+    """What happened to an estimator or a sensor: a text for each time, all of one level."""
+
+    who: str
+    level: str
+    time_ns: Times
+    texts: list[str]
+
+
+def above_events(
+    board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
+) -> rrb.Container:
+    """A board so many times as high as the events below it, if there are any."""
+    return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
+
+
+def draw_events(
+    canvas: Canvas,
+    scene: Scene,
+    case: str,
+    not_drawn: Mapping[str, str] | None = None,
+    also: Iterable[Happened] = (),
+) -> list[rrb.TextLogView]:
+    """The events of a case, one entity per estimator and sensor: no view where nothing happened.
+
+    `not_drawn` says of topics that have no drawing why, beside those that cannot be read; `also` is what
+    happened that only a scenario family knows of.
+    """
+    root = entity_path("events", case)
+    reasons = {**scene.unread, **(not_drawn or {})}
+    texts = [f"{topic} is not drawn: {reason}" for topic, reason in reasons.items()]
+    unread = Happened("log", "INFO", np.full(len(texts), canvas.epoch_ns), texts)
+    happened = [unread, *also, *_of_estimators(scene, case), *_of_sensors(scene, case)]
+    happened = [each for each in happened if each.texts]
+    for who, level, time_ns, texts in happened:
+        lines = [f"{who}: {text}" for text in texts]
+        columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
+        canvas.send(f"{root}/{who}", time_ns, columns)
+    return [events_view(root)] if happened else []
+
+
+def events_view(root: str) -> rrb.TextLogView:
+    """All events below an entity."""
+    shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
+
+
+def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
+    for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
+        times = stream.publish_time_ns
+        drawn, span_s = len(thin(times)), (times[-1] - times[0]) * 1e-9
+        if drawn < len(times):
+            text = f"drawn at {drawn / span_s:.3g} Hz of {len(times) / span_s:.3g} Hz"
+            yield Happened(estimator, "INFO", times[:1], [text])
+    for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
+        gated = stream.take(stream["accepted"] == 0)
+        squares = gated["normalised_innovation_squared"].tolist()
+        texts = [
+            f"gated target {target}: NIS {square:.1f}"
+            for target, square in zip(gated["target_id"].tolist(), squares, strict=True)
+        ]
+        yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.STARTED):
+        yield Happened(estimator, "INFO", stream.publish_time_ns, sentences_of(stream))
+    for estimator, stream in scene.outputs_of(case, schemas.DIAGNOSED):
+        yield Happened(estimator, "WARN", stream.publish_time_ns, sentences_of(stream))
+    for estimator, stream in scene.outputs_of(case, schemas.SKIPPED):
+        texts = [f"not used: {reason}" for reason in sentences_of(stream)]
+        yield Happened(estimator, "WARN", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.REWOUND):
+        late_s = (stream.log_time_ns - stream.publish_time_ns) * 1e-9
+        texts = [
+            f"came {delay:.3f} s late: went back and used {repeated} after it again"
+            for delay, repeated in zip(late_s.tolist(), stream["repeated"].tolist(), strict=True)
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.WAITED):
+        texts = [
+            f"came late, {behind:.3f} s behind newer ones, which waited for it"
+            for behind in stream["behind_s"].tolist()
+        ]
+        yield Happened(estimator, "INFO", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.FAILURE):
+        texts = [f"failed: {reason}" for reason in sentences_of(stream)]
+        yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
+    for estimator, stream in scene.outputs_of(case, schemas.RELATIVE_BEARING):
+        pairs = zip(stream["first_id"].tolist(), stream["second_id"].tolist(), strict=True)
+        texts = [f"empty set: the pair {first}, {second} is to blame" for first, second in pairs]
+        yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
+
+
+def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
+    """Spans in which a sensor was dead, stated by the log or seen as a gap; how good solutions are."""
+    for topic in scene.topics_near(case):
+        if scene.source.topics[topic].schema_name in NOT_SENSED:
+            continue
+        outages = np.empty((0, 2), np.int64)
+        if f"{topic}/outages" in scene.source.topics:
+            stated = scene.read(f"{topic}/outages")
+            outages = np.stack([stated.publish_time_ns, stated["end_time_ns"]], axis=1)
+        gaps = _gaps(scene.read(topic))
+        explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
+        sensor = topic.removeprefix(f"/{case}").removeprefix("/")
+        yield from _changes(sensor, scene.read(topic))
+        yield _spans(sensor, "dead for", outages)
+        yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])
+
+
+def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
+    """Where what a sensor says of its solution or its body changes, see STATES."""
+    if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
+        return
+    for column, component in enumerate(stream.components):
+        if component in STATES:
+            numbers, words = stream["value"][:, column], STATES[component]
+            rows = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0.0)
+            texts = [words.get(number, f"{component} {number:g}") for number in numbers[rows].tolist()]
+            yield Happened(sensor, "INFO", stream.publish_time_ns[rows], texts)
+
+
+def _gaps(stream: Stream) -> Times:
+    """Where a sensor was silent for much longer than usual: (n, 2), from and to."""
+    times = stream.publish_time_ns
+    long = np.diff(times) > gap_limit_ns(times)
+    return np.stack([times[:-1][long], times[1:][long]], axis=1)
+
+
+def _spans(sensor: str, what: str, spans: Times) -> Happened:
+    texts = [f"{what} {seconds:.1f} s" for seconds in (np.diff(spans)[:, 0] * 1e-9).tolist()]
+    return Happened(sensor, "WARN", spans[:, 0], texts)

@@ -1,0 +1,107 @@
+"""Places on the earth: points by latitude and longitude on a map.
+
+The map's tiles come from the network; without it the points are still in their places.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from recorders.log import Stream
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import Canvas, Colour, escaped, thin
+from replay.timeline.drawing.plane import TRAIL_S, trail_of
+
+# Fixes up to these standard deviations in m: an ambiguity that is fixed, one that floats, code alone.
+QUALITIES: tuple[tuple[float, Colour], ...] = (
+    (0.05, (0, 158, 115)),
+    (0.5, (240, 228, 66)),
+    (5.0, (230, 159, 0)),
+)
+POOR: Colour = (204, 121, 167)
+SHOWN_SHARE = 0.9
+# So many times the shown extent beyond it is far off.
+FAR = 10.0
+# How wide the map is drawn, about, and its tiles.
+MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
+
+
+def degrees_of(stream: Stream) -> Floats:
+    """Latitude and longitude (n, 2) of geodetic fixes."""
+    return np.stack([stream["latitude_deg"], stream["longitude_deg"]], axis=1)
+
+
+def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
+    """Geodetic fixes as points, and the whole way past them as a thin line; none that are far off.
+
+    Points have the colour of the deviation that fixes state, else the one that is given.
+    """
+    degrees = degrees_of(stream)
+    rows = np.flatnonzero(are_near(degrees))
+    rows = rows[thin(stream.publish_time_ns[rows])]
+    colours = by_deviation(stream["covariance_m2"][rows], colour)
+    packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 255
+    points = rr.GeoPoints.columns(positions=degrees[rows], colors=packed)
+    canvas.send(entity, stream.publish_time_ns[rows], points)
+    canvas.fix(entity, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(4.0)))
+    draw_way(canvas, f"{entity}/way", degrees[rows], colour)
+
+
+def draw_way(canvas: Canvas, entity: str, degrees: Floats, colour: Colour) -> None:
+    """A whole way past places (n, 2) as a thin line."""
+    way = rr.GeoLineStrings(lat_lon=[degrees], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0))
+    canvas.fix(entity, way)
+
+
+def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
+    """Colours (n, 3) of fixes with covariances (n, d * d), by their mean standard deviation."""
+    size = round(covariance_m2.shape[1] ** 0.5)
+    sigma_m = np.full(len(covariance_m2), np.nan)
+    if size:  # fixes may come without
+        sigma_m = np.sqrt(covariance_m2[:, :: size + 1].mean(axis=1))
+    limits = [limit for limit, _ in QUALITIES]
+    colours = np.array([*(colour for _, colour in QUALITIES), POOR, unknown], np.uint8)
+    # what is not known comes after all numbers
+    return colours[np.searchsorted([*limits, np.inf], sigma_m)]
+
+
+def map_view(
+    canvas: Canvas, root: str, degrees: Floats, paths: Sequence[str] = (), trail_s: float = TRAIL_S
+) -> rrb.MapView:
+    """A map of all below `root` that shows at least the places (n, 2) that are not far off.
+
+    Of the `paths` it shows what lies up to `trail_s` before the cursor.
+    """
+    near = are_near(degrees)
+    left_out = "" if near.all() else f", {(~near).sum()} far off left out"
+    trail = trail_of(canvas, trail_s)
+    return rrb.MapView(
+        origin=escaped(root),
+        name=f"OpenStreetMap{left_out}",
+        zoom=_zoom(degrees[near]),
+        overrides={escaped(path): [trail] for path in paths},
+    )
+
+
+def usual(places: Floats) -> Floats:
+    """The corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
+    tail = 0.5 * (1.0 - SHOWN_SHARE)
+    return np.nanquantile(places, [tail, 1.0 - tail], axis=0)
+
+
+def are_near(places: Floats) -> NDArray[np.bool_]:
+    """Which places are not far off: the map's view centres on all that it has."""
+    low, high = usual(places)
+    margin = FAR * (high - low).max()
+    return ((places >= low - margin) & (places <= high + margin)).all(axis=1)
+
+
+def _zoom(degrees: Floats) -> float:
+    """The zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
+    low, high = degrees.min(axis=0), degrees.max(axis=0)
+    latitude = np.radians(0.5 * (low[0] + high[0]))
+    width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)
+    return float(np.clip(np.log2(360.0 / width * MAP_PIXELS / TILE_PIXELS), 1.0, 19.0))

@@ -1,0 +1,316 @@
+"""Drawing a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
+
+What is sent are the true coordinates. Rerun's 2-D views have y pointing down, so everything below `map`
+hangs on one transform that turns it up. What moves sits at its time and vanishes when it is no longer
+current; a path is a segment per row, of which the view shows the last minute.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+
+from recorders.log import schemas
+from replay.distributions import chi2
+from replay.engine.streams.measurements import PLANE
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import (
+    TRUTH,
+    Canvas,
+    Colour,
+    Scene,
+    Times,
+    escaped,
+    gap_limit_ns,
+    nice,
+    thin,
+    usual_interval_ns,
+)
+
+ROOT = "map"
+GRID: Colour = (45, 45, 45)
+TRAIL_S = 60.0
+ELLIPSE_VERTICES = 24
+# The lines of a look stay for so many of the usual intervals between looks.
+SHOWN_INTERVALS = 1.5
+# Of clouds of particles so many are drawn, those of whole stamps; the area of each is its weight.
+CLOUD_POINTS = 100_000
+PARTICLE_PX = 1.5
+# What is left free beside the places, as a share of their side, or of so much of the longer one.
+MARGIN, LEAST_SIDE = 0.07, 0.3
+# Points closer than this share of the map's extent share one label.
+LABEL_SHARE = 0.04
+
+
+class Stroke(NamedTuple):
+    """How a line looks: its colour, and its radius in pixels. Wide ones lie below narrow ones."""
+
+    colour: Colour
+    radius_px: float = 1.0
+
+    def fields(self, widen: float = 1.0) -> dict[str, Any]:
+        """The fields of Rerun's archetypes."""
+        radii = rr.Radius.ui_points(self.radius_px * widen)
+        return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - self.radius_px}
+
+
+def turn_up(canvas: Canvas, root: str = ROOT) -> None:
+    """Let y point up below an entity."""
+    canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+
+
+def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
+    """Fixed points (n, 2) with their numbers; close ones share a label, below the lowest of them.
+
+    A point that single precision, which viewers draw in, puts at infinity is nowhere to be drawn.
+    """
+    is_somewhere = (np.abs(places) <= np.finfo(np.float32).max).all(axis=1)
+    numbers, places = numbers[is_somewhere], places[is_somewhere]
+    if len(places) == 0:
+        return
+    texts = np.array([str(number) for number in numbers.tolist()])
+    radii = rr.Radius.ui_points(4.0)
+    canvas.fix(entity, rr.Points2D(places, labels=texts, colors=[TRUTH], radii=radii, show_labels=False))
+    groups = _neighbours(places)
+    spots = [(places[rows, 0].mean(), places[rows, 1].min()) for rows in groups]
+    labels = [" ".join(texts[rows]) for rows in groups]
+    names = rr.Points2D(spots, labels=labels, colors=[TRUTH], radii=0.0, show_labels=True)
+    canvas.fix(f"{entity}/numbers", names)
+
+
+def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
+    """The rows of the groups of points whose labels would overlap."""
+    if len(places) == 1:
+        return [np.arange(1)]
+    group = fcluster(linkage(places, "complete"), LABEL_SHARE * extent_of(places), "distance")
+    return [np.flatnonzero(group == each) for each in np.unique(group)]
+
+
+def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
+    """A point (n, 2) at each time, such as a measurement."""
+    canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
+    canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
+
+
+def draw_scans(
+    canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
+) -> None:
+    """All points (n, 2) of a stamp together, until those of the next."""
+    times, sizes = np.unique(time_ns, return_counts=True)
+    columns = rr.Points2D.columns(positions=places)
+    canvas.send(entity, times, columns.partition(sizes))
+    radii = rr.Radius.ui_points(radius_px)
+    canvas.fix(entity, rr.Points2D.from_fields(colors=[colour], radii=radii))
+
+
+class Cloud(NamedTuple):
+    """The particles of an estimator that are drawn.
+
+    Attributes:
+        estimator: whose they are.
+        stamps: (s,) their times.
+        row: (n,) the number of each particle's stamp, in order.
+        places: (n, 2).
+        weights: (n,) one on average over the particles of a stamp.
+    """
+
+    estimator: str
+    stamps: Times
+    row: NDArray[np.int64]
+    places: Floats
+    weights: Floats
+
+
+def clouds_of(scene: Scene, case: str) -> Iterator[Cloud]:
+    """The particles of all estimators that say where they are."""
+    for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
+        if not set(PLANE) <= set(stream.components):
+            continue
+        stamps, counts = np.unique(stream.publish_time_ns, return_counts=True)
+        rows = thin(stamps, max(CLOUD_POINTS // int(counts.max()), 1))
+        drawn = np.isin(stream.publish_time_ns, stamps[rows])
+        columns = [stream.components.index(component) for component in PLANE]
+        size = len(stream.components)
+        places = stream["mean"][drawn].reshape(-1, size)[:, columns]
+        weights = stream["weight"][drawn] * np.repeat(counts[rows], counts[rows])
+        yield Cloud(name, stamps[rows], np.repeat(np.arange(len(rows)), counts[rows]), places, weights)
+
+
+def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
+    """The particles of all estimators of a case; see `draw_cloud`."""
+    for cloud in clouds_of(scene, case):
+        draw_cloud(canvas, f"{root}/{cloud.estimator}/particles", cloud, scene.colour(cloud.estimator))
+
+
+def draw_cloud(canvas: Canvas, entity: str, cloud: Cloud, colour: Colour) -> None:
+    """All particles of a stamp until those of the next."""
+    points = rr.Points2D.columns(
+        positions=cloud.places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(cloud.weights)
+    )
+    counts = np.bincount(cloud.row, minlength=len(cloud.stamps))
+    canvas.send(entity, cloud.stamps, points.partition(counts))
+    canvas.fix(entity, rr.Points2D.from_fields(colors=[(*colour, 120)]))
+
+
+def draw_polygons(
+    canvas: Canvas,
+    entity: str,
+    time_ns: Times,
+    sizes: NDArray[np.int64],
+    polygons: Sequence[Floats],
+    stroke: Stroke,
+) -> None:
+    """Closed polygons (vertices, 2), so many (n,) at each time; none is an empty set, not a gap."""
+    rows = thin(time_ns)
+    first = np.cumsum(sizes) - sizes
+    shown = [polygons[k] for row in rows for k in range(first[row], first[row] + sizes[row])]
+    strips = [np.concatenate([ring, ring[:1]]).astype(np.float32) for ring in shown]
+    times, counts = _until_stale(canvas, time_ns[rows], sizes[rows], gap_limit_ns(time_ns))
+    if strips:
+        canvas.send(entity, times, rr.LineStrips2D.columns(strips=strips).partition(counts))
+    canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
+
+
+def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
+    """The way of a point (n, 2): each row the segment from the place before."""
+    segments = np.stack([places[:-1], places[1:]], axis=1).astype(np.float32)
+    canvas.send(entity, time_ns[1:], rr.LineStrips2D.columns(strips=segments))
+    canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
+
+
+def draw_poses(
+    canvas: Canvas, entity: str, time_ns: Times, poses: Floats, stroke: Stroke, length_m: float
+) -> None:
+    """An arrow from each pose (n, 3), x, y, heading, in the direction of the heading."""
+    times, sizes = _until_stale(canvas, time_ns, np.ones_like(time_ns), gap_limit_ns(time_ns))
+    vectors = length_m * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    columns = rr.Arrows2D.columns(origins=poses[:, :2], vectors=vectors)
+    canvas.send(entity, times, columns.partition(sizes))
+    canvas.fix(entity, rr.Arrows2D.from_fields(**stroke.fields(widen=3.0)))
+
+
+def draw_ellipses(
+    canvas: Canvas, entity: str, time_ns: Times, means: Floats, covariances: Floats, stroke: Stroke
+) -> None:
+    """The 95 % ellipse of each Gaussian (n, 2), (n, 2, 2)."""
+    draw_outlines(canvas, entity, time_ns, ellipses(means, covariances), stroke)
+
+
+def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats, stroke: Stroke) -> None:
+    """The outline of a thing at each time, closed or not: (n, vertices, 2), left out where NaN."""
+    good = np.isfinite(outlines).all(axis=(1, 2))
+    times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
+    columns = rr.LineStrips2D.columns(strips=outlines[good].astype(np.float32))
+    canvas.send(entity, times, columns.partition(sizes))
+    canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
+
+
+def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
+    """The closed outlines (n, vertices + 1, 2) that hold Gaussians (n, 2), (n, 2, 2) so probably.
+
+    NaN where a covariance is not positive definite.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, ELLIPSE_VERTICES + 1)
+    circle = np.sqrt(chi2.ppf(probability, 2)) * np.stack([np.cos(angle), np.sin(angle)])
+    root = np.zeros_like(covariances)
+    with np.errstate(invalid="ignore", divide="ignore"):  # Cholesky that does not raise for all
+        root[:, 0, 0] = np.sqrt(covariances[:, 0, 0])
+        root[:, 1, 0] = covariances[:, 1, 0] / root[:, 0, 0]
+        root[:, 1, 1] = np.sqrt(covariances[:, 1, 1] - root[:, 1, 0] ** 2)
+    return means[:, None, :] + (root @ circle).transpose(0, 2, 1)
+
+
+def draw_lines(
+    canvas: Canvas, entity: str, time_ns: Times, lines: Floats, colours: NDArray[np.uint8]
+) -> None:
+    """Lines (n, points, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
+
+    They make way for the next look, and vanish where that comes later than usual.
+    """
+    looks = np.unique(time_ns)
+    looks = looks[thin(looks)]
+    drawn = np.isin(time_ns, looks)
+    counts = np.unique(time_ns[drawn], return_counts=True)[1]
+    shown_ns = int(SHOWN_INTERVALS * usual_interval_ns(looks))
+    times, sizes = _until_stale(canvas, looks, counts, shown_ns)
+    columns = rr.LineStrips2D.columns(strips=lines[drawn].astype(np.float32), colors=colours[drawn])
+    canvas.send(entity, times, columns.partition(sizes))
+    canvas.fix(entity, rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(0.75)))
+
+
+def _until_stale(
+    canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
+) -> tuple[Times, NDArray[np.int64]]:
+    """Rows of so many things each, and an empty row where one has no successor for `shown_ns`."""
+    ends = time_ns + shown_ns
+    gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
+    times = np.concatenate([time_ns, ends[gone]])
+    order = np.argsort(times, kind="stable")
+    return times[order], np.concatenate([sizes, np.zeros(gone.sum(), np.int64)])[order]
+
+
+def plane_view(
+    canvas: Canvas,
+    root: str,
+    others: list[str],
+    paths: list[str],
+    places: Floats,
+    trail_s: float = TRAIL_S,
+    *,
+    name: str = "Map",
+) -> rrb.Spatial2DView:
+    """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
+
+    Of the `paths` it shows what lies up to `trail_s` before the cursor.
+    """
+    extent = extent_of(places)
+    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
+    step_m = nice(extent / 10.0)
+    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent)
+    low, high = low - margin, high + margin
+    _draw_grid(canvas, f"{root}/grid", low - extent, high + extent, step_m)
+    trail = trail_of(canvas, trail_s)
+    return rrb.Spatial2DView(
+        origin="/",
+        contents=[f"{escaped(each)}/**" for each in (root, *others)],
+        name=f"{name}, grid {step_m:g} m",
+        overrides={escaped(path): [trail] for path in paths},
+        # the bounds are outside the transform that turns y up
+        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
+    )
+
+
+def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
+    """What lies up to so long before the cursor, on every timeline."""
+    steps = round(trail_s * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    begin = cursor(seconds=-trail_s)
+    return rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange("sim_time", start=begin, end=cursor()),
+            rrb.VisibleTimeRange("utc", start=begin, end=cursor()),
+            rrb.VisibleTimeRange("step", start=cursor(seq=-steps), end=cursor()),
+        ]
+    )
+
+
+def extent_of(places: Floats) -> float:
+    """The larger side of the box around places (n, 2); one where they have no extent."""
+    return float(np.ptp(places, axis=0).max()) or 1.0 if len(places) else 1.0
+
+
+def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: float) -> None:
+    """Lines at the multiples of the step in x and in y."""
+    lines = []
+    for axis in range(2):
+        at = step_m * np.arange(np.ceil(low[axis] / step_m), np.floor(high[axis] / step_m) + 1)
+        ends = np.tile(np.stack([low, high]), (len(at), 1, 1))
+        ends[:, :, axis] = at[:, None]
+        lines.append(ends)
+    radii = rr.Radius.ui_points(0.5)
+    strips = rr.LineStrips2D(np.concatenate(lines), colors=[GRID], radii=radii, draw_order=-1.0)
+    canvas.fix(entity, strips)

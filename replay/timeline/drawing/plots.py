@@ -1,0 +1,251 @@
+"""Plots that every family uses: components, errors with bands, NEES and NIS with chi-square bounds.
+
+Every function sends its columns and returns the views that show them. A band is Rerun's `Measurements`,
+which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import compress, cycle
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorders.log import schemas
+from replay.engine.streams.blocks import gather
+from replay.judging.errors.evaluation import Errors, Floats, chi_square_interval, innovations_of
+from replay.timeline.drawing.canvas import (
+    DRAWN_ROWS,
+    MUTED,
+    PALETTE,
+    TRUTH,
+    Canvas,
+    Colour,
+    Scene,
+    Times,
+    entity_path,
+    escaped,
+    nice,
+    thin_curve,
+)
+
+SIGMAS = 2.0
+WHOLE_RUN = rrb.TimeAxis(
+    view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
+)
+Style = Callable[..., rr.AsComponents]
+LINE: Style = partial(rr.SeriesLines, widths=[1.5])
+POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
+
+
+class Squares(NamedTuple):
+    """Chi-square values of an estimator and their degrees of freedom; `of` is what they are of.
+
+    It is empty where the degrees tell.
+    """
+
+    degrees: int
+    of: str
+    estimator: str
+    time_ns: Times
+    values: Floats
+
+
+def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """Errors, NEES, NIS and effective particles of a case: no plots where there is nothing to judge."""
+    parts = (draw_errors, draw_nees, draw_nis, draw_effective)
+    return [view for part in parts for view in part(canvas, scene, case)]
+
+
+def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Tabs]:
+    """NEES and errors of a case of many components: of each kind of plot one at a time."""
+    kinds = (draw_nees(canvas, scene, case)[::-1], draw_errors(canvas, scene, case))
+    return [rrb.Tabs(*views) for views in kinds if views]
+
+
+def draw_errors(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """One plot per component of a case: each estimator's error inside its band of +-2 sigma."""
+    found = scene.errors_of(case)
+    components = dict.fromkeys(name for errors in found for name in errors.components)
+    return [
+        _draw_error(canvas, scene, case, name, [each for each in found if name in each.components])
+        for name in components
+    ]
+
+
+def _draw_error(
+    canvas: Canvas, scene: Scene, case: str, component: str, found: Sequence[Errors]
+) -> rrb.TimeSeriesView:
+    quantity, unit, scale = shown_unit(component)
+    plot = entity_path("plots", case, f"error_{component}")
+    extents = []
+    for errors in found:
+        column = errors.components.index(component)
+        rows = thin_curve(errors.time_ns, errors.error[:, column])
+        error = scale * errors.error[rows, column]
+        bound = scale * SIGMAS * np.sqrt(np.maximum(errors.covariance[rows, column, column], 0.0))
+        extents.append(np.quantile(np.maximum(np.abs(error), bound), 0.99))
+        zero = np.zeros(len(rows))
+        columns = rr.Measurements.columns(
+            values=np.stack([error, zero], axis=1).ravel(),
+            variances=np.stack([zero, bound**2], axis=1).ravel(),
+        )
+        entity = f"{plot}/{errors.estimator}"
+        canvas.send(entity, errors.time_ns[rows], columns.partition([2] * len(rows)))
+        names = [errors.estimator, f"{errors.estimator} band"]
+        colour = scene.colour(errors.estimator)
+        style = rr.Measurements.from_fields(
+            names=names, colors=[colour, (*colour, 150)], widths=[1.5, 0.0]
+        )
+        canvas.fix(entity, style)
+    # the most accurate estimator sets the range; one that drifts away leaves the picture
+    extent = nice(1.2 * max(float(min(extents)), np.finfo(float).tiny))
+    name = f"Error of {quantity} ({unit}), bands ±{SIGMAS:g} sigma"
+    return plot_view(plot, name, (-1.1 * extent, 1.1 * extent), legend=False)
+
+
+def draw_nees(
+    canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
+) -> list[rrb.TimeSeriesView]:
+    """NEES of each estimator with the bounds of a single run; one plot per number of components."""
+    found = [
+        Squares(len(errors.components), "", errors.estimator, errors.time_ns, errors.nees)
+        for errors in scene.errors_of(case)
+        if not errors.is_bound
+    ]
+    return _draw_squares(canvas, scene, case, "NEES", found, LINE, legend=legend)
+
+
+def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """NIS of each estimator, a point per measurement; one plot per set of measured components."""
+    found = []
+    for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
+        innovations = innovations_of(gather([stream]))
+        patterns, of_pattern = np.unique(np.isfinite(stream["innovation"]), axis=0, return_inverse=True)
+        degrees = patterns.sum(axis=1)
+        for number in np.flatnonzero(degrees > 0).tolist():
+            rows, own = of_pattern.ravel() == number, int(degrees[number])
+            is_named = len(stream.components) == patterns.shape[1]
+            alike = np.count_nonzero(degrees == own) > 1
+            of = ", ".join(compress(stream.components, patterns[number])) if is_named and alike else ""
+            squares = innovations.time_ns[rows], innovations.squared[rows]
+            found.append(Squares(own, of, estimator, *squares))
+    return _draw_squares(canvas, scene, case, "NIS", found, POINTS)
+
+
+def _draw_squares(
+    canvas: Canvas,
+    scene: Scene,
+    case: str,
+    name: str,
+    found: Sequence[Squares],
+    style: Style,
+    *,
+    legend: bool = True,
+) -> list[rrb.TimeSeriesView]:
+    """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
+    views = []
+    for degrees, of in sorted({(each.degrees, each.of) for each in found}):
+        plot = entity_path("plots", case, f"{name.lower()}_{degrees}{of and '_' + of.partition(',')[0]}")
+        low, high = chi_square_interval(degrees, 1)
+        alike = [each for each in found if (each.degrees, each.of) == (degrees, of)]
+        ends = [min(each.time_ns[0] for each in alike), max(each.time_ns[-1] for each in alike)]
+        band = rr.Measurements.columns(
+            values=[0.5 * (low + high)] * 2, variances=[0.25 * (high - low) ** 2] * 2
+        )
+        look = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
+        canvas.send(f"{plot}/bounds", np.array(ends), band)
+        canvas.fix(f"{plot}/bounds", look)
+        for _, _, estimator, time_ns, values in alike:
+            draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
+        title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
+        views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
+    return views
+
+
+def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """The probabilities of all modes, a plot for each estimator and for those given all data."""
+    views = []
+    for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
+        name = stream.topic.rpartition("/")[2]
+        plot = entity_path("plots", case, name, estimator)
+        curves = zip(stream.components, stream["probability"].T, cycle(PALETTE), strict=False)
+        for mode, probability, colour in curves:
+            draw_curve(canvas, plot, mode, colour, stream.publish_time_ns, probability, LINE)
+        views.append(
+            plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, 1.05))
+        )
+    return views
+
+
+def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """What share of each filter's particles is effective."""
+    plot, found = entity_path("plots", case, "effective"), False
+    for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
+        share, found = stream["effective"] / stream["particles"], True
+        draw_curve(canvas, plot, estimator, scene.colour(estimator), stream.publish_time_ns, share, LINE)
+    return [plot_view(plot, "Effective share of the particles", (-0.05, 1.05))] if found else []
+
+
+def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
+    """One plot per component of a case's Gaussian estimates: every estimator's mean, and the truth."""
+    found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
+    for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
+        found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
+    views: dict[str, rrb.TimeSeriesView] = {}
+    for name, colour, stream, values in found:
+        for column, component in enumerate(stream.components):
+            quantity, unit, scale = shown_unit(component)
+            plot = entity_path("plots", case, component)
+            shown = scale * values[:, column]
+            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
+            views[component] = plot_view(plot, f"{quantity.capitalize()} ({unit})")
+    return list(views.values())
+
+
+def draw_curve(
+    canvas: Canvas,
+    plot: str,
+    name: str,
+    colour: Colour,
+    time_ns: Times,
+    values: Floats,
+    style: Style,
+    most: int = DRAWN_ROWS,
+) -> None:
+    """One curve of a plot: values (n,) over time, at most so many of them, peaks kept."""
+    rows = thin_curve(time_ns, values, most)
+    canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
+    canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
+
+
+def plot_view(
+    entity: str, name: str, extent: tuple[float, float] | None = None, *, legend: bool = True
+) -> rrb.TimeSeriesView:
+    """A plot of everything below an entity, over the whole run."""
+    return rrb.TimeSeriesView(
+        origin=escaped(entity),
+        name=name,
+        axis_x=WHOLE_RUN,
+        axis_y=rrb.ScalarAxis(range=extent, zoom_lock=extent is not None),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+    )
+
+
+def shown_unit(component: str) -> tuple[str, str, float]:
+    """Quantity, the unit to show it in, and the factor to that unit: angles are shown in degrees."""
+    quantity, _, unit = component.rpartition("_")
+    if not quantity:
+        return component, "-", 1.0
+    shown, scale = _SHOWN.get(unit, (unit, 1.0))
+    return quantity.replace("_", " "), shown, scale
+
+
+_SHOWN = {
+    "rad": ("deg", 180 / np.pi),
+    "radps": ("deg/s", 180 / np.pi),
+    "mps": ("m/s", 1.0),
+    "mps2": ("m/s²", 1.0),
+}

@@ -1,0 +1,155 @@
+"""The timeline of score fusion: probes as they come, their scores, and wrong decisions so far."""
+
+from functools import partial
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from recorders.log import Stream, schemas
+from recorders.models.scores import TOPIC, matchers_of
+from replay.estimators.biometrics.biometrics import subsets_of
+from replay.judging.consistency.verification import Floats, Fused, fused_of
+from replay.timeline.drawing.canvas import (
+    PALETTE,
+    WRONG,
+    Canvas,
+    Scene,
+    Timeline,
+    Times,
+    draw_cases,
+    entity_path,
+    escaped,
+)
+from replay.timeline.drawing.plots import LINE, POINTS, plot_view
+
+GENUINE, IMPOSTOR = PALETTE[2], PALETTE[1]
+BINS = 60
+UPDATES = 50
+
+
+def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
+    """A board for every subset of matchers that was fused; without estimates, the matchers' scores."""
+    return draw_cases(scene, partial(_draw_case, canvas, scene))
+
+
+def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.View:
+    fusions = scene.outputs_of(case, schemas.SCORE_VECTOR)
+    rows = [_draw_fusion(canvas, case, *fusion) for fusion in fusions]
+    matched = _draw_matchers(canvas, scene, case)
+    boards: list[rrb.Container | rrb.View] = []
+    if rows:
+        boards = [rrb.Tabs(*rows, active_tab=len(rows) - 1), _draw_errors(canvas, scene, case)]
+    if matched:
+        boards.append(rrb.Horizontal(*matched))
+    return rrb.Vertical(*boards, name=case or "run")
+
+
+def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> rrb.Container:
+    """Genuine score and greatest impostor score of each probe, and how the scores so far are spread."""
+    fused, time_ns = fused_of(stream), stream.publish_time_ns
+    root = entity_path("fusion", case, estimator)
+    of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
+    _draw_probes(canvas, f"{root}/scores", fused, time_ns)
+    return rrb.Horizontal(
+        plot_view(f"{root}/scores", f"{of_probe} of each probe"),
+        _draw_distribution(canvas, f"{root}/distribution", fused, time_ns),
+        name=estimator,
+    )
+
+
+def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
+    """The share of wrong decisions so far of every fusion of a case."""
+    plot = entity_path("errors", case)
+    for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
+        wrong, time_ns = _errors_so_far(fused_of(stream)), stream.publish_time_ns
+        # a probe's comparisons share a stamp: the last one holds
+        last = np.flatnonzero(np.append(time_ns[1:] != time_ns[:-1], True))
+        canvas.send(f"{plot}/{estimator}", time_ns[last], rr.Scalars.columns(scalars=wrong[last]))
+        canvas.fix(f"{plot}/{estimator}", LINE(names=[estimator], colors=[scene.colour(estimator)]))
+    return plot_view(plot, "Wrong decisions so far (%)")
+
+
+def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> None:
+    for name, colour, chosen in (
+        ("impostor", IMPOSTOR, ~fused.genuine),
+        ("genuine", GENUINE, fused.genuine),
+    ):
+        rows = _greatest_of_each_time(time_ns[chosen], fused.score[chosen])
+        score = fused.score[chosen][rows]
+        canvas.send(f"{plot}/{name}", time_ns[chosen][rows], rr.Scalars.columns(scalars=score))
+        canvas.fix(f"{plot}/{name}", POINTS(names=[name], colors=[colour]))
+    if fused.threshold is not None:
+        ends = np.array([time_ns[0], time_ns[-1]])
+        level = rr.Scalars.columns(scalars=[fused.threshold] * 2)
+        canvas.send(f"{plot}/threshold", ends, level)
+        canvas.fix(f"{plot}/threshold", LINE(names=["threshold"], colors=[WRONG]))
+
+
+def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
+    """The row of the greatest score of each distinct time."""
+    order = np.lexsort((score, time_ns))
+    return order[np.append(time_ns[order][1:] != time_ns[order][:-1], True)]
+
+
+def _errors_so_far(fused: Fused) -> Floats:
+    """Per cent of the comparisons so far that were decided wrongly: the mean of both classes' rates.
+
+    A fusion without a threshold is judged half-way between the medians of genuine and impostor scores.
+    """
+    threshold = fused.threshold
+    if threshold is None:
+        medians = [np.median(fused.score[rows]) for rows in (fused.genuine, ~fused.genuine)]
+        threshold = float(np.mean(medians))
+    wrong = (fused.score > threshold) != fused.genuine
+    rates = []
+    for chosen in (fused.genuine, ~fused.genuine):
+        count = np.cumsum(chosen)
+        rates.append(np.cumsum(wrong & chosen) / np.maximum(count, 1))
+    return 50 * np.sum(rates, axis=0)
+
+
+def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
+    """Two histograms of the scores so far, each of sum 1; what is off the scale is in the end bars."""
+    low = np.quantile(fused.score[~fused.genuine], 0.001)
+    high = np.median(fused.score[fused.genuine])
+    edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
+    place = np.clip(np.searchsorted(edges, fused.score) - 1, 0, BINS - 1)
+    moments = np.unique(np.linspace(0, len(time_ns) - 1, UPDATES).astype(int))
+    for label, colour, chosen in (
+        ("impostor", IMPOSTOR, ~fused.genuine),
+        ("genuine", GENUINE, fused.genuine),
+    ):
+        counts = [
+            np.bincount(place[: moment + 1][chosen[: moment + 1]], minlength=BINS) for moment in moments
+        ]
+        shares = np.array([count / max(count.sum(), 1) for count in counts])
+        for moment, share in zip(moments, shares, strict=True):
+            chart = rr.BarChart.columns(
+                values=[share], abscissa=[0.5 * (edges[1:] + edges[:-1])], color=[(*colour, 150)]
+            )
+            canvas.send(f"{entity}/{label}", time_ns[[moment]], chart)
+    return rrb.BarChartView(
+        origin=escaped(entity), name="Scores so far", plot_legend=rrb.PlotLegend(visible=False)
+    )
+
+
+def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
+    """The scores that the case's matchers gave each probe."""
+    if TOPIC not in scene.source.topics:
+        return []
+    stream = scene.read(TOPIC)
+    matchers = matchers_of(stream.metadata)
+    views: list[rrb.View] = []
+    for index in subsets_of(matchers).get(case, range(len(matchers))):
+        plot = entity_path("matchers", case, matchers[index].name)
+        probe, gallery = (stream[name].astype(np.int64) for name in ("probe_id", "gallery_id"))
+        score = np.nan_to_num(stream["scores"][:, index])
+        _draw_probes(
+            canvas, plot, Fused(score, probe, gallery, None, None, False), stream.publish_time_ns
+        )
+        views.append(plot_view(plot, f"{matchers[index].name}: score of each probe"))
+    return views
+
+
+TIMELINE = Timeline(draw)

@@ -1,0 +1,51 @@
+"""The extended target's timeline: true and estimated rectangles, and the points that are seen."""
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from recorders.log import Stream, schemas
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import TRUTH, WRONG, Canvas, Scene, Timeline, beside
+from replay.timeline.drawing.events import above_events, draw_events
+from replay.timeline.drawing.plane import ROOT, Stroke, draw_dots, draw_outlines, plane_view, turn_up
+from replay.timeline.drawing.plots import draw_components, draw_quality
+
+TARGET = ("half_x_m", "half_y_m", "x_m", "y_m")
+CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+
+
+def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
+    """The plane beside sizes, errors and consistency."""
+    turn_up(canvas)
+    shown = [np.empty((0, 2))]
+    points = f"{ROOT}/points"
+    for stream in _seen(scene):
+        draw_dots(canvas, points, stream.publish_time_ns, stream["position_m"], Stroke(WRONG))
+        shown.append(stream["position_m"])
+    for stream in filter(_is_target, scene.truths_of("")):
+        _draw_target(canvas, "truth", stream, stream["state"], Stroke(TRUTH, 2.0))
+    for estimator, stream in scene.outputs_of("", schemas.GAUSSIAN_ESTIMATE):
+        if _is_target(stream):
+            _draw_target(canvas, estimator, stream, stream["mean"], Stroke(scene.colour(estimator)))
+    plane = plane_view(canvas, ROOT, [], [points], np.concatenate(shown))
+    board = above_events(plane, draw_events(canvas, scene, ""))
+    plots = [*draw_components(canvas, scene, "")[:2], *draw_quality(canvas, scene, "")]
+    return beside(board, plots, "")
+
+
+def _seen(scene: Scene) -> list[Stream]:
+    fixes = schemas.POSITION_FIX.full_name
+    topics = [topic.name for topic in scene.source.topics.values() if topic.schema_name == fixes]
+    return [scene.read(topic) for topic in topics]
+
+
+def _is_target(stream: Stream) -> bool:
+    return tuple(stream.components) == TARGET
+
+
+def _draw_target(canvas: Canvas, name: str, stream: Stream, states: Floats, stroke: Stroke) -> None:
+    outlines = states[:, None, 2:] + CORNERS * states[:, None, :2]
+    draw_outlines(canvas, f"{ROOT}/{name}", stream.publish_time_ns, outlines, stroke)
+
+
+TIMELINE = Timeline(draw)

@@ -1,0 +1,175 @@
+"""The robots' timeline: each robot on its map of landmarks, its errors, NEES, NIS and events."""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import rerun.blueprint as rrb
+
+from recorders.log import Stream, schemas
+from replay.engine.streams.measurements import PLANE, covariances_of
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import (
+    TRUTH,
+    WRONG,
+    Canvas,
+    Scene,
+    Timeline,
+    Times,
+    beside,
+    draw_cases,
+    entity_path,
+    thin,
+)
+from replay.timeline.drawing.events import above_events, draw_events
+from replay.timeline.drawing.plane import (
+    ROOT,
+    Stroke,
+    draw_clouds,
+    draw_ellipses,
+    draw_lines,
+    draw_path,
+    draw_points,
+    draw_poses,
+    extent_of,
+    plane_view,
+    turn_up,
+)
+from replay.timeline.drawing.plots import draw_quality
+from replay.timeline.families.sets import draw_sets
+
+HEADING = "heading_rad"
+# An arrow is so long, as a share of the scene.
+ARROW_SHARE = 0.04
+SIGHTINGS = tuple(each.full_name for each in (schemas.RANGE_BEARING, schemas.RANGE, schemas.BEARING))
+SEEN = (170, 170, 90, 140)
+GATED = (*WRONG, 255)
+# A pose is too old to look from after so long.
+FRESH_NS = 500_000_000
+
+
+class Track(NamedTuple):
+    """Poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
+
+    A heading that is not stated is NaN.
+    """
+
+    name: str
+    stroke: Stroke
+    time_ns: Times
+    poses: Floats
+    covariances: Floats | None
+
+
+def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
+    """A map and plots for each robot."""
+    landmarks = landmarks_of(scene)
+    turn_up(canvas)
+    draw_points(canvas, f"{ROOT}/landmarks", landmarks.index.to_numpy(), landmarks.to_numpy())
+    return draw_cases(scene, partial(_draw_robot, canvas, scene, landmarks))
+
+
+def landmarks_of(scene: Scene) -> pd.DataFrame:
+    """Places (n, 2) by number; none where the log has no map, as that of estimates."""
+    if "/landmarks" not in scene.source.topics:
+        return pd.DataFrame(np.empty((0, 2)), index=np.empty(0, np.int64))
+    stream = scene.read("/landmarks")
+    places = stream["position_m"].reshape(len(stream), -1)[:, :2]
+    numbered = pd.DataFrame(places, index=stream["landmark_id"].astype(np.int64))
+    return numbered[~numbered.index.duplicated()]
+
+
+def _draw_robot(
+    canvas: Canvas, scene: Scene, landmarks: pd.DataFrame, robot: str
+) -> rrb.Container | rrb.View:
+    root = entity_path(ROOT, robot)
+    tracks = tracks_of(scene, robot)
+    shown = np.concatenate([landmarks.to_numpy(), *(each.poses[:, :2] for each in tracks[:1])])
+    paths = [draw_track(canvas, root, track, extent_of(shown)) for track in tracks]
+    draw_clouds(canvas, scene, robot, root)
+    draw_sights(canvas, scene, robot, tracks, landmarks)
+    _, areas = draw_sets(canvas, scene, robot, root)
+    plane = plane_view(canvas, root, [f"{ROOT}/landmarks"], paths, shown)
+    board = above_events(plane, draw_events(canvas, scene, robot))
+    return beside(board, [*draw_quality(canvas, scene, robot), *areas], robot)
+
+
+def tracks_of(scene: Scene, robot: str) -> list[Track]:
+    """The truth and every estimate that says where the robot is, thinned to what is drawn."""
+    found = [("truth", Stroke(TRUTH, 2.0), each, each["state"]) for each in scene.truths_of(robot)]
+    for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
+        found.append((estimator, Stroke(scene.colour(estimator)), stream, stream["mean"]))
+    tracks = [_track(*each) for each in found if set(PLANE) <= set(each[2].components)]
+    return [track for track in tracks if len(track.time_ns)]
+
+
+def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
+    rows = thin(stream.publish_time_ns)
+    columns = [stream.components.index(component) for component in PLANE]
+    rows = rows[np.isfinite(states[rows][:, columns]).all(axis=1)]
+    poses = np.full((len(rows), 3), np.nan)
+    poses[:, :2] = states[rows][:, columns]
+    if HEADING in stream.components:
+        poses[:, 2] = states[rows, stream.components.index(HEADING)]
+    covariances = None
+    if "covariance" in stream.columns:
+        covariances = covariances_of(stream.take(rows), PLANE)
+    return Track(name, stroke, stream.publish_time_ns[rows], poses, covariances)
+
+
+def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
+    """Path, arrows and ellipses of a robot in a scene so wide; the entity of the path."""
+    entity = f"{root}/{track.name}"
+    draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
+    if np.isfinite(track.poses).all():
+        length_m = ARROW_SHARE * extent_m
+        draw_poses(canvas, f"{entity}/pose", track.time_ns, track.poses, track.stroke, length_m)
+    if track.covariances is not None:
+        outline = (track.time_ns, track.poses[:, :2], track.covariances, track.stroke)
+        draw_ellipses(canvas, f"{entity}/ellipse", *outline)
+    return f"{entity}/path"
+
+
+def draw_sights(
+    canvas: Canvas, scene: Scene, robot: str, tracks: list[Track], landmarks: pd.DataFrame
+) -> None:
+    """Lines from the robot to the landmarks it sees; one that an estimator's gate kept out is red."""
+    sensors = [
+        scene.read(topic)
+        for topic in scene.topics_near(robot)
+        if scene.source.topics[topic].schema_name in SIGHTINGS
+    ]
+    seen = _pairs([each.take(np.isin(each["target_id"], landmarks.index)) for each in sensors])
+    judged = [stream for _, stream in scene.outputs_of(robot, schemas.INNOVATION)]
+    gated = seen.isin(_pairs([each.take(each["accepted"] == 0) for each in judged]))
+    time_ns = seen.get_level_values(0).to_numpy()
+    ends = landmarks.loc[seen.get_level_values(1)].to_numpy()
+    lines = np.stack([_places_at(tracks, time_ns), ends], axis=1)
+    known = np.isfinite(lines).all(axis=(1, 2))
+    colours = np.where(gated[:, None], GATED, SEEN).astype(np.uint8)
+    draw_lines(canvas, entity_path(ROOT, robot, "sights"), time_ns[known], lines[known], colours[known])
+
+
+def _pairs(streams: list[Stream]) -> pd.MultiIndex:
+    """The distinct (time, target) of some streams, sorted."""
+    times = [stream.publish_time_ns for stream in streams]
+    targets = [stream["target_id"].astype(np.int64) for stream in streams]
+    none = [np.empty(0, np.int64)]
+    pairs = [np.concatenate(times or none), np.concatenate(targets or none)]
+    return pd.MultiIndex.from_arrays(pairs).unique().sort_values()
+
+
+def _places_at(tracks: list[Track], time_ns: Times) -> Floats:
+    """Where the robot was (n, 2): by the truth, where that has none by the first estimate that has."""
+    places = np.full((len(time_ns), 2), np.nan)
+    for track in tracks:
+        row = np.searchsorted(track.time_ns, time_ns, side="right") - 1
+        fresh = (row >= 0) & (time_ns - track.time_ns[row] <= FRESH_NS) & np.isnan(places[:, 0])
+        for axis in range(2):
+            between = np.interp(time_ns[fresh], track.time_ns, track.poses[:, axis])
+            places[fresh, axis] = between
+    return places
+
+
+TIMELINE = Timeline(draw)
