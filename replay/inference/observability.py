@@ -231,8 +231,8 @@ class Observability(IteratedSmoother):
         t, (loop, steps) = stage.model.tangent, _summing(stage)
         ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
         ends[offsets[1:][np.diff(offsets) > 0] - 1] = True
-        happenings = way.happenings
-        happenings = happenings._replace(is_due=happenings.is_due & ends[way.node])
+        events = way.events
+        events = events._replace(wants_estimate=events.wants_estimate & ends[way.node])
         due = np.append(0, np.cumsum(ends))[offsets]
         one = np.arange(runs + 1)
         _, innovations = no_results(due, one, stage.model, len(slots_of(stage.sensors)))
@@ -251,7 +251,7 @@ class Observability(IteratedSmoother):
         def memory() -> Any:
             return steps.memory((Along(way.states.mean, way.node, np.empty((1, t))),))
 
-        loop(runs, happenings, settings, self.gates, carried, found, innovations, scratch=memory)
+        loop(runs, events, settings, self.gates, carried, found, innovations, scratch=memory)
         return filled(found, due)
 
 

@@ -193,7 +193,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
     stage, associate = tracker.stage, ASSOCIATIONS[tracker.association]
-    advance, weigh, take_in = advancing(tracker), weighing(tracker), taking_in(tracker)
+    advance, weigh, process = advancing(tracker), weighing(tracker), processing(tracker)
     end_tracks, begin_tracks = ending(tracker), beginning(tracker)
     tell_pairs, tell_tracks = telling_pairs(tracker.sizes[0]), telling_tracks(stage)
 
@@ -223,7 +223,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
                 for place in range(used):
                     memory.left[detection] -= memory.probability[place, 1 + detection]
             tell_pairs(run, scan, count, tracks, told, memory)
-            take_in(run, scan, count, scans, tracks, p, memory)
+            process(run, scan, count, scans, tracks, p, memory)
             end_tracks(run, tracks, p)
             told.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
             tell_tracks(run, scan, tracks, told, memory)
@@ -310,8 +310,8 @@ def weighing(tracker: Tracker) -> Function:
     return weigh
 
 
-def taking_in(tracker: Tracker) -> Function:
-    """`take_in(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
+def processing(tracker: Tracker) -> Function:
+    """`process(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
@@ -330,7 +330,7 @@ def taking_in(tracker: Tracker) -> Function:
             tracks.mode[run, place, mode] = after
             tracks.log_mode[run, place, mode] = np.log(after) if after > 0.0 else -np.inf
 
-    def take_in(
+    def process(
         run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
     ) -> None:
         """Update all tracks by the associations, and what is known of their targets' existence."""
@@ -351,7 +351,7 @@ def taking_in(tracker: Tracker) -> Function:
         if shared > 0:
             pool_errors(run, shared_at, tracks, memory.pool)
 
-    return take_in
+    return process
 
 
 def ending(tracker: Tracker) -> Function:

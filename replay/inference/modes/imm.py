@@ -52,7 +52,7 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 
 TINY = 1e-280  # below it a probability loses digits
 LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
@@ -594,9 +594,9 @@ class Interacting(Mixing):
             return "smoothed modes use what came later in any case (smoothed_modes)"
         return super().cannot_rewind
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Filter events."""
-        after, made = super().follow(state, happenings)
+        after, made = super().follow(state, events)
         if self.parameters.smoothed_modes:
             after = after._replace(kept=(*state.kept, made[1]))
         return after, made

@@ -35,9 +35,9 @@ from replay.inference.particles.particles import (
     summing_up,
 )
 from replay.inference.particles.update import weighing
-from replay.inference.run.events import joined, of_rows
+from replay.inference.run.events import join_events, select_events
 from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 
 MOST_PARTICLES = 1_000_000
 
@@ -125,21 +125,21 @@ class ParticleFilter(Filter):
         """See `Filter.cannot_rewind`."""
         return "all particles would have to be kept for every message of the window"
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Filter events of the runs in which something was measured; those of the others wait."""
         if state.kept is not None:
-            happenings = joined(state.kept, happenings)
-        sensed = np.flatnonzero(happenings.source >= 0)
-        place = np.searchsorted(sensed, happenings.offsets)
+            events = join_events(state.kept, events)
+        sensed = np.flatnonzero(events.source >= 0)
+        place = np.searchsorted(sensed, events.offsets)
         is_new = (place[1:] > place[:-1]) & (state.carried.belief.counter == 0)
         first = {run: sensed[place[run]] for run in np.flatnonzero(is_new).tolist()}
-        columns = happenings.time_ns, happenings.source, happenings.data
+        columns = events.time_ns, events.source, events.data
         after = self.begun(state, {run: [each[at] for each in columns] for run, at in first.items()})
-        is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(happenings.offsets))
-        waiting = None if is_ready.all() else of_rows(happenings, ~is_ready)
-        ready = happenings if is_ready.all() else of_rows(happenings, is_ready)
+        is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(events.offsets))
+        waiting = None if is_ready.all() else select_events(events, ~is_ready)
+        ready = events if is_ready.all() else select_events(events, is_ready)
         after, made = super().follow(after._replace(kept=waiting), ready)
-        return after, [*made, *self.cautions(happenings.time_ns, first, len(place) - 1)]
+        return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
         """On the topic `started` of runs that begin at these rows: which parameters cannot change."""

@@ -20,7 +20,7 @@ from replay.inference.model.model import Control, Map, Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import CONTROL, NOTHING, Happenings
+from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 
 EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
 
@@ -55,7 +55,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
-class World(NamedTuple):
+class Context(NamedTuple):
     """What messages are read against: the points of every map by its topic, and the plane's origins.
 
     The origins (runs, 3) are latitude, longitude and altitude; None where no fix needs them.
@@ -76,11 +76,11 @@ def data_columns(stage: Stage) -> tuple[int, int]:
     return max(width, start + stage.model.controls), start
 
 
-def happenings_of(
-    stage: Stage, found: Found, block: Block, world: World, settings: Floats
-) -> tuple[Happenings, Booleans]:
+def filter_events(
+    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+) -> tuple[FilterEvents, Booleans]:
     """A block's messages as the recursion takes them, and which of them lack their covariance."""
-    events, control = block.events, stage.model.control
+    merged, control = block.events, stage.model.control
     width, start = data_columns(stage)
     uses: list[tuple[str, Table]] = []
     if control is not None and found.control is not None:
@@ -93,36 +93,36 @@ def happenings_of(
             uses.append((topic.name, _control_table(each, block.streams[topic.name], width, columns)))
     for number, (_, topic) in enumerate(found.sensors):
         ragged = block.streams[topic.name]
-        uses.append((topic.name, sensor_table(stage, number, ragged, world, settings)))
+        uses.append((topic.name, sensor_table(stage, number, ragged, context, settings)))
     tables = dict(reversed(uses))  # the first use of every topic
-    data, source, target, lacking = (
-        column[0] if len(column) == 1 else np.concatenate(column)[events.source]
+    data, source, target, without_covariance = (
+        column[0] if len(column) == 1 else np.concatenate(column)[merged.source]
         for column in zip(*(tables[name] for name in block.streams), strict=True)
     )
-    came = np.empty((len(source), 0), np.int64) if block.came is None else block.came
-    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target, came)
-    again = [_again(happenings, block, name, table) for name, table in uses if table is not tables[name]]
-    if lacking.any():  # as if these had not come
-        chosen = ~lacking
+    arrival = np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival
+    events = FilterEvents(merged.offsets, merged.time_ns, source, data, merged.is_last, target, arrival)
+    again = [_again(events, block, name, table) for name, table in uses if table is not tables[name]]
+    if without_covariance.any():  # as if these had not come
+        chosen = ~without_covariance
         after = np.cumsum(chosen)
         again = [(after[places] - 1, others) for places, others in again]
-        happenings = of_rows(happenings, chosen)
+        events = select_events(events, chosen)
     if again:
-        happenings = _inserted(happenings, again)
-    if lacking.any() or again:
-        happenings = happenings._replace(is_due=last_of_stamps(happenings))
-    return happenings._replace(is_due=_wanted(stage, happenings)), lacking
+        events = _inserted(events, again)
+    if without_covariance.any() or again:
+        events = events._replace(wants_estimate=last_of_stamps(events))
+    return events._replace(wants_estimate=_wanted(stage, events)), without_covariance
 
 
-def _wanted(stage: Stage, happenings: Happenings) -> Booleans:
+def _wanted(stage: Stage, events: FilterEvents) -> Booleans:
     """Which of the last events of their stamps want an estimate: not where the control's are all."""
     control = stage.model.control
     if control is None or control.estimates or not stage.sensors:
-        return happenings.is_due
-    stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
+        return events.wants_estimate
+    stamp: Integers = np.cumsum(events.wants_estimate) - events.wants_estimate
     sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-    sensed[stamp[happenings.source != CONTROL]] = True
-    return happenings.is_due & sensed[stamp]
+    sensed[stamp[events.source != CONTROL]] = True
+    return events.wants_estimate & sensed[stamp]
 
 
 def delays_of(stage: Stage, settings: Floats) -> Integers:
@@ -137,31 +137,31 @@ def delays_of(stage: Stage, settings: Floats) -> Integers:
     return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
 
 
-def as_measured(
-    stage: Stage, happenings: Happenings, delays_ns: Integers, *, is_end: bool
-) -> tuple[Happenings, Happenings]:
+def compensate_delays(
+    stage: Stage, events: FilterEvents, delays_ns: Integers, *, is_end: bool
+) -> tuple[FilterEvents, FilterEvents]:
     """Events at the times at which they were measured, in order; and those still to wait.
 
     What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
     something older may come.
     """
-    runs = len(happenings.offsets) - 1
-    run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
-    time_ns = happenings.time_ns - delays_ns[happenings.source]
-    last_ns = np.append(happenings.time_ns, 0)[happenings.offsets[1:] - 1]
+    runs = len(events.offsets) - 1
+    run = np.repeat(np.arange(runs), np.diff(events.offsets))
+    time_ns = events.time_ns - delays_ns[events.source]
+    last_ns = np.append(events.time_ns, 0)[events.offsets[1:] - 1]
     settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
-    waiting = of_rows(happenings, ~settled)
-    measured = of_rows(happenings._replace(time_ns=time_ns), settled)
+    waiting = select_events(events, ~settled)
+    measured = select_events(events._replace(time_ns=time_ns), settled)
     order = np.lexsort((measured.time_ns, run[settled]))
     columns: Any = (column[order] for column in measured[1:])
-    measured = Happenings(measured.offsets, *columns)
-    measured = measured._replace(is_due=last_of_stamps(measured))
-    return measured._replace(is_due=_wanted(stage, measured)), waiting
+    measured = FilterEvents(measured.offsets, *columns)
+    measured = measured._replace(wants_estimate=last_of_stamps(measured))
+    return measured._replace(wants_estimate=_wanted(stage, measured)), waiting
 
 
-def last_of_stamps(happenings: Happenings) -> Booleans:
+def last_of_stamps(events: FilterEvents) -> Booleans:
     """Whether the next event of the run has another stamp, or was taken at another time."""
-    return last_of_equals(happenings.offsets, happenings.time_ns, *happenings.came.T[:1])
+    return last_of_equals(events.offsets, events.time_ns, *events.arrival.T[:1])
 
 
 class Table(NamedTuple):
@@ -170,10 +170,10 @@ class Table(NamedTuple):
     data: Floats
     source: Integers
     target_id: Integers
-    is_lacking: Booleans
+    lacks_covariance: Booleans
 
 
-def _again(happenings: Happenings, block: Block, name: str, table: Table) -> tuple[Integers, Happenings]:
+def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
     """The messages of a topic as what another sensor measures by them, and their places among all.
 
     One of which nothing is measured does not come again.
@@ -182,19 +182,19 @@ def _again(happenings: Happenings, block: Block, name: str, table: Table) -> tup
     begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
     of_topic = block.events.topic == before
     row = np.where(of_topic, block.events.source - begin, 0)
-    measures = ~np.isnan(table.data).all(axis=1) & ~table.is_lacking
+    measures = ~np.isnan(table.data).all(axis=1) & ~table.lacks_covariance
     chosen = of_topic & measures[row]
     data, source, target, _ = (column[row[chosen]] for column in table)
-    again = of_rows(happenings, chosen)._replace(data=data, source=source, target_id=target)
+    again = select_events(events, chosen)._replace(data=data, source=source, target_id=target)
     return np.flatnonzero(chosen), again
 
 
-def _inserted(happenings: Happenings, again: Sequence[tuple[Integers, Happenings]]) -> Happenings:
+def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents]]) -> FilterEvents:
     """Events with others after those at whose places they are."""
     places, others = zip(*again, strict=True)
-    order = np.argsort(np.concatenate([np.arange(len(happenings.time_ns)), *places]), kind="stable")
-    offsets, *columns = zip(happenings, *others, strict=True)
-    return Happenings(sum(offsets), *(np.concatenate(column)[order] for column in columns))
+    order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
+    offsets, *columns = zip(events, *others, strict=True)
+    return FilterEvents(sum(offsets), *(np.concatenate(column)[order] for column in columns))
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
@@ -205,13 +205,13 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    lacking = np.zeros(count, bool)
+    without_covariance = np.zeros(count, bool)
     if control.interpolated:  # one that is not finite is as if it had not come
-        lacking |= ~np.isfinite(read).all(axis=1)
-    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), lacking)
+        without_covariance |= ~np.isfinite(read).all(axis=1)
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), without_covariance)
 
 
-def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settings: Floats) -> Table:
+def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
     """The messages of sensor `number`: measured, what it is about, its covariance; see `steps.reading`.
 
     A message that lacks its covariance, or of which all is NaN, is as if it had not come.
@@ -220,18 +220,21 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
     m = len(sensor.measured)
     if ragged.stream.schema.full_name == GEODETIC:
-        assert world.origins is not None
-        ragged = in_plane(ragged, world.origins)
+        assert context.origins is not None
+        ragged = in_plane(ragged, context.origins)
     stream = ragged.stream
     source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
-    lacking = np.zeros(len(stream), bool)
+    without_covariance = np.zeros(len(stream), bool)
     parts = []
     if sensor.covariance:
-        value, spread, lacking = _with_covariance(sensor, ragged)
+        value, spread, without_covariance = _with_covariance(sensor, ragged)
         variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
         if np.isfinite(variances).all():
-            spread[lacking], lacking = np.diag(variances), np.zeros(len(stream), bool)
-        lacking = lacking | np.isnan(value).all(axis=1)
+            spread[without_covariance], without_covariance = (
+                np.diag(variances),
+                np.zeros(len(stream), bool),
+            )
+        without_covariance = without_covariance | np.isnan(value).all(axis=1)
         parts = [value, spread[:, *np.tril_indices(m)]]
     elif sensor.read:
         parts = [_computed(sensor.read, ragged, m)]
@@ -244,22 +247,22 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
         target = stream[sensor.maps[0].of].astype(np.int64)
         run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
     for each in sensor.maps:
-        places = world.points[each.topic]
+        places = context.points[each.topic]
         rows = places.rows(run, stream[each.of].astype(np.int64))
         source[rows < 0] = NOTHING
         about.append(places.at(rows))
-    if sensor.control is not None:  # see `with_control`
+    if sensor.control is not None:  # see `fill_control`
         about.append(np.full((len(stream), len(sensor.control.components)), np.nan))
     about += [_field(stream, name, size) for name, size in sensor.fields.items()]
     if sensor.is_numbered:
         about.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
     parts[1:1] = about
-    source[lacking] = NOTHING
+    source[without_covariance] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
         parts.append(np.full((len(stream), width - filled), np.nan))
     data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-    return Table(np.ascontiguousarray(data), source, target, lacking)
+    return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
 def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
@@ -302,15 +305,17 @@ def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) ->
     return numbers
 
 
-def times_alone(offsets: Integers, time_ns: Integers, width: int, *, is_due: bool) -> Happenings:
+def output_times(
+    offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
+) -> FilterEvents:
     """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
-    about, came = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
-    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), about, came)
+    about, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
+    return FilterEvents(offsets, time_ns, *nothing, np.full(count, wants_estimate), about, arrival)
 
 
-def joined(first: Happenings, second: Happenings) -> Happenings:
+def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
     """The events of both in time, run by run; at equal stamps those of the first go first."""
     first, second = _came_alike(first, second), _came_alike(second, first)
     runs = len(first.offsets) - 1
@@ -319,103 +324,103 @@ def joined(first: Happenings, second: Happenings) -> Happenings:
     columns: Any = (
         np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
     )
-    return Happenings(first.offsets + second.offsets, *columns)
+    return FilterEvents(first.offsets + second.offsets, *columns)
 
 
-def _came_alike(happenings: Happenings, other: Happenings) -> Happenings:
+def _came_alike(events: FilterEvents, other: FilterEvents) -> FilterEvents:
     """Events that say when they came if others do: times alone come at their stamps."""
-    if happenings.came.shape[1] >= other.came.shape[1]:
-        return happenings
-    time_ns = happenings.time_ns
-    return happenings._replace(came=np.stack([time_ns, np.full(len(time_ns), -1)], axis=1))
+    if events.arrival.shape[1] >= other.arrival.shape[1]:
+        return events
+    time_ns = events.time_ns
+    return events._replace(arrival=np.stack([time_ns, np.full(len(time_ns), -1)], axis=1))
 
 
-def of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
+def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
     """Some of the events."""
-    columns: Any = (column[chosen] for column in happenings[1:])
-    return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
+    columns: Any = (column[chosen] for column in events[1:])
+    return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
 
 
-def interpolated(
-    happenings: Happenings, controls: int, gap_ns: float = np.inf
-) -> tuple[Happenings, Happenings]:
+def interpolate_control(
+    events: FilterEvents, controls: int, gap_ns: float = np.inf
+) -> tuple[FilterEvents, FilterEvents]:
     """Events with the control at their stamps, linear between messages; and those still to wait.
 
     What comes after a run's last control message waits for the next, with that message before it. From
     one message that comes more than a gap before the next, up to that, the control is NaN.
     """
-    data, is_control = happenings.data.copy(), happenings.source == CONTROL
+    data, is_control = events.data.copy(), events.source == CONTROL
     ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
     columns = range(data.shape[1] - controls, data.shape[1])
-    for begin, end in pairwise(happenings.offsets):
+    for begin, end in pairwise(events.offsets):
         at = begin + np.flatnonzero(is_control[begin:end])
         if not len(at):
             continue
         inside = slice(begin, at[-1] + 1)
-        times_ns, wanted_ns = (
-            happenings.time_ns[rows] - happenings.time_ns[begin] for rows in (at, inside)
-        )
+        times_ns, wanted_ns = (events.time_ns[rows] - events.time_ns[begin] for rows in (at, inside))
         for column in columns:
             data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
         for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
             data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
         ready[inside], waiting[begin : at[-1]] = True, False
-    again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
-    return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
+    again = events._replace(wants_estimate=events.wants_estimate & ~ready)  # one estimate is enough
+    return select_events(events._replace(data=data), ready), select_events(again, waiting)
 
 
-def with_control(stage: Stage, happenings: Happenings) -> Happenings:
+def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
     """Events whose control is known, with its numbers where sensors read them."""
-    data = happenings.data.copy()
+    data = events.data.copy()
     for number, sensor in enumerate(stage.sensors):
         if sensor.control is not None:
-            rows, controls = happenings.source == number, len(sensor.control.components)
+            rows, controls = events.source == number, len(sensor.control.components)
             begin = len(sensor.measured) + sensor.control_start
             data[rows, begin : begin + controls] = data[rows, -controls:]
-    return happenings._replace(data=data)
+    return events._replace(data=data)
 
 
-def held(happenings: Happenings, initial: Sequence[float], gap_ns: float = np.inf) -> Happenings:
+def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
     """Events that wait for a control message that does not come: the last one holds, for up to a gap.
 
     `initial` holds in a run in which there was none.
     """
-    data = happenings.data.copy()
-    for begin, end in pairwise(happenings.offsets):
+    data = events.data.copy()
+    for begin, end in pairwise(events.offsets):
         if begin < end:
-            is_control = happenings.source[begin] == CONTROL
+            is_control = events.source[begin] == CONTROL
             control = data[begin, -len(initial) :].copy() if is_control else initial
             data[begin:end, -len(initial) :] = control
-            late = happenings.time_ns[begin:end] - happenings.time_ns[begin] > gap_ns
+            late = events.time_ns[begin:end] - events.time_ns[begin] > gap_ns
             data[begin:end][late & is_control, -len(initial) :] = np.nan
-    return happenings._replace(data=data)
+    return events._replace(data=data)
 
 
-def with_ticks(
-    happenings: Happenings, start_ns: Integers, tick: Integers, every_ns: int
-) -> tuple[Happenings, Integers]:
+def add_output_times(
+    events: FilterEvents, start_ns: Integers, next_output: Integers, every_ns: int
+) -> tuple[FilterEvents, Integers]:
     """Events, and between them one every so often, at which an estimate is wanted.
 
     From the prior on, or, where that is more than EARLY such times before the run's first event, from
     there on.
     """
-    times, runs, ticks = [], [], tick.copy()
-    for number, (begin, end) in enumerate(pairwise(happenings.offsets)):
+    times, runs, next_outputs = [], [], next_output.copy()
+    for number, (begin, end) in enumerate(pairwise(events.offsets)):
         if begin == end:
             continue
-        first_ns, last_ns = happenings.time_ns[begin], happenings.time_ns[end - 1]
-        is_old = tick[number] == 0 and first_ns - start_ns[number] > EARLY * every_ns
+        first_ns, last_ns = events.time_ns[begin], events.time_ns[end - 1]
+        is_old = next_output[number] == 0 and first_ns - start_ns[number] > EARLY * every_ns
         begins_ns = int(first_ns if is_old else start_ns[number])
-        first = max(int(tick[number]), -(-begins_ns // every_ns))
+        first = max(int(next_output[number]), -(-begins_ns // every_ns))
         stop = max(int(last_ns) // every_ns + 1, first)
         wanted = np.arange(first, stop) * every_ns
-        own = happenings.time_ns[begin:end][happenings.is_due[begin:end]]
+        own = events.time_ns[begin:end][events.wants_estimate[begin:end]]
         wanted = wanted[~np.isin(wanted, own)]
-        ticks[number] = stop
+        next_outputs[number] = stop
         times.append(wanted)
         runs.append(np.full(len(wanted), number))
     if not times:
-        return happenings, ticks
-    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(happenings.offsets)))
-    width = happenings.data.shape[1]
-    return joined(happenings, times_alone(offsets, np.concatenate(times), width, is_due=True)), ticks
+        return events, next_outputs
+    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(events.offsets)))
+    width = events.data.shape[1]
+    return join_events(
+        events, output_times(offsets, np.concatenate(times), width, wants_estimate=True)
+    ), next_outputs

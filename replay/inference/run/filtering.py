@@ -24,25 +24,25 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.events import (
-    World,
-    as_measured,
+    Context,
+    add_output_times,
+    compensate_delays,
     data_columns,
     delays_of,
-    happenings_of,
-    held,
-    interpolated,
-    joined,
-    of_rows,
+    fill_control,
+    filter_events,
+    hold_control,
+    interpolate_control,
+    join_events,
+    output_times,
     points_of,
-    times_alone,
-    with_control,
-    with_ticks,
+    select_events,
 )
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
     Carried,
     Estimates,
-    Happenings,
+    FilterEvents,
     Innovations,
     filled,
     no_results,
@@ -57,20 +57,20 @@ class State(NamedTuple):
 
     Attributes:
         carried: see `recursion.Carried`.
-        world: what messages are read against.
+        context: what messages are read against.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         unsettled: events that wait for others which were measured before them and come later.
         kept: what a smoother keeps for its way back, or a filter for late messages.
-        tick: (runs,) the number of the next extra estimate.
+        next_output: (runs,) the number of the next extra estimate.
     """
 
     carried: Carried
-    world: World
+    context: Context
     generators: tuple[Any, ...]
-    waiting: Happenings | None
-    tick: Integers
-    unsettled: Happenings | None = None
+    waiting: FilterEvents | None
+    next_output: Integers
+    unsettled: FilterEvents | None = None
     kept: Any = None
 
 
@@ -137,52 +137,52 @@ class Filter:
         waiting = None
         if model.control is not None and model.control.interpolated:  # what drives from there on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
-            waiting = times_alone(runs, time_ns.copy(), width, is_due=False)
-        world = World(points, self.origins(whole, len(mean)))
-        return State(carried, world, (), waiting, np.zeros(len(mean), np.int64))
+            waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
+        context = Context(points, self.origins(whole, len(mean)))
+        return State(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
     def origins(self, whole: Mapping[str, Ragged], runs: int) -> Floats | None:
-        """The origins of the planes (runs, 3), see `World`: as stated, else the first fixes."""
+        """The origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(whole[topic.name]) for topic in self.found.geodetic), None)
 
     def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
         """Filter a block."""
-        happenings, lacking = happenings_of(self.stage, self.found, block, state.world, self.settings)
-        passed_over = self.passed_over(block, lacking)
-        after, made = self.through(state, happenings, is_end=False)
+        events, without_covariance = filter_events(
+            self.stage, self.found, block, state.context, self.settings
+        )
+        passed_over = self.passed_over(block, without_covariance)
+        after, made = self.through(state, events, is_end=False)
         return after, [*made, *passed_over]
 
-    def through(
-        self, state: State, happenings: Happenings, *, is_end: bool
-    ) -> tuple[State, list[Ragged]]:
+    def through(self, state: State, events: FilterEvents, *, is_end: bool) -> tuple[State, list[Ragged]]:
         """Filter the events that need not wait for others."""
-        tick, waiting, unsettled = state.tick, None, None
+        next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
-                happenings = joined(state.unsettled, happenings)
+                events = join_events(state.unsettled, events)
             delays = self.delays_ns
-            happenings, unsettled = as_measured(self.stage, happenings, delays, is_end=is_end)
+            events, unsettled = compensate_delays(self.stage, events, delays, is_end=is_end)
         if self.parameters.every_s is not None:
             every_ns = round(self.parameters.every_s * 1e9)
-            happenings, tick = with_ticks(happenings, state.carried.time_ns, tick, every_ns)
+            events, next_output = add_output_times(events, state.carried.time_ns, next_output, every_ns)
         if state.waiting is not None:
-            happenings = joined(state.waiting, happenings)
+            events = join_events(state.waiting, events)
         control = self.stage.model.control
         if control is not None and control.interpolated:
-            happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
-            happenings = with_control(self.stage, happenings)
-        state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
-        state, made = self.follow(state, happenings)
-        return state, [*made, *self.not_driven(happenings)]
+            events, waiting = interpolate_control(events, len(control.components), self.gap_ns)
+            events = fill_control(self.stage, events)
+        state = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
+        state, made = self.follow(state, events)
+        return state, [*made, *self.not_driven(events)]
 
-    def not_driven(self, happenings: Happenings) -> list[Ragged]:
+    def not_driven(self, events: FilterEvents) -> list[Ragged]:
         """What was not used since it was measured in a gap of the control, where that may have some."""
         control = self.stage.model.control
         if control is None or not control.gap or not _steps(self.stage, self.method).resumes:
             return []
-        lost = (happenings.source >= 0) & np.isnan(happenings.data[:, -1])
+        lost = (events.source >= 0) & np.isnan(events.data[:, -1])
         reasons = [
             f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
             f"{control.gap}"
@@ -191,13 +191,13 @@ class Filter:
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
             schemas.SKIPPED,
-            happenings.time_ns[lost],
-            happenings.source[lost],
+            events.time_ns[lost],
+            events.source[lost],
             reasons,
         )
-        return [Ragged(stream, ragged_rows(lost, happenings.offsets))]
+        return [Ragged(stream, ragged_rows(lost, events.offsets))]
 
-    def passed_over(self, block: Block, lacking: Booleans) -> list[Ragged]:
+    def passed_over(self, block: Block, without_covariance: Booleans) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""
         control = self.stage.model.control
         drops_controls = control is not None and control.interpolated
@@ -210,15 +210,15 @@ class Filter:
             else f"topic {topic}: it is not finite"
             for topic in block.streams
         ]
-        events = block.events
+        merged = block.events
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
             schemas.SKIPPED,
-            events.time_ns[lacking],
-            events.topic[lacking],
+            merged.time_ns[without_covariance],
+            merged.topic[without_covariance],
             reasons,
         )
-        return [Ragged(stream, ragged_rows(lacking, events.offsets))]
+        return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]
 
     def finish(self, state: State) -> list[Ragged]:
         """What still waits for messages that do not come any more."""
@@ -228,11 +228,11 @@ class Filter:
         """The state after what waits for messages that do not come any more, and its outputs."""
         made: list[Ragged] = []
         if state.unsettled is not None:
-            no_more = of_rows(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
+            no_more = select_events(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
             state, made = self.through(state, no_more, is_end=True)
         if state.waiting is None:
             return state, made
-        tail = with_control(self.stage, held(state.waiting, self.initial, self.gap_ns))
+        tail = fill_control(self.stage, hold_control(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
 
@@ -270,22 +270,22 @@ class Filter:
             return "its samples are random, so that a message that is used again gets others"
         return ""
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Filter events."""
-        after, estimated, made = self.filtered(state, happenings)
+        after, estimated, made = self.filtered(state, events)
         states, *others = self.told(*estimated)
-        return after, [issued(states, happenings, state.carried.time_ns), *others, *made]
+        return after, [issued(states, events, state.carried.time_ns), *others, *made]
 
     def filtered(
-        self, state: State, happenings: Happenings
+        self, state: State, events: FilterEvents
     ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
         loop, steps = _compiled(self.stage, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
-        due = ragged_rows(happenings.is_due, happenings.offsets)
-        noted = ragged_rows(happenings.source >= 0, happenings.offsets)
+        due = ragged_rows(events.wants_estimate, events.offsets)
+        noted = ragged_rows(events.source >= 0, events.offsets)
         slots = len(slots_of(sensors))
         estimates, innovations = self.no_results(due, noted, slots)
         if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
@@ -293,11 +293,11 @@ class Filter:
         settings = np.repeat(self.settings[None], runs, axis=0)
         generators = state.generators
         if any(each.redrawn for each in self.samplers):
-            generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
-        for part, sets in self.sets(generators, happenings):
+            generators = _seeded(generators, events, len(self.samplers), self.parameters.seed)
+        for part, sets in self.sets(generators, events):
             loop(
                 part.stop - part.start,
-                happenings._replace(offsets=happenings.offsets[part.start : part.stop + 1]),
+                events._replace(offsets=events.offsets[part.start : part.stop + 1]),
                 settings[part],
                 self.gates,
                 of_runs(carried, part),
@@ -313,10 +313,10 @@ class Filter:
         return after, filled(estimates, due), made
 
     def sets(
-        self, generators: tuple[Any, ...], happenings: Happenings
+        self, generators: tuple[Any, ...], events: FilterEvents
     ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
         """Runs, and what the steps get for them: the samples of all functions."""
-        return _sets(self.samplers, generators, happenings.offsets)
+        return _sets(self.samplers, generators, events.offsets)
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
         """Estimates and innovations to be filled in, see `recursion.no_results`."""
@@ -379,14 +379,12 @@ def _nis_bounds(probability: float, components: int) -> Floats:
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))
 
 
-def _seeded(
-    generators: tuple[Any, ...], happenings: Happenings, count: int, seed: int
-) -> tuple[Any, ...]:
+def _seeded(generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int) -> tuple[Any, ...]:
     """Generators of every sampled function and run, from the seed and the run's first data."""
-    runs = len(happenings.offsets) - 1
+    runs = len(events.offsets) - 1
     before = generators or ((None,) * runs,) * count
     return tuple(
-        seeded_by_data(each, happenings.data, happenings.offsets, seed, function)
+        seeded_by_data(each, events.data, events.offsets, seed, function)
         for function, each in enumerate(before)
     )
 

@@ -26,8 +26,8 @@ from replay.inference.model.model import Sensor, Start
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.events import World, data_columns, happenings_of, sensor_table
-from replay.inference.run.recursion import CONTROL, Happenings
+from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
+from replay.inference.run.recursion import CONTROL, FilterEvents
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 FOREVER_NS = np.iinfo(np.int64).max
@@ -249,7 +249,7 @@ class Beginning:
         chosen = np.full(len(begun.time_ns), -1)
         for number, _, topic in self._measuring:
             ragged = first[topic.name]
-            table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
+            table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
             found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
@@ -291,17 +291,17 @@ class Beginning:
         names = [topic.name for topic in self._starting]
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
-        happenings, _ = happenings_of(stage, found, block, World({}, origins), settings)
+        events, _ = filter_events(stage, found, block, Context({}, origins), settings)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
-            solved = self._align(happenings, run, stage, settings)
+            solved = self._align(events, run, stage, settings)
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
         return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
 
     def _align(
-        self, happenings: Happenings, run: int, stage: Stage, settings: Floats
+        self, events: FilterEvents, run: int, stage: Stage, settings: Floats
     ) -> tuple[int, Floats, Floats] | None:
         """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
         model = stage.model
@@ -312,15 +312,15 @@ class Beginning:
         path: list[Any] = []
         places: list[Floats] = []
         spreads: list[Floats] = []
-        begin, end = happenings.offsets[run : run + 2]
+        begin, end = events.offsets[run : run + 2]
         _, first = data_columns(stage)
         before_ns = first_ns = 0
         for event in range(begin, end):
-            time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
+            time_ns, source = int(events.time_ns[event]), events.source[event]
             duration_s = (time_ns - before_ns) * 1e-9
             if event > begin and duration_s > 0.0:
                 state = model.motion.move(state, tuple(control), duration_s, parameters)
-            before_ns, data = time_ns, happenings.data[event]
+            before_ns, data = time_ns, events.data[event]
             if source == CONTROL:
                 own = data[first : first + len(control)]
                 control = np.where(np.isnan(own), control, own)

@@ -25,16 +25,16 @@ from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import data_columns, happenings_of
+from replay.inference.run.events import data_columns, filter_events
 from replay.inference.run.recursion import (
     CONTROL,
     NOTHING,
     Carried,
-    Happenings,
+    FilterEvents,
     Innovations,
     fault_of,
     filled,
-    taking_in,
+    processing,
 )
 from replay.sampling.sets import sets_by_runs
 
@@ -46,7 +46,7 @@ class Kept(NamedTuple):
     """Messages in order, and what they did; first axis = run and message.
 
     Attributes:
-        time_ns, source, data, target_id: see `recursion.Happenings`; the last of uint32.
+        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
         position: in the file.
         after: what was carried after the message.
         is_noted: whether it was an update, and so has an innovation.
@@ -132,14 +132,12 @@ def _no_history(stage: Stage, carried: Carried) -> History:
     return History(carried.time_ns, np.zeros(runs, np.int64), np.ones(runs, np.int64), kept)
 
 
-def _most_within(history: History, happenings: Happenings, window_ns: int) -> int:
+def _most_within(history: History, events: FilterEvents, window_ns: int) -> int:
     """The most messages of a run that lie within a window, of those kept and those that come."""
     most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
-    for run, (begin, end) in enumerate(
-        zip(happenings.offsets[:-1], happenings.offsets[1:], strict=True)
-    ):
+    for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
         before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]
-        time_ns = np.sort(np.concatenate([before_ns, happenings.time_ns[begin:end]]))
+        time_ns = np.sort(np.concatenate([before_ns, events.time_ns[begin:end]]))
         through = np.searchsorted(time_ns, time_ns + window_ns, side="right")
         most = max(most, int((through - np.arange(len(time_ns))).max(initial=0)))
     return most
@@ -152,12 +150,12 @@ def _most_within(history: History, happenings: Happenings, window_ns: int) -> in
 def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Function, Steps]:
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
-    loop = going_back(stage.model, taking_in(stage, steps, reads), steps.estimate, structure)
+    loop = going_back(stage.model, processing(stage, steps, reads), steps.estimate, structure)
     title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
     return compile_over_runs(loop, allocates=False, title=title), steps
 
 
-def going_back(model: Model, take_in: Function, estimate: Function, structure: Structure) -> Function:
+def going_back(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
     """The loop over the events of one run in the order in which they came; see `recursion.recursion`.
 
     `structure` is that of `Kept`.
@@ -165,7 +163,7 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
     copy, restore = copying_rows(structure), copying_rows(dict(structure)["after"])
     passes_controls = model.control is not None and not model.control.estimates
 
-    def insert(run: int, event: int, happenings: Happenings, history: History, capacity: int) -> int:
+    def insert(run: int, event: int, events: FilterEvents, history: History, capacity: int) -> int:
         """Put an event where it belongs, by stamp and place in the file; returns its row."""
         kept, base = history.kept, run * capacity
         if history.first[run] + history.counts[run] == capacity:
@@ -173,23 +171,23 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
                 copy(kept, base + history.first[run] + k, kept, base + k)
             history.first[run] = 0
         row = base + history.first[run] + history.counts[run]
-        time_ns, position = happenings.time_ns[event], happenings.came[event, 1]
+        time_ns, position = events.time_ns[event], events.arrival[event, 1]
         while kept.time_ns[row - 1] > time_ns or (
             kept.time_ns[row - 1] == time_ns and kept.position[row - 1] > position
         ):
             copy(kept, row - 1, kept, row)
             row -= 1
         kept.time_ns[row], kept.position[row] = time_ns, position
-        kept.source[row], kept.target_id[row] = happenings.source[event], happenings.target_id[event]
-        for k in range(happenings.data.shape[1]):
-            kept.data[row, k] = happenings.data[event, k]
+        kept.source[row], kept.target_id[row] = events.source[event], events.target_id[event]
+        for k in range(events.data.shape[1]):
+            kept.data[row, k] = events.data[event, k]
         history.counts[run] += 1
         return row
 
     def take_again(
         run: int,
         row: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         carried: Carried,
@@ -198,14 +196,14 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
         memory: Any,
     ) -> int:
         """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
-        events = Happenings(
-            happenings.offsets,
+        stored = FilterEvents(
+            events.offsets,
             kept.time_ns,
             kept.source,
             kept.data,
             kept.is_noted,
             kept.target_id,
-            happenings.came,
+            events.arrival,
         )
         notes = Innovations(
             at, kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
@@ -215,7 +213,7 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
             for j in range(kept.difference.shape[1]):
                 kept.covariance[row, i, j] = np.nan
         at[run] = row
-        failure = take_in(run, row, events, settings, gates, carried, notes, memory)
+        failure = process(run, row, stored, settings, gates, carried, notes, memory)
         kept.is_noted[row] = at[run] > row
         restore(carried, run, kept.after, row)
         return failure
@@ -247,7 +245,7 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
 
     def follow(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         window_ns: int,
@@ -261,21 +259,19 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
     ) -> None:
         """Move what is carried and kept, and fill the results, until the events end or the run fails."""
         kept, capacity = history.kept, len(history.kept.time_ns) // len(history.first)
-        for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
+        for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            begin = insert(run, event, happenings, history, capacity)
+            begin = insert(run, event, events, history, capacity)
             last = run * capacity + history.first[run] + history.counts[run] - 1
             repeated[event] = last - begin
             restore(kept.after, begin - 1, carried, run)
             failure = ALL_WELL
             for row in range(begin, last + 1):
-                failure = take_again(
-                    run, row, happenings, settings[run], gates, carried, kept, at, memory
-                )
+                failure = take_again(run, row, events, settings[run], gates, carried, kept, at, memory)
                 if failure != ALL_WELL:
                     break
-            if failure == ALL_WELL and happenings.is_due[event]:
+            if failure == ALL_WELL and events.wants_estimate[event]:
                 row, result = newest_estimated(last, kept), estimates.end[run]
                 estimate(row, kept.after.belief, estimates, result, memory)
                 failure = fault_of(estimates.mean[result], estimates.covariance[result])
@@ -337,22 +333,24 @@ class Rewinding:
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
         """Filter a block, its messages in the order in which they came."""
         inner, sensors = self.inner, self.inner.stage.sensors
-        happenings, lacking = happenings_of(inner.stage, inner.found, block, state.world, inner.settings)
+        events, without_covariance = filter_events(
+            inner.stage, inner.found, block, state.context, inner.settings
+        )
         carried, before = copied(state.carried), state.kept
-        history = before.with_room(2 * (_most_within(before, happenings, self.window_ns) + 3))
+        history = before.with_room(2 * (_most_within(before, events, self.window_ns) + 3))
         runs = len(history.first)
-        run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
-        is_due = happenings.is_due & (happenings.time_ns >= history.start_ns[run])
-        happenings = happenings._replace(is_due=is_due)
-        due = ragged_rows(is_due, happenings.offsets)
-        noted = ragged_rows(happenings.source >= 0, happenings.offsets) + history.offsets
+        run = np.repeat(np.arange(runs), np.diff(events.offsets))
+        wants_estimate = events.wants_estimate & (events.time_ns >= history.start_ns[run])
+        events = events._replace(wants_estimate=wants_estimate)
+        due = ragged_rows(wants_estimate, events.offsets)
+        noted = ragged_rows(events.source >= 0, events.offsets) + history.offsets
         estimates, innovations = inner.no_results(due, noted, len(slots_of(sensors)))
-        repeated = np.zeros(len(is_due), np.int64)
+        repeated = np.zeros(len(wants_estimate), np.int64)
         loop, steps = _compiled(inner.stage, inner.method, structure_of(history.kept))
-        sets = tuple(next(sets_by_runs(each, (), happenings.offsets))[1] for each in inner.samplers)
+        sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
-            happenings,
+            events,
             np.repeat(inner.settings[None], runs, axis=0),
             inner.gates,
             self.window_ns,
@@ -365,12 +363,12 @@ class Rewinding:
             scratch=partial(steps.memory, sets),
         )
         states, *others = inner.told(*filled(estimates, due))
-        made = [issued(states, happenings, history.start_ns), *others]
+        made = [issued(states, events, history.start_ns), *others]
         made += [inner.innovations(*filled(innovations, noted))] if sensors else []
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        made += [self.rewound(happenings, repeated), *inner.passed_over(block, lacking)]
+        made += [self.rewound(events, repeated), *inner.passed_over(block, without_covariance)]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:
@@ -385,29 +383,29 @@ class Rewinding:
         told = Innovations(offsets[1:], *(column[rows] for column in columns))
         return [self.inner.innovations(told, offsets)]
 
-    def rewound(self, happenings: Happenings, repeated: Integers) -> Ragged:
+    def rewound(self, events: FilterEvents, repeated: Integers) -> Ragged:
         """The late messages, and how many updates each had repeated."""
         is_late = repeated > 0
         stream = make_stream(
             f"/estimates/{self.inner.name}/rewound",
             schemas.REWOUND,
-            happenings.time_ns[is_late],
-            log_time_ns=happenings.came[is_late, 0],
+            events.time_ns[is_late],
+            log_time_ns=events.arrival[is_late, 0],
             repeated=repeated[is_late],
         )
-        return Ragged(stream, ragged_rows(is_late, happenings.offsets))
+        return Ragged(stream, ragged_rows(is_late, events.offsets))
 
 
-def issued(estimates: Ragged, happenings: Happenings, start_ns: Integers) -> Ragged:
+def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
     """Estimates whose log times are the moments at which the events that called for them were taken.
 
     Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
     """
-    if not happenings.came.shape[1]:
+    if not events.arrival.shape[1]:
         return estimates
-    run = np.repeat(np.arange(estimates.runs), np.diff(happenings.offsets))
-    called = happenings.is_due & (happenings.time_ns >= start_ns[run])
-    begin = ragged_rows(called, happenings.offsets)[:-1]
+    run = np.repeat(np.arange(estimates.runs), np.diff(events.offsets))
+    called = events.wants_estimate & (events.time_ns >= start_ns[run])
+    begin = ragged_rows(called, events.offsets)[:-1]
     first = np.repeat(begin - estimates.offsets[:-1], np.diff(estimates.offsets))
-    moment_ns = happenings.came[called, 0][first + np.arange(len(estimates))]
+    moment_ns = events.arrival[called, 0][first + np.arange(len(estimates))]
     return replace(estimates, stream=replace(estimates.stream, log_time_ns=moment_ns))

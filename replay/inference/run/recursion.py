@@ -36,7 +36,7 @@ CONTROL = -1  # an event's source; sensors count from zero, and NOTHING is only 
 NOTHING = -2
 
 
-class Happenings(NamedTuple):
+class FilterEvents(NamedTuple):
     """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
@@ -45,7 +45,7 @@ class Happenings(NamedTuple):
         source: (n,) a sensor's number, CONTROL or NOTHING.
         data: (n, width) the numbers of the message, see `steps.reading`; the control's where that is
             interpolated.
-        is_due: (n,) whether the estimate after the event is wanted.
+        wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
         came: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the order
             of the stamps.
@@ -55,9 +55,9 @@ class Happenings(NamedTuple):
     time_ns: Integers
     source: Integers
     data: Floats
-    is_due: NDArray[np.bool_]
+    wants_estimate: NDArray[np.bool_]
     target_id: Integers
-    came: Integers
+    arrival: Integers
 
 
 class Carried(NamedTuple):
@@ -136,8 +136,8 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     return made(kept[1:], *(column[rows] for column in columns)), kept
 
 
-def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """What one event does to a run, `take_in(run, event, happenings, ...)`; see `recursion`."""
+def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """What one event does to a run, `process(run, event, events, ...)`; see `recursion`."""
     predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
@@ -156,24 +156,24 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         run: int,
         event: int,
         duration_s: float,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         carried: Carried,
         memory: Any,
     ) -> bool:
         """Predict to an event."""
         control = carried.control[run]
-        first = happenings.data.shape[1] - controls
+        first = events.data.shape[1] - controls
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
-                control[k] = 0.5 * (control[k] + happenings.data[event, first + k])
+                control[k] = 0.5 * (control[k] + events.data[event, first + k])
         parameters = settings_of(settings, 0)
         return predict(run, carried.belief, control, duration_s, parameters, event, memory)
 
-    def take_in(
+    def process(
         run: int,
         event: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         carried: Carried,
@@ -184,16 +184,16 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
         UNKNOWN in a gap of the control after which it goes on.
         """
-        source, data = happenings.source[event], happenings.data[event]
-        duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
+        source, data = events.source[event], events.data[event]
+        duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             if has_gaps and np.isnan(data[len(data) - 1]):
                 if not resumes:
                     return NOT_DRIVEN
                 carried.control[run, :] = np.nan
                 return UNKNOWN
-            carried.time_ns[run] = happenings.time_ns[event]
-            if not advance(run, event, duration_s, happenings, settings, carried, memory):
+            carried.time_ns[run] = events.time_ns[event]
+            if not advance(run, event, duration_s, events, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE
         if duration_s >= 0.0 if interpolated else source == CONTROL:
             drive(run, data, carried)
@@ -203,20 +203,20 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
             parameters = settings_of(settings, source + 1)
-            waited_s = (happenings.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
+            waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
             told = update(source, run, carried.belief, data, parameters, gate, event, memory, note)
             if told >= 0:
                 return told
             if told == ALL_WELL:
                 if note.numbers[2] > 0.0:
-                    carried.accepted_ns[run, source] = happenings.time_ns[event]
-                innovations.time_ns[row] = happenings.time_ns[event]
-                innovations.target_id[row] = happenings.target_id[event]
+                    carried.accepted_ns[run, source] = events.time_ns[event]
+                innovations.time_ns[row] = events.time_ns[event]
+                innovations.target_id[row] = events.target_id[event]
                 innovations.end[run] = row + 1
         return ALL_WELL
 
-    return take_in
+    return process
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
@@ -224,11 +224,11 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
     """
-    take_in, estimate = taking_in(stage, steps, settings_of), steps.estimate
+    process, estimate = processing(stage, steps, settings_of), steps.estimate
 
     def follow(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         carried: Carried,
@@ -238,20 +238,20 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     ) -> None:
         """Move what is carried, and fill the results, until the events end or the run fails."""
         start_ns = carried.time_ns[run]
-        for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
+        for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            failure = take_in(run, event, happenings, settings[run], gates, carried, innovations, memory)
+            failure = process(run, event, events, settings[run], gates, carried, innovations, memory)
             if (
                 failure == ALL_WELL
-                and happenings.is_due[event]
-                and happenings.time_ns[event] >= start_ns
+                and events.wants_estimate[event]
+                and events.time_ns[event] >= start_ns
             ):
                 row = estimates.end[run]
                 estimate(run, carried.belief, estimates, row, memory)
                 failure = fault_of(estimates.mean[row], estimates.covariance[row])
                 if failure == ALL_WELL:
-                    estimates.time_ns[row] = happenings.time_ns[event]
+                    estimates.time_ns[row] = events.time_ns[event]
                     estimates.end[run] = row + 1
             carried.failure[run] = ALL_WELL if failure == UNKNOWN else failure
 

@@ -48,7 +48,7 @@ from replay.inference.linear_algebra.gaussian import (
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.stage import Stage
 from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations
+from replay.inference.run.recursion import Carried, Estimates, FilterEvents, Innovations
 from replay.inference.smoothing.backward_pass import solve_semidefinite
 
 
@@ -311,17 +311,17 @@ class BoundFilter(Filter):
         return found
 
     def filtered(
-        self, state: State, happenings: Happenings
+        self, state: State, events: FilterEvents
     ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
         """Go through events, with the truths at all of them."""
-        truths = self.truths(state.kept.truth, happenings.time_ns, happenings.offsets)
-        after, nodes, made = super().filtered(state._replace(generators=(truths,)), happenings)
+        truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
+        after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
         return after._replace(generators=()), nodes, failures
 
-    def sets(self, generators: tuple[Any, ...], happenings: Happenings) -> Any:
+    def sets(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:
         """All runs, and the truths."""
-        yield slice(0, len(happenings.offsets) - 1), generators
+        yield slice(0, len(events.offsets) - 1), generators
 
     def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
@@ -329,10 +329,10 @@ class BoundFilter(Filter):
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Go through events; smoothed covariances have to wait for the end."""
         before, kept = state.carried, state.kept
-        after, (nodes, offsets), made = self.filtered(state, happenings)
+        after, (nodes, offsets), made = self.filtered(state, events)
         kept, first = self.begun(before, kept, nodes, offsets)
         made += [first, self.steps_told(nodes, offsets)]
         if self.parameters.of == "smoother":

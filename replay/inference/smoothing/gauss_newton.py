@@ -25,7 +25,7 @@ from replay.inference.linear_algebra.manifold import is_flat, resetting, retract
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.run.recursion import Carried, Estimates, FilterEvents, Innovations, recursion
 from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
 from replay.inference.smoothing.backward_pass import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
 
@@ -77,7 +77,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
     def go_forward(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         plan: Plan,
@@ -108,7 +108,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             carried.control[run, row] = plan.initial[row]
         carried.time_ns[run], carried.failure[run] = plan.start_ns[run], ALL_WELL
         nodes.end[run] = begin
-        follow(run, happenings, settings, gates, carried, nodes, innovations, memory)
+        follow(run, events, settings, gates, carried, nodes, innovations, memory)
         whole = carried.failure[run] == ALL_WELL and nodes.end[run] == offsets[run + 1]
         return whole and np.isfinite(trajectory.cost[0] + trajectory.held[0])
 
@@ -137,7 +137,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
     def search_run(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         plan: Plan,
@@ -161,7 +161,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         while begin < end:
             trajectory.damping[0] = damping
             well = go_forward(
-                run, happenings, settings, gates, plan, carried, nodes, offsets, innovations, memory
+                run, events, settings, gates, plan, carried, nodes, offsets, innovations, memory
             )
             held, passes = trajectory.held[0], ended.passes[run]
             slack, poor = COST_ROUNDING * max(1.0, best), False

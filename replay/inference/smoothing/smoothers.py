@@ -33,7 +33,7 @@ from replay.inference.linear_algebra.manifold import is_flat
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
 from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
@@ -152,9 +152,9 @@ class Smoother(Filter):
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
-        after, (nodes, offsets), made = self.filtered(state, happenings)
+        after, (nodes, offsets), made = self.filtered(state, events)
         new = Piece(nodes, offsets)
         if self.lag_ns == FOREVER_NS:  # nothing yet
             nothing = self.states(*self.gone_back([new], offsets[:-1]))
