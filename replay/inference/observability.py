@@ -26,10 +26,15 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
 from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
-from replay.inference.kalman.update import reading, sensor_derivative, sensor_noise, slots_of
-from replay.inference.linear_algebra.gaussian import kalman_step, keep_measured, multiply_into, whiten
-from replay.inference.linear_algebra.manifold import differencing, is_flat
+from replay.inference.kalman.steps import NOTHING_MEASURED, InnovationRecord, Steps, Workspace, workspace
+from replay.inference.kalman.update import (
+    innovation_components,
+    reading,
+    sensor_derivative,
+    sensor_noise,
+)
+from replay.inference.linear_algebra.gaussian import drop_missing, kalman_step, multiply_into, whiten
+from replay.inference.linear_algebra.manifold import boxminus, is_flat
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
@@ -90,7 +95,7 @@ def _carried_by_motion(stage: Stage) -> Function:
     model = stage.model
     linearise = motion_derivative(model, stage.motion, by_state=True)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
-    subtract, flat, carry = differencing(model.kinds), is_flat(model.kinds), carrying(model.kinds)
+    subtract, flat, carry = boxminus(model.kinds), is_flat(model.kinds), carrying(model.kinds)
 
     def predict(
         run: int,
@@ -98,11 +103,11 @@ def _carried_by_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        event: int,
         work: Workspace,
     ) -> bool:
         along, transition = work.samples[0], belief.transition[run]
-        node = along.node[use]
+        node = along.node[event]
         linearise(read_state(along.mean[node - 1]), read_control(control), duration_s, parameters, work)
         if not flat:
             subtract(along.mean[node], work.state, along.offset, 0)
@@ -125,13 +130,13 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        event: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         along, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
-        linearise(read_state(along.mean[along.node[use]]), read_about(data), parameters, work)
+        linearise(read_state(along.mean[along.node[event]]), read_about(data), parameters, work)
         innovation.covariance[:] = 0.0
         add_noise(innovation.covariance, data, parameters, work)
         for i in range(m):
@@ -141,7 +146,7 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
                 for k in range(t):
                     entry += work.rows[i, k] * belief.transition[run, k, column]
                 cross[column, i] = entry
-        size = keep_measured(innovation)
+        size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)
         if size == 0 or np.isnan(squared):
             return NOTHING_MEASURED
@@ -235,7 +240,7 @@ class Observability(IteratedSmoother):
         events = events._replace(wants_estimate=events.wants_estimate & ends[way.node])
         due = np.append(0, np.cumsum(ends))[offsets]
         one = np.arange(runs + 1)
-        _, innovations = no_results(due, one, stage.model, len(slots_of(stage.sensors)))
+        _, innovations = no_results(due, one, stage.model, len(innovation_components(stage.sensors)))
         count = due[-1]
         found = Estimates(
             due[:-1].copy(), np.empty(count, np.int64), np.empty((count, 1)), np.empty((count, t, t))

@@ -38,7 +38,7 @@ from replay.estimators.networks.covariance_intersection import (
     one_of,
     rule_number,
 )
-from replay.inference.linear_algebra.gaussian import coast, copy_gaussian
+from replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
 
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
 Rule = Literal[
@@ -189,7 +189,9 @@ class Results(NamedTuple):
 
 def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
     """Predict with constant velocity, in place."""
-    coast(mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s))
+    predict_constant_velocity(
+        mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s)
+    )
 
 
 def observe(

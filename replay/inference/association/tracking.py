@@ -41,7 +41,7 @@ from replay.inference.linear_algebra.tuples import range_of, tuple_of
 from replay.inference.model.model import Model
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.modes.imm import Belief, interacting_steps
+from replay.inference.modes.imm import ModeBelief, interacting_steps
 
 
 class Tracker(NamedTuple):
@@ -135,8 +135,10 @@ def believing(stage: Stage) -> Function:
     def of_one(run: int, tracks: Tracks) -> Gaussian:
         return Gaussian(tracks.mean[run, :, 0], tracks.covariance[run, :, 0])
 
-    def of_modes(run: int, tracks: Tracks) -> Belief:
-        return Belief(tracks.mean[run], tracks.covariance[run], tracks.mode[run], tracks.log_mode[run])
+    def of_modes(run: int, tracks: Tracks) -> ModeBelief:
+        return ModeBelief(
+            tracks.mean[run], tracks.covariance[run], tracks.mode[run], tracks.log_mode[run]
+        )
 
     return of_modes if stage.modes else of_one
 

@@ -22,7 +22,7 @@ from replay.inference.kalman.regression import sample_memory, sampled_motion, sa
 from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
-    Note,
+    InnovationRecord,
     Steps,
     Workspace,
     gaussian_filter,
@@ -32,18 +32,18 @@ from replay.inference.kalman.update import (
     kalman_update,
     linear_innovation,
     linear_sensor,
-    note_numbers,
-    noting,
     reading,
     sensor_derivative,
+    write_numbers,
+    writing_innovation,
 )
 from replay.inference.linear_algebra.gaussian import (
+    downdate,
+    drop_missing,
+    inflate,
+    inflation,
     kalman_step,
-    keep_measured,
-    reduce_covariance,
     whiten,
-    widen,
-    widening,
     wrap,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
@@ -145,7 +145,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
     n, t, m = model.size, model.tangent, len(sensor.measured)
     read_state, read_about = tuple_of(n), reading(sensor).about
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    tell, correct = noting(stage, number), correcting(model.kinds, model.correct)
+    write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
     step_to, chain = relinearising(model)
 
@@ -168,9 +168,9 @@ def iterated_update(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         present = 0
         for i in range(m):
@@ -183,17 +183,17 @@ def iterated_update(stage: Stage, number: int) -> Function:
             step[row] = 0.0
         for iteration in range(ITERATIONS):
             relinearise(mean, covariance, data, parameters, work)
-            tell(innovation, note)
-            size = keep_measured(innovation)
+            write_innovation(innovation, record)
+            size = drop_missing(innovation)
             squared, determinant = whiten(innovation, size)
             if np.isnan(squared):
                 return NOT_POSITIVE_DEFINITE
             if iteration == 0:
-                factor = widening(squared, size, parameters)
+                factor = inflation(squared, size, parameters)
             if size == 0 or (iteration == 0 and not squared <= gate[size]):
-                note_numbers(note, squared, determinant, size, False, 1.0)
+                write_numbers(record, squared, determinant, size, False, 1.0)
                 return ALL_WELL
-            widen(innovation, size, factor)
+            inflate(innovation, size, factor)
             for row in range(t):
                 work.turned[row] = step[row]
             kalman_step(innovation, size, step)
@@ -202,9 +202,9 @@ def iterated_update(stage: Stage, number: int) -> Function:
                 change = max(change, abs(step[row] - work.turned[row]))
             if change < SETTLED:
                 break
-        reduce_covariance(covariance, innovation.cross_covariance, size)
+        downdate(covariance, innovation.cross_covariance, size)
         correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, True, factor)
+        write_numbers(record, squared, determinant, size, True, factor)
         return ALL_WELL
 
     return update
@@ -267,7 +267,7 @@ def _exact_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)
@@ -286,7 +286,12 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted

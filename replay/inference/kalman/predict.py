@@ -6,7 +6,7 @@ from replay.engine.arrays import Floats, Function
 from replay.inference.kalman.steps import Workspace
 from replay.inference.linear_algebra.gaussian import add_through
 from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
-from replay.inference.linear_algebra.sparse import adding_through, moving_covariance, pattern_of
+from replay.inference.linear_algebra.sparse import adding_through, pattern_of, propagating_covariance
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.model import Model, Motion
 from replay.inference.model.stage import Stage
@@ -19,7 +19,7 @@ def linear_motion(stage: Stage) -> Function:
     read_state, fill = tuple_of(n), filling(n)
     linearise = motion_derivative(model, motion, by_state=True)
     known = known_entries(linearise, "transition")
-    move_covariance = moving_covariance(pattern_of(known, model.tangent))
+    move_covariance = propagating_covariance(pattern_of(known, model.tangent))
     add_noise = motion_noise(model, motion)
 
     def predict(
@@ -28,7 +28,7 @@ def linear_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)

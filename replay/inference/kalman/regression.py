@@ -17,10 +17,10 @@ from replay.inference.kalman.steps import Workspace
 from replay.inference.kalman.update import reading, sensor_noise
 from replay.inference.linear_algebra.gaussian import cholesky, wrap
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
     is_flat,
     recentring,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
@@ -81,16 +81,16 @@ def regression(
 ) -> Function:
     """The regression of `function(state, noise, arguments)` at samples.
 
-    Returns `regress(mean, covariance, arguments, variances, spread, cross, use, memory)`. It takes the
-    samples of use number `use`, fills `memory.centre` with the intrinsic mean of the values, `spread`
-    (v, v) with their covariance and `cross` (t, v) with that with the state; False where the state's
-    covariance is not positive definite. `variances` is a tuple of those of the noise; `spread` may be
-    the state's covariance itself.
+    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
+    takes the set of samples number `sample_index`, fills `memory.centre` with the intrinsic mean of the
+    values, `spread` (v, v) with their covariance and `cross` (t, v) with that with the state; False
+    where the state's covariance is not positive definite. `variances` is a tuple of those of the noise;
+    `spread` may be the state's covariance itself.
     """
     t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
-    add, subtract = retraction(kinds), differencing(outputs)
+    add, subtract = boxplus(kinds), boxminus(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
@@ -120,10 +120,10 @@ def regression(
         variances: tuple[float, ...],
         spread: Floats,
         cross: Floats,
-        use: int,
+        sample_index: int,
         memory: SampleMemory,
     ) -> bool:
-        chosen = (use - memory.first) * memory.stride
+        chosen = (sample_index - memory.first) * memory.stride
         weights, factor = memory.weights[chosen], memory.factor
         if not cholesky(factor, covariance, t):
             return False
@@ -146,7 +146,7 @@ def settling(kinds: tuple[str, ...]) -> Function:
     afterwards.
     """
     v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
-    add, recentre, weighted_mean = retraction(kinds), recentring(kinds), weighted_mean_of(v)
+    add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
 
     def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
         for _ in range(MEANS):
@@ -187,14 +187,14 @@ def sampled_motion(stage: Stage, number: int) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         memory, state, driven = work.samples[number], read_state(mean), read_control(control)
         arguments = (driven, duration_s, parameters)
         variances = variances_of(state, duration_s, parameters)
         cross = work.product.T
-        if not regress(mean, covariance, arguments, variances, covariance, cross, use, memory):
+        if not regress(mean, covariance, arguments, variances, covariance, cross, sample_index, memory):
             return False
         linearise(state, driven, duration_s, parameters, work)
         add_noise(state, covariance, duration_s, parameters, work)
@@ -231,12 +231,17 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         memory = work.samples[samples]
         difference, spread, cross = work.innovations[number]
         arguments, variances = (read_about(data), parameters), variances_of(parameters)
-        if not regress(mean, covariance, arguments, variances, spread, cross, use, memory):
+        if not regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory):
             return False
         for i in range(m):
             difference[i] = wrap(data[i] - memory.centre[i], angular[i])

@@ -44,10 +44,10 @@ class Steps(NamedTuple):
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well;
-            moves the belief in place. `use` numbers the sets of randomised samples.
-        updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
-            ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
+        predict: (run, belief, control, duration_s, parameters, sample_index, memory) -> whether all is
+            well; moves the belief in place. `sample_index` numbers the sets of randomised samples.
+        updates: for every sensor, (run, belief, data, parameters, gate, sample_index, memory, record) ->
+            a failure, ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
@@ -62,7 +62,7 @@ class Steps(NamedTuple):
     resumes: bool = False
 
 
-class Note(NamedTuple):
+class InnovationRecord(NamedTuple):
     """What an update tells of itself: one row of the results.
 
     Attributes:
@@ -140,18 +140,24 @@ def gaussian_filter(
 ) -> Steps:
     """The steps of a filter whose belief is one Gaussian.
 
-    `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
-    one run's mean and covariance.
+    `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` and the updates
+    alike take one run's mean and covariance.
     """
     lost = stage.motion.lost
     if lost is not None:
         predict = _predicting_lost(stage.model, lost, predict)
 
     def predict_run(
-        run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
+        run: int,
+        belief: Gaussian,
+        control: Any,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        work: Any,
     ) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return predict(mean, covariance, control, duration_s, parameters, use, work)
+        return predict(mean, covariance, control, duration_s, parameters, sample_index, work)
 
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
@@ -177,11 +183,11 @@ def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> 
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         if not np.isnan(control[0]):
-            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+            return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
@@ -198,11 +204,11 @@ def _of_run(update: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Any,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return update(mean, covariance, data, parameters, gate, use, work, note)
+        return update(mean, covariance, data, parameters, gate, sample_index, work, record)
 
     return update_run

@@ -7,17 +7,22 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Workspace
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Workspace,
+)
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     Innovation,
     add_through,
+    downdate,
+    drop_missing,
+    inflate,
+    inflation,
     kalman_step,
-    keep_measured,
-    reduce_covariance,
     whiten,
-    widen,
-    widening,
     wrap,
 )
 from replay.inference.linear_algebra.linearization import Input, derivative
@@ -89,14 +94,23 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
 
 
 def linear_sensor(stage: Stage, number: int) -> Function:
-    """`innovate(mean, covariance, data, parameters, use, work)` by the derivative at the mean."""
+    """Make the innovation by the derivative at the mean.
+
+    Returns `innovate(mean, covariance, data, parameters, sample_index, work)`, which fills that of the
+    sensor in `work.innovations`.
+    """
     sensor = stage.sensors[number]
     read_state, read = tuple_of(stage.model.size), reading(sensor)
     read_about = read.about
     linearise, compare = sensor_derivative(stage.model, sensor), linear_innovation(sensor, number)
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         linearise(read_state(mean), read_about(data), parameters, work)
         compare(covariance, data, parameters, work)
@@ -153,7 +167,7 @@ def whitening(sensor: Sensor, number: int) -> Function:
             for j in range(m):
                 noise[i, j] = 0.0
         add_noise(noise, data, parameters, work)
-        size = keep_measured(innovation)
+        size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)
         kalman_step(innovation, size, work.step)
         return size, squared
@@ -161,32 +175,32 @@ def whitening(sensor: Sensor, number: int) -> Function:
     return whiten_residual
 
 
-def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:
+def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
     """All components that these sensors measure, by name with their kinds: those of the innovations."""
-    slots: dict[str, str] = {}
+    components: dict[str, str] = {}
     for sensor in sensors:
         for name, kind in sensor.measured.items():
-            if slots.setdefault(name, kind) != kind:
+            if components.setdefault(name, kind) != kind:
                 raise BadInput(
-                    f"sensor {sensor.topic}: {name} is {kind} here and {slots[name]} elsewhere"
+                    f"sensor {sensor.topic}: {name} is {kind} here and {components[name]} elsewhere"
                 )
-    return slots
+    return components
 
 
-def noting(stage: Stage, number: int) -> Function:
-    """`tell(innovation, note)`: the innovation of sensor `number` into the slots of the results."""
-    slots = list(slots_of(stage.sensors))
-    places = tuple(slots.index(name) for name in stage.sensors[number].measured)
+def writing_innovation(stage: Stage, number: int) -> Function:
+    """`write_innovation(innovation, record)`: sensor `number`'s, at the places of its components."""
+    components = list(innovation_components(stage.sensors))
+    places = tuple(components.index(name) for name in stage.sensors[number].measured)
 
-    def tell(innovation: Innovation, note: Note) -> None:
+    def write_innovation(innovation: Innovation, record: InnovationRecord) -> None:
         for i in range(len(places)):
-            note.difference[places[i]] = innovation.difference[i]
+            record.difference[places[i]] = innovation.difference[i]
             for j in range(len(places)):
                 missing = np.isnan(innovation.difference[i] + innovation.difference[j])
                 entry = np.nan if missing else innovation.covariance[i, j]
-                note.covariance[places[i], places[j]] = entry
+                record.covariance[places[i], places[j]] = entry
 
-    return tell
+    return write_innovation
 
 
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
@@ -195,9 +209,13 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
     is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
-    in may still count less, see `gaussian.widening`.
+    in may still count less, see `gaussian.inflation`.
     """
-    model, m, tell = stage.model, len(stage.sensors[number].measured), noting(stage, number)
+    model, m, write_innovation = (
+        stage.model,
+        len(stage.sensors[number].measured),
+        writing_innovation(stage, number),
+    )
     find_slope = sloping(model.kinds, model.correct)
     correct = correcting(model.kinds, model.correct)
 
@@ -207,9 +225,9 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         present = 0
         for i in range(m):
@@ -217,35 +235,40 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         if present == 0:
             return NOTHING_MEASURED
         innovation = work.innovations[number]
-        if not innovate(mean, covariance, data, parameters, use, work):
+        if not innovate(mean, covariance, data, parameters, sample_index, work):
             return NOT_POSITIVE_DEFINITE
-        tell(innovation, note)
-        size = keep_measured(innovation)
+        write_innovation(innovation, record)
+        size = drop_missing(innovation)
         squared, determinant = whiten(innovation, size)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
-        factor = widening(squared, size, parameters)
+        factor = inflation(squared, size, parameters)
         if accepted:
-            widen(innovation, size, factor)
+            inflate(innovation, size, factor)
             kalman_step(innovation, size, work.step)
-            reduce_covariance(covariance, innovation.cross_covariance, size)
+            downdate(covariance, innovation.cross_covariance, size)
             find_slope(mean, covariance, work.slope)
             correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, accepted, factor)
+        write_numbers(record, squared, determinant, size, accepted, factor)
         return ALL_WELL
 
     return update
 
 
-def note_numbers(
-    note: Note, squared: float, determinant: float, size: int, accepted: bool, factor: float
+def write_numbers(
+    record: InnovationRecord,
+    squared: float,
+    determinant: float,
+    size: int,
+    accepted: bool,
+    factor: float,
 ) -> None:
     """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
 
     The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
     """
-    note.numbers[0] = squared
+    record.numbers[0] = squared
     likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
-    note.numbers[1] = likelihood if accepted else 0.0
-    note.numbers[2] = 1.0 if accepted else 0.0
+    record.numbers[1] = likelihood if accepted else 0.0
+    record.numbers[2] = 1.0 if accepted else 0.0

@@ -82,7 +82,7 @@ def wrap(difference: float, is_angle: bool) -> float:
     return difference
 
 
-def keep_measured(innovation: Innovation) -> int:
+def drop_missing(innovation: Innovation) -> int:
     """Move the components that were measured to the front; returns how many there are."""
     difference, covariance, cross_covariance = innovation
     size = 0
@@ -120,7 +120,7 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     return squared, 2.0 * np.log(determinant)
 
 
-def widening(squared: float, size: int, parameters: Any) -> float:
+def inflation(squared: float, size: int, parameters: Any) -> float:
     """How many times larger the covariance of an innovation counts, of a NIS and so many components.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
@@ -150,7 +150,7 @@ def widening(squared: float, size: int, parameters: Any) -> float:
     return factor
 
 
-def widen(innovation: Innovation, size: int, factor: float) -> None:
+def inflate(innovation: Innovation, size: int, factor: float) -> None:
     """Make the covariance of a whitened innovation so many times larger."""
     root = np.sqrt(factor)
     for i in range(size):
@@ -175,7 +175,7 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
             step[row] += cross[row, i] * difference[i]
 
 
-def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
+def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
     """P becomes P - W W', with W as `kalman_step` leaves it."""
     for row in range(len(covariance)):
         for column in range(row + 1):
@@ -216,7 +216,7 @@ def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
             matrix[row, column] = product[row, column]
 
 
-def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
+def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
     """P becomes F P F', by way of `product`."""
     size = len(covariance)
     multiply(transition, covariance, product)
@@ -228,7 +228,7 @@ def moved_covariance(covariance: Floats, transition: Floats, product: Floats) ->
             covariance[row, column] = covariance[column, row] = entry
 
 
-def coast(
+def predict_constant_velocity(
     mean: Floats,
     covariance: Floats,
     duration_s: float,

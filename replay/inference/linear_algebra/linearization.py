@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from replay.engine.arrays import Function
 from replay.engine.vectors.tangent import WIDTHS
-from replay.inference.linear_algebra.manifold import tangent_size, things
+from replay.inference.linear_algebra.manifold import manifold_blocks, tangent_size
 from replay.inference.linear_algebra.tuples import range_of
 from replay.tracing.functions import Derivative, TracedFunction
 from replay.tracing.graph import Node
@@ -126,7 +126,7 @@ def _seeded(
     graph = trace.graph
     x = [graph.input((argument, index)) for index in range(len(kinds))]
     one, found = graph.constant(1.0), {}
-    for kind, c, t, _ in things(kinds):
+    for kind, c, t, _ in manifold_blocks(kinds):
         at = first + t
         if kind in ("linear", "angle"):
             found[x[c]] = {at: one}
@@ -153,7 +153,7 @@ def _in_tangent_space(
     """The slopes of what a function returns by one variable, by the row of the tangent space."""
     zero = trace.graph.constant(0.0)
     y = [trace.number(node) for node in returned]
-    for kind, c, t, _ in things(kinds):
+    for kind, c, t, _ in manifold_blocks(kinds):
         by = [slopes[c + index].get(variable, zero) for index in range(WIDTHS[kind])]
         d = [trace.number(node) for node in by]
         if kind in ("linear", "angle"):

@@ -20,10 +20,10 @@ Quaternion = tuple[float, float, float, float]
 
 def tangent_size(kinds: Sequence[str]) -> int:
     """How many components the tangent space of these components has."""
-    return sum(width for _, _, _, width in things(kinds))
+    return sum(width for _, _, _, width in manifold_blocks(kinds))
 
 
-def things(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
+def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
     """Every number, angle, axis and quaternion: kind, first component and tangent one, tangent size."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
@@ -40,9 +40,9 @@ def is_flat(kinds: Sequence[str]) -> bool:
 
 
 @lru_cache(maxsize=64)
-def retraction(kinds: tuple[str, ...]) -> Function:
+def boxplus(kinds: tuple[str, ...]) -> Function:
     """`add(x, d)`: moves the state x (n,) by a tangent vector d (t,), in place."""
-    parts = tuple(things(kinds))
+    parts = tuple(manifold_blocks(kinds))
 
     def add(x: Floats, d: Floats) -> None:
         for kind, c, t, _ in parts:
@@ -61,9 +61,9 @@ def retraction(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def differencing(kinds: tuple[str, ...]) -> Function:
+def boxminus(kinds: tuple[str, ...]) -> Function:
     """`subtract(a, b, d, k)`: row k of d (..., t) becomes the tangent vector from b to a, both (n,)."""
-    parts = tuple(things(kinds))
+    parts = tuple(manifold_blocks(kinds))
 
     def subtract(a: Floats, b: Floats, d: Floats, k: int) -> None:
         for kind, c, t, _ in parts:
@@ -86,14 +86,14 @@ def differencing(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
+def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Function:
     """`reset(d, rows)`: multiplies the rows (t, m) of every rotation by its right Jacobian at d (t,).
 
     Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
     With `back` it multiplies by the inverse instead, which carries a covariance the other way.
     """
-    factors_of = inverse_right_jacobian if back else right_jacobian
-    turns = tuple(t for kind, _, t, _ in things(kinds) if kind == "quaternion")
+    factors_of = inverse_right_jacobian_factors if back else right_jacobian_factors
+    turns = tuple(t for kind, _, t, _ in manifold_blocks(kinds) if kind == "quaternion")
 
     def reset(d: Floats, rows: Floats) -> None:
         for t in turns:
@@ -109,7 +109,7 @@ def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
     return reset
 
 
-def right_jacobian(squared: float) -> tuple[float, float]:
+def right_jacobian_factors(squared: float) -> tuple[float, float]:
     """The factors f, g of Jr(d) = I - f [d]x + g [d]x^2, of t^2 = |d|^2.
 
     They are (1 - cos t)/t^2 and (t - sin t)/t^3. Markley 2003; Mueller 2017.
@@ -123,7 +123,7 @@ def right_jacobian(squared: float) -> tuple[float, float]:
     return 0.5 * half * half, second
 
 
-def inverse_right_jacobian(squared: float) -> tuple[float, float]:
+def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
     """The factors of its inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
     angle = np.sqrt(squared)
     if angle < 0.05:
@@ -140,7 +140,7 @@ def recentring(kinds: tuple[str, ...]) -> Function:
     Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a
     rotation is not yet settled.
     """
-    parts = tuple(things(kinds))
+    parts = tuple(manifold_blocks(kinds))
 
     def recentre(values: Floats, shift: Floats) -> bool:
         again = False

@@ -20,11 +20,11 @@ from replay.engine.arrays import Floats
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
+    downdate,
+    drop_missing,
     kalman_step,
-    keep_measured,
-    moved_covariance,
     no_innovation,
-    reduce_covariance,
+    propagate_covariance,
     whiten,
 )
 
@@ -86,7 +86,7 @@ def predict(
         product[0, row] = entry
     for row in range(size):
         mean[row] = product[0, row]
-    moved_covariance(covariance, transition, product)
+    propagate_covariance(covariance, transition, product)
     for row in range(size):
         for column in range(size):
             covariance[row, column] += noise[row, column]
@@ -128,12 +128,12 @@ def update(
             for k in range(len(mean)):
                 entry += rows[i, k] * innovation.cross_covariance[k, j]
             innovation.covariance[i, j] = innovation.covariance[j, i] = entry
-    size = keep_measured(innovation)
+    size = drop_missing(innovation)
     squared = whiten(innovation, size)[0]
     if not squared <= gate:
         return squared
     kalman_step(innovation, size, step)
     for row in range(len(mean)):
         mean[row] += step[row]
-    reduce_covariance(covariance, innovation.cross_covariance, size)
+    downdate(covariance, innovation.cross_covariance, size)
     return squared

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import add_through, moved_covariance
+from replay.inference.linear_algebra.gaussian import add_through, propagate_covariance
 
 Pattern = tuple[tuple[tuple[int, float | None], ...], ...]
 
@@ -23,10 +23,10 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
     )
 
 
-def moving_covariance(pattern: Pattern | None) -> Function:
+def propagating_covariance(pattern: Pattern | None) -> Function:
     """`move(covariance, transition, product)`: P becomes F P F', by way of the product F P."""
     if pattern is None:
-        return moved_covariance
+        return propagate_covariance
     rows = tuple(enumerate(pattern))
 
     def move(covariance: Floats, transition: Floats, product: Floats) -> None:

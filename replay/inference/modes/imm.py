@@ -36,14 +36,14 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, Note, Steps
-from replay.inference.kalman.update import noting, slots_of
-from replay.inference.linear_algebra.gaussian import keep_measured, whiten, wrap
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.update import innovation_components, writing_innovation
+from replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
+    by_right_jacobian,
     is_flat,
-    resetting,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.tuples import filling, range_of, total
@@ -80,7 +80,7 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
 # The steps
 
 
-class Belief(NamedTuple):
+class ModeBelief(NamedTuple):
     """What is believed of the states, first axis = run: a Gaussian for each of M modes.
 
     Attributes:
@@ -104,7 +104,7 @@ class Mixtures(NamedTuple):
     probability: Floats
 
 
-class Memory(NamedTuple):
+class InteractingMemory(NamedTuple):
     """What the steps of one core work in.
 
     Attributes:
@@ -115,7 +115,7 @@ class Memory(NamedTuple):
         centre: (n,), the mean in whose tangent space mixtures are made.
         away, carried: (M, t), (M, t, t), the modes' Gaussians there.
         shift: (t,), of a mixture.
-        notes: what every mode's update tells, first axis = mode.
+        records: what every mode's update tells, first axis = mode.
         open_gate: (m + 1,), bounds that let everything in.
     """
 
@@ -128,7 +128,7 @@ class Memory(NamedTuple):
     away: Floats
     carried: Floats
     shift: Floats
-    notes: Note
+    records: InnovationRecord
     open_gate: Floats
 
 
@@ -137,45 +137,55 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     model, switching = stage.model, stage.model.switching
     assert switching is not None
     modes, n, t = len(filters), model.size, model.tangent
-    slots = len(slots_of(stage.sensors))
+    components = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    gather, mix = mixing(model.kinds)
-    change, weigh, predict_modes = changing(modes), weighing(modes), predicting(filters)
+    to_common_tangent, mix = mixing(model.kinds)
+    fill_transition, fill_weights, predict_modes = (
+        transition_matrix(modes),
+        mixing_weights(modes),
+        predicting(filters),
+    )
     rates_of, fill_rates = switching.rates, filling(modes * (modes - 1))
 
     def predict(
         run: int,
-        belief: Belief,
+        belief: ModeBelief,
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
-        memory: Memory,
+        sample_index: int,
+        memory: InteractingMemory,
     ) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
         fill_rates(memory.rates, rates_of(parameters))
-        change(memory.rates, duration_s, memory.transition)
-        gather(mean, covariance, probability, memory)
-        weigh(probability, log_probability, memory)
+        fill_transition(memory.rates, duration_s, memory.transition)
+        to_common_tangent(mean, covariance, probability, memory)
+        fill_weights(probability, log_probability, memory)
         for mode in range(modes):
             mix(memory.weights[mode], memory, mean[mode], covariance[mode])
         return predict_modes(
-            Gaussian(mean, covariance), control, duration_s, parameters, use, memory.filters
+            Gaussian(mean, covariance), control, duration_s, parameters, sample_index, memory.filters
         )
 
-    def estimate(run: int, belief: Belief, mixtures: Mixtures, row: int, memory: Memory) -> None:
+    def estimate(
+        run: int, belief: ModeBelief, mixtures: Mixtures, row: int, memory: InteractingMemory
+    ) -> None:
         probability = mixtures.probability[row]
         for mode in range(modes):
             probability[mode] = belief.probability[run, mode]
-        gather(belief.mean[run], belief.covariance[run], probability, memory)
+        to_common_tangent(belief.mean[run], belief.covariance[run], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
 
-    def memory(sets: tuple[Any, ...]) -> Memory:
+    def memory(sets: tuple[Any, ...]) -> InteractingMemory:
         waiting = iter(sets)
         inner = tuple(each.memory(tuple(next(waiting) for _ in each.sampled)) for each in filters)
-        notes = Note(np.empty((modes, slots)), np.empty((modes, slots, slots)), np.empty((modes, 3)))
-        return Memory(
+        records = InnovationRecord(
+            np.empty((modes, components)),
+            np.empty((modes, components, components)),
+            np.empty((modes, 3)),
+        )
+        return InteractingMemory(
             inner,
             rates=np.empty(modes * (modes - 1)),
             transition=np.empty((modes, modes)),
@@ -185,29 +195,29 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             away=np.empty((modes, t)),
             carried=np.empty((modes, t, t)),
             shift=np.empty(t),
-            notes=notes,
+            records=records,
             open_gate=np.full(most + 1, np.inf),
         )
 
     def of_run(update: Function) -> Function:
         def update_run(
             run: int,
-            belief: Belief,
+            belief: ModeBelief,
             data: Floats,
             parameters: Any,
             gate: Floats,
-            use: int,
-            memory: Memory,
-            note: Note,
+            sample_index: int,
+            memory: InteractingMemory,
+            record: InnovationRecord,
         ) -> int:
             weights = belief.probability[run], belief.log_probability[run]
             gaussians = Gaussian(belief.mean[run], belief.covariance[run])
-            return update(gaussians, weights, data, parameters, gate, use, memory, note)
+            return update(gaussians, weights, data, parameters, gate, sample_index, memory, record)
 
         return update_run
 
     updates = tuple(
-        of_run(weighed_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
+        of_run(mixture_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
     resumes = all(each.resumes for each in filters)
@@ -219,18 +229,26 @@ def predicting(filters: Sequence[Steps]) -> Function:
     predictions = tuple(each.predict for each in filters)
 
     def predict(
-        belief: Any, control: Floats, duration_s: float, parameters: Any, use: int, memories: Any
+        belief: Any,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        memories: Any,
     ) -> bool:
         well = True
         for mode in range_of(len(predictions)):
             predict_mode, memory = predictions[mode], memories[mode]
-            well = predict_mode(mode, belief, control, duration_s, parameters, use, memory) and well
+            well = (
+                predict_mode(mode, belief, control, duration_s, parameters, sample_index, memory)
+                and well
+            )
         return well
 
     return predict
 
 
-def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function:
+def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
     """The update of several Gaussians by sensor `number`, and of the probabilities of their modes.
 
     `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
@@ -238,31 +256,31 @@ def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function
     do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
     of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
     """
-    slots, measured = list(slots_of(stage.sensors)), stage.sensors[number].measured
-    places = tuple(slots.index(name) for name in measured)
+    components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
+    places = tuple(components.index(name) for name in measured)
     angular = tuple(kind == "angle" for kind in measured.values())
-    m, tell = len(measured), noting(stage, number)
+    m, write_innovation = len(measured), writing_innovation(stage, number)
 
-    def blend(probability: Floats, memory: Any, note: Note) -> float:
+    def blend(probability: Floats, memory: Any, record: InnovationRecord) -> float:
         """Note the innovation of the mixture of all modes; returns its NIS."""
-        innovation, notes = memory.filters[0].innovations[number], memory.notes
+        innovation, records = memory.filters[0].innovations[number], memory.records
         difference, covariance, _ = innovation
         for i in range(m):
-            first = notes.difference[0, places[i]]
+            first = records.difference[0, places[i]]
             difference[i] = first
             for mode in range(1, len(probability)):
-                away = wrap(notes.difference[mode, places[i]] - first, angular[i])
+                away = wrap(records.difference[mode, places[i]] - first, angular[i])
                 difference[i] += probability[mode] * away
         for i in range(m):
             for j in range(i + 1):
                 entry, row, column = 0.0, places[i], places[j]
                 for mode in range(len(probability)):
-                    spread = wrap(notes.difference[mode, row] - difference[i], angular[i])
-                    spread *= wrap(notes.difference[mode, column] - difference[j], angular[j])
-                    entry += probability[mode] * (notes.covariance[mode, row, column] + spread)
+                    spread = wrap(records.difference[mode, row] - difference[i], angular[i])
+                    spread *= wrap(records.difference[mode, column] - difference[j], angular[j])
+                    entry += probability[mode] * (records.covariance[mode, row, column] + spread)
                 covariance[i, j] = covariance[j, i] = entry
-        tell(innovation, note)
-        return whiten(innovation, keep_measured(innovation))[0]
+        write_innovation(innovation, record)
+        return whiten(innovation, drop_missing(innovation))[0]
 
     def update(
         gaussians: Gaussian,
@@ -270,36 +288,36 @@ def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         memory: Any,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         probability, log_probability = weights
-        numbers, taken = memory.notes.numbers, 0
+        numbers, taken = memory.records.numbers, 0
         for mode in range(len(probability)):
             numbers[mode, 2] = 0.0
         for bounds in (gate, memory.open_gate):
             for mode in range(len(probability)):
                 if numbers[mode, 2] == 0.0:
-                    own = Note(
-                        memory.notes.difference[mode], memory.notes.covariance[mode], numbers[mode]
+                    own = InnovationRecord(
+                        memory.records.difference[mode], memory.records.covariance[mode], numbers[mode]
                     )
-                    told = update_mode(
-                        mode, gaussians, data, parameters, bounds, use, memory.filters[0], own
+                    outcome = update_mode(
+                        mode, gaussians, data, parameters, bounds, sample_index, memory.filters[0], own
                     )
-                    if told != ALL_WELL:
-                        return told
+                    if outcome != ALL_WELL:
+                        return outcome
                     taken += int(numbers[mode, 2])
             if taken == 0:
                 break
-        note.numbers[0] = blend(probability, memory, note)
-        note.numbers[1] = 0.0
-        note.numbers[2] = 1.0 if taken else 0.0
+        record.numbers[0] = blend(probability, memory, record)
+        record.numbers[1] = 0.0
+        record.numbers[2] = 1.0 if taken else 0.0
         if taken:
-            note.numbers[1] = weigh(probability, log_probability, numbers)
+            record.numbers[1] = reweigh_modes(probability, log_probability, numbers)
         return ALL_WELL
 
-    def weigh(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
+    def reweigh_modes(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
         """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
         highest, total = -np.inf, 0.0
         for mode in range(len(probability)):
@@ -317,12 +335,12 @@ def weighed_update(stage: Stage, number: int, update_mode: Function) -> Function
     return update
 
 
-# Modes
+# The probabilities of modes
 
 
 @lru_cache(maxsize=16)
-def changing(modes: int) -> Function:
-    """`change(rates, duration_s, transition)`: fills Pi = expm(rates dt), by uniformisation.
+def transition_matrix(modes: int) -> Function:
+    """`fill_transition(rates, duration_s, transition)`: fills Pi = expm(rates dt), by uniformisation.
 
     With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
     negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
@@ -335,7 +353,7 @@ def changing(modes: int) -> Function:
     )
     identity = tuple(tuple(float(i == j) for j in range(modes)) for i in range(modes))
 
-    def change(rates: Floats, duration_s: float, transition: Floats) -> None:
+    def fill_transition(rates: Floats, duration_s: float, transition: Floats) -> None:
         leaving = tuple(total(tuple(rates[each] for each in row if each >= 0)) for row in rate_of)
         fastest = max(*leaving)
         span_s, doublings = duration_s, 0
@@ -362,7 +380,7 @@ def changing(modes: int) -> Function:
             for j, entry in enumerate(row):
                 transition[i, j] = entry / whole
 
-    return change
+    return fill_transition
 
 
 def matrix_product(left: Matrix, right: Matrix) -> Matrix:
@@ -375,14 +393,14 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
     )
 
 
-def weighing(modes: int) -> Function:
-    """`weigh(probability, log_probability, memory)`: the probabilities become c.
+def mixing_weights(modes: int) -> Function:
+    """`fill_weights(probability, log_probability, memory)`: the probabilities become c.
 
     Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
     it; a mode that none with any probability leads to keeps its own Gaussian.
     """
 
-    def weigh_by_logarithms(end: int, log_probability: Floats, memory: Memory) -> float:
+    def weigh_by_logarithms(end: int, log_probability: Floats, memory: InteractingMemory) -> float:
         weights, transition = memory.weights, memory.transition
         highest, total = -np.inf, 0.0
         for begin in range(modes):
@@ -400,7 +418,7 @@ def weighing(modes: int) -> Function:
             weights[end, begin] /= total
         return highest + np.log(total)
 
-    def weigh(probability: Floats, log_probability: Floats, memory: Memory) -> None:
+    def fill_weights(probability: Floats, log_probability: Floats, memory: InteractingMemory) -> None:
         weights, predicted = memory.weights, memory.predicted
         for end in range(modes):
             total = 0.0
@@ -417,20 +435,21 @@ def weighing(modes: int) -> Function:
             log_probability[mode] = predicted[mode]
             probability[mode] = np.exp(predicted[mode])
 
-    return weigh
+    return fill_weights
 
 
 def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
-    """`gather(mean, covariance, probability, memory)` and `mix(weights, memory, mean, covariance)`.
+    """Make the two halves of mixing the Gaussians of all modes.
 
-    The first carries the Gaussians of all modes to the tangent space of the likeliest; the second fills
-    mean and covariance of a mixture of them.
+    Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent
+    space of the likeliest, and `mix(weights, memory, mean, covariance)`, which fills mean and covariance
+    of a mixture of them.
     """
-    add, subtract, flat = retraction(kinds), differencing(kinds), is_flat(kinds)
-    reset, reset_back = resetting(kinds), resetting(kinds, back=True)
+    add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
+    reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
     n, t = len(kinds), tangent_size(kinds)
 
-    def gather(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
+    def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
         likeliest = likeliest_of(probability)
         centre, away = memory.centre, memory.away
         for row in range(n):
@@ -466,7 +485,7 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
             reset(shift, covariance)
             reset(shift, covariance.T)
 
-    return gather, mix
+    return to_common_tangent, mix
 
 
 def likeliest_of(probability: Floats) -> int:
@@ -500,7 +519,7 @@ def smoothing(modes: int) -> Function:
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
     """
-    change = changing(modes)
+    fill_transition = transition_matrix(modes)
 
     def smooth(
         run: int,
@@ -512,7 +531,7 @@ def smoothing(modes: int) -> Function:
     ) -> None:
         transition, ratio = memory
         for row in range(offsets[run + 1] - 2, offsets[run] - 1, -1):
-            change(rates, (time_ns[row + 1] - time_ns[row]) * 1e-9, transition)
+            fill_transition(rates, (time_ns[row + 1] - time_ns[row]) * 1e-9, transition)
             for end in range(modes):
                 predicted = 0.0
                 for begin in range(modes):
@@ -530,7 +549,7 @@ def smoothing(modes: int) -> Function:
 # As an estimator
 
 
-class Mixing(Filter, ABC):
+class MixtureFilter(Filter, ABC):
     """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
 
     @property
@@ -538,9 +557,9 @@ class Mixing(Filter, ABC):
     def names(self) -> Sequence[str]:
         """What the Gaussians are of."""
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(self, due: Integers, recorded: Integers, components: int) -> tuple[Any, Innovations]:
         """Estimates and innovations to be filled in."""
-        (end, time_ns, mean, covariance), innovations = super().no_results(due, noted, slots)
+        (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
         probability = np.empty((len(mean), len(self.names)))
         return Mixtures(end, time_ns, mean, covariance, probability), innovations
 
@@ -561,7 +580,7 @@ class Mixing(Filter, ABC):
         return Ragged(stream, offsets)
 
 
-class Interacting(Mixing):
+class InteractingFilter(MixtureFilter):
     """A filter of all modes of a model."""
 
     @property
@@ -584,7 +603,7 @@ class Interacting(Mixing):
         )
         probability = np.tile(initial, (len(mean), 1))
         with np.errstate(divide="ignore"):
-            belief = Belief(mean, covariance, probability, np.log(probability))
+            belief = ModeBelief(mean, covariance, probability, np.log(probability))
         return state._replace(carried=state.carried._replace(belief=belief), kept=())
 
     @property
@@ -650,6 +669,6 @@ INTERACTING = Method(
     lacks=partial(_lacks, inner=FILTERS["ekf"]),
     variant="filter",
     made_for=_made_for,
-    filtering=Interacting,
+    filtering=InteractingFilter,
     takes_all_modes=True,
 )

@@ -22,7 +22,7 @@ from replay.inference.kalman.steps import (
 from replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
-from replay.inference.linear_algebra.manifold import retraction
+from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.model.model import Model, Sensor, trial_state
 from replay.inference.model.settings import trial_parameters
 from replay.inference.model.stage import Stage
@@ -188,9 +188,11 @@ class ParticleFilter(Filter):
                 cloud.counter[run] = draw(self.stage.model, cloud, run)
         return state._replace(carried=carried._replace(belief=cloud))
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Estimates, with particles where they are wanted, and innovations to be filled in."""
-        (end, times, mean, covariance), innovations = super().no_results(due, noted, slots)
+        (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.stage.model.size))
         weight = np.empty((rows, particles))
@@ -239,7 +241,7 @@ def draw(model: Model, cloud: Cloud, run: int) -> int:
     drawn = numbers[: len(states) * t].reshape(len(states), t)
     states[:] = cloud.prior.mean[run]
     # not by the matrix product, whose round-off depends on the number of cores
-    retraction(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
+    boxplus(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
     return counter
 
 

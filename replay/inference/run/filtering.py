@@ -18,7 +18,7 @@ from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, innovation_stream, state_stream
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
-from replay.inference.kalman.update import slots_of
+from replay.inference.kalman.update import innovation_components
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
@@ -285,10 +285,10 @@ class Filter:
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(events.wants_estimate, events.offsets)
-        noted = ragged_rows(events.source >= 0, events.offsets)
-        slots = len(slots_of(sensors))
-        estimates, innovations = self.no_results(due, noted, slots)
-        if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
+        recorded = ragged_rows(events.source >= 0, events.offsets)
+        innovation_size = len(innovation_components(sensors))
+        estimates, innovations = self.no_results(due, recorded, innovation_size)
+        if innovation_size > min((len(sensor.measured) for sensor in sensors), default=innovation_size):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
         settings = np.repeat(self.settings[None], runs, axis=0)
         generators = state.generators
@@ -305,7 +305,7 @@ class Filter:
                 innovations._replace(end=innovations.end[part]),
                 scratch=partial(steps.memory, sets),
             )
-        made = [self.innovations(*filled(innovations, noted))] if sensors else []
+        made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
@@ -318,9 +318,11 @@ class Filter:
         """Runs, and what the steps get for them: the samples of all functions."""
         return _sets(self.samplers, generators, events.offsets)
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Estimates and innovations to be filled in, see `recursion.no_results`."""
-        return no_results(due, noted, self.stage.model, slots)
+        return no_results(due, recorded, self.stage.model, innovation_size)
 
     @cached_property
     def gates(self) -> Floats:
@@ -361,7 +363,7 @@ class Filter:
         stream = innovation_stream(
             f"/estimates/{self.name}/innovation",
             innovations.time_ns,
-            slots_of(self.stage.sensors),
+            innovation_components(self.stage.sensors),
             self.truth,
             target_id=innovations.target_id,
             accepted=innovations.numbers[:, 2].astype(np.uint32),

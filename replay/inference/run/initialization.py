@@ -20,7 +20,7 @@ from replay.engine.streams.blocks import Block, Ragged, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
-from replay.engine.vectors.tangent import tangent_components, things
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
 from replay.inference.model.binding import Found, measures_state
 from replay.inference.model.model import Sensor, Start
 from replay.inference.model.parameters import number_fields
@@ -402,7 +402,7 @@ def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floa
     sigmas = start.sigmas if start else {}
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]

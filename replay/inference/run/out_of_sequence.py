@@ -20,7 +20,7 @@ from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, Steps
-from replay.inference.kalman.update import slots_of
+from replay.inference.kalman.update import innovation_components
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
@@ -49,8 +49,8 @@ class Kept(NamedTuple):
         time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
         position: in the file.
         after: what was carried after the message.
-        is_noted: whether it was an update, and so has an innovation.
-        difference, covariance, numbers: see `steps.Note`.
+        has_innovation: whether it was an update, and so has an innovation.
+        difference, covariance, numbers: see `steps.InnovationRecord`.
     """
 
     time_ns: Integers
@@ -59,7 +59,7 @@ class Kept(NamedTuple):
     target_id: Any
     position: Integers
     after: Carried
-    is_noted: Booleans
+    has_innovation: Booleans
     difference: Floats
     covariance: Floats
     numbers: Floats
@@ -118,7 +118,11 @@ class History(NamedTuple):
 
 def _no_history(stage: Stage, carried: Carried) -> History:
     """The priors alone, before all messages."""
-    runs, slots, (width, _) = len(carried.time_ns), len(slots_of(stage.sensors)), data_columns(stage)
+    runs, innovation_size, (width, _) = (
+        len(carried.time_ns),
+        len(innovation_components(stage.sensors)),
+        data_columns(stage),
+    )
     kept = Kept(
         np.full(runs, BEFORE_ALL_NS),
         np.full(runs, NOTHING),
@@ -127,7 +131,10 @@ def _no_history(stage: Stage, carried: Carried) -> History:
         np.full(runs, -1),
         carried,
         np.zeros(runs, bool),
-        *(np.zeros((runs, *shape)) for shape in ((slots,), (slots, slots), (3,))),
+        *(
+            np.zeros((runs, *shape))
+            for shape in ((innovation_size,), (innovation_size, innovation_size), (3,))
+        ),
     )
     return History(carried.time_ns, np.zeros(runs, np.int64), np.ones(runs, np.int64), kept)
 
@@ -201,11 +208,11 @@ def going_back(model: Model, process: Function, estimate: Function, structure: S
             kept.time_ns,
             kept.source,
             kept.data,
-            kept.is_noted,
+            kept.has_innovation,
             kept.target_id,
             events.arrival,
         )
-        notes = Innovations(
+        records = Innovations(
             at, kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
         )
         for i in range(kept.difference.shape[1]):
@@ -213,26 +220,26 @@ def going_back(model: Model, process: Function, estimate: Function, structure: S
             for j in range(kept.difference.shape[1]):
                 kept.covariance[row, i, j] = np.nan
         at[run] = row
-        failure = process(run, row, stored, settings, gates, carried, notes, memory)
-        kept.is_noted[row] = at[run] > row
+        failure = process(run, row, stored, settings, gates, carried, records, memory)
+        kept.has_innovation[row] = at[run] > row
         restore(carried, run, kept.after, row)
         return failure
 
-    def tell(run: int, row: int, kept: Kept, innovations: Innovations) -> None:
+    def write_innovation(run: int, row: int, kept: Kept, innovations: Innovations) -> None:
         """Fill in the innovation of a kept message."""
-        if kept.is_noted[row]:
-            told = innovations.end[run]
-            innovations.time_ns[told], innovations.target_id[told] = (
+        if kept.has_innovation[row]:
+            result = innovations.end[run]
+            innovations.time_ns[result], innovations.target_id[result] = (
                 kept.time_ns[row],
                 kept.target_id[row],
             )
             for i in range(kept.difference.shape[1]):
-                innovations.difference[told, i] = kept.difference[row, i]
+                innovations.difference[result, i] = kept.difference[row, i]
                 for j in range(kept.difference.shape[1]):
-                    innovations.covariance[told, i, j] = kept.covariance[row, i, j]
+                    innovations.covariance[result, i, j] = kept.covariance[row, i, j]
             for i in range(3):
-                innovations.numbers[told, i] = kept.numbers[row, i]
-            innovations.end[run] = told + 1
+                innovations.numbers[result, i] = kept.numbers[row, i]
+            innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: Kept) -> int:
         """The last row of the newest stamp at which there are estimates."""
@@ -280,7 +287,7 @@ def going_back(model: Model, process: Function, estimate: Function, structure: S
                     estimates.end[run] = result + 1
             first = run * capacity + history.first[run]
             while first < last and kept.time_ns[first + 1] < kept.time_ns[last] - window_ns:
-                tell(run, first, kept, innovations)
+                write_innovation(run, first, kept, innovations)
                 first += 1
             history.counts[run] = last - first + 1
             history.first[run] = first - run * capacity
@@ -343,8 +350,8 @@ class Rewinding:
         wants_estimate = events.wants_estimate & (events.time_ns >= history.start_ns[run])
         events = events._replace(wants_estimate=wants_estimate)
         due = ragged_rows(wants_estimate, events.offsets)
-        noted = ragged_rows(events.source >= 0, events.offsets) + history.offsets
-        estimates, innovations = inner.no_results(due, noted, len(slots_of(sensors)))
+        recorded = ragged_rows(events.source >= 0, events.offsets) + history.offsets
+        estimates, innovations = inner.no_results(due, recorded, len(innovation_components(sensors)))
         repeated = np.zeros(len(wants_estimate), np.int64)
         loop, steps = _compiled(inner.stage, inner.method, structure_of(history.kept))
         sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
@@ -364,7 +371,7 @@ class Rewinding:
         )
         states, *others = inner.told(*filled(estimates, due))
         made = [issued(states, events, history.start_ns), *others]
-        made += [inner.innovations(*filled(innovations, noted))] if sensors else []
+        made += [inner.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
@@ -374,14 +381,14 @@ class Rewinding:
     def finish(self, state: Any) -> list[Ragged]:
         """The innovations that might still have changed."""
         history: History = state.kept
-        is_noted = history.kept.is_noted[history.rows]
-        rows, offsets = history.rows[is_noted], ragged_rows(is_noted, history.offsets)
+        has_innovation = history.kept.has_innovation[history.rows]
+        rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
         if not self.inner.stage.sensors:
             return []
         kept = history.kept
         columns: Any = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
-        told = Innovations(offsets[1:], *(column[rows] for column in columns))
-        return [self.inner.innovations(told, offsets)]
+        innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
+        return [self.inner.innovations(innovations, offsets)]
 
     def rewound(self, events: FilterEvents, repeated: Integers) -> Ragged:
         """The late messages, and how many updates each had repeated."""

@@ -21,7 +21,7 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     UNKNOWN,
-    Note,
+    InnovationRecord,
     Steps,
 )
 from replay.inference.linear_algebra.tuples import range_of
@@ -88,7 +88,7 @@ class Estimates(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """The innovations as the recursion fills them in, see `Estimates` and `steps.Note`."""
+    """The innovations as the recursion fills them in, see `Estimates` and `steps.InnovationRecord`."""
 
     end: Integers
     time_ns: Integers
@@ -102,9 +102,9 @@ ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 
 
 def no_results(
-    due: Integers, noted: Integers, model: Model, slots: int
+    due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[Estimates, Innovations]:
-    """Results to be filled in: run r has the rows due[r]:due[r + 1] and noted[r]:noted[r + 1].
+    """Results to be filled in: run r has the rows due[r]:due[r + 1] and recorded[r]:recorded[r + 1].
 
     All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
     every page by itself, and that takes as long as half of a small filter.
@@ -112,7 +112,10 @@ def no_results(
     n, t = model.size, model.tangent
     shapes = [
         *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
-        *((int(noted[-1]), *shape) for shape in ((), (), (slots,), (slots, slots), (3,))),
+        *(
+            (int(recorded[-1]), *shape)
+            for shape in ((), (), (innovation_size,), (innovation_size, innovation_size), (3,))
+        ),
     ]
     ends = list(accumulate(map(math.prod, shapes), initial=0))
     memory = np.empty(ends[-1])
@@ -122,8 +125,10 @@ def no_results(
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
     about = target_id.view(np.uint32)[: len(target_id)]
-    told = Innovations(noted[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers)
-    return estimates, told
+    innovations = Innovations(
+        recorded[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers
+    )
+    return estimates, innovations
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
@@ -199,17 +204,17 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             drive(run, data, carried)
         if source >= 0 and duration_s >= 0.0:
             row = innovations.end[run]
-            note = Note(
+            record = InnovationRecord(
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
             parameters = settings_of(settings, source + 1)
             waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
-            told = update(source, run, carried.belief, data, parameters, gate, event, memory, note)
-            if told >= 0:
-                return told
-            if told == ALL_WELL:
-                if note.numbers[2] > 0.0:
+            outcome = update(source, run, carried.belief, data, parameters, gate, event, memory, record)
+            if outcome >= 0:
+                return outcome
+            if outcome == ALL_WELL:
+                if record.numbers[2] > 0.0:
                     carried.accepted_ns[run, source] = events.time_ns[event]
                 innovations.time_ns[row] = events.time_ns[event]
                 innovations.target_id[row] = events.target_id[event]

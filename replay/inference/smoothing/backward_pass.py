@@ -20,11 +20,11 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.kalman.steps import Note, Steps
+from replay.inference.kalman.steps import InnovationRecord, Steps
 from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
-    moved_covariance,
     multiply,
+    propagate_covariance,
     semidefinite_cholesky,
 )
 from replay.inference.linear_algebra.manifold import tangent_size
@@ -93,7 +93,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         memory: ForwardMemory,
     ) -> bool:
         rest, turned, product = memory.rest, memory.turned, memory.product
@@ -101,7 +101,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         for row in range(t):
             for column in range(t):
                 rest[row, column] = covariance[row, column]
-        if not predict_filter(run, belief, control, duration_s, parameters, use, memory.filter):
+        if not predict_filter(run, belief, control, duration_s, parameters, sample_index, memory.filter):
             return False
         cross = memory.filter.product
         for row in range(t):
@@ -151,11 +151,11 @@ def _with_memory(update: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         memory: ForwardMemory,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
-        return update(run, belief, data, parameters, gate, use, memory.filter, note)
+        return update(run, belief, data, parameters, gate, sample_index, memory.filter, record)
 
     return update_filter
 
@@ -171,7 +171,7 @@ def lengthen(
                 gain[row, column] = next_gain[row, column]
                 rest[row, column] = next_rest[row, column]
         return
-    moved_covariance(next_rest, gain, product)
+    propagate_covariance(next_rest, gain, product)
     multiply(gain, next_gain, product)
     for row in range(t):
         for column in range(t):
@@ -251,7 +251,7 @@ def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
             for k in range(t):
                 entry += gain[row, k] * change[k]
             step[row] = entry
-        moved_covariance(work.covariance, gain, work.product)
+        propagate_covariance(work.covariance, gain, work.product)
         for row in range(t):
             for column in range(t):
                 work.covariance[row, column] += rest[row, column]

@@ -30,7 +30,7 @@ from replay.inference.kalman.steps import (
     NO_TRUTH,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
-    Note,
+    InnovationRecord,
     Steps,
     Workspace,
     workspace,
@@ -38,11 +38,11 @@ from replay.inference.kalman.steps import (
 from replay.inference.kalman.update import linear_sensor, sensor_noise
 from replay.inference.linear_algebra.gaussian import (
     cholesky,
+    downdate,
+    drop_missing,
     kalman_step,
-    keep_measured,
-    moved_covariance,
     multiply_into,
-    reduce_covariance,
+    propagate_covariance,
     whiten,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
@@ -117,9 +117,9 @@ def bound_steps(stage: Stage) -> Steps:
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
         multiply_into(work.transition, along.transition[run], work.product)
-        moved_covariance(along.noise[run], work.transition, work.product)
+        propagate_covariance(along.noise[run], work.transition, work.product)
         add_noise(state, along.noise[run], duration_s, parameters, work)
-        moved_covariance(along.covariance[run], work.transition, work.product)
+        propagate_covariance(along.covariance[run], work.transition, work.product)
         add_noise(state, along.covariance[run], duration_s, parameters, work)
         for i in range(n):
             mean[i] = memory.truth[event, i]
@@ -158,7 +158,7 @@ def _update(stage: Stage, number: int) -> Function:
         gate: Floats,
         event: int,
         memory: BoundMemory,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         mean, covariance, work = along.mean[run], along.covariance[run], memory.work
         if np.isnan(mean[0]):
@@ -180,13 +180,13 @@ def _update(stage: Stage, number: int) -> Function:
                     noise[j, size] = noise[j, i]
                 size += 1
         add_information(along.information[run], work.rows, noise, size)
-        keep_measured(innovation)
+        drop_missing(innovation)
         for i in range(size):
             innovation.difference[i] = 0.0
         if np.isnan(whiten(innovation, size)[0]):
             return NOT_POSITIVE_DEFINITE
         kalman_step(innovation, size, work.step)
-        reduce_covariance(covariance, innovation.cross_covariance, size)
+        downdate(covariance, innovation.cross_covariance, size)
         return NOTHING_MEASURED  # there is no innovation to tell of
 
     return update
@@ -244,7 +244,7 @@ def smooth(
         for row in range(len(here)):
             for column in range(len(here)):
                 predicted[row, column] = here[row, column]
-        moved_covariance(predicted, step, turned)  # which becomes F P
+        propagate_covariance(predicted, step, turned)  # which becomes F P
         for row in range(len(here)):
             for column in range(len(here)):
                 predicted[row, column] += noise[node + 1, row, column]
@@ -255,7 +255,7 @@ def smooth(
             for column in range(len(here)):
                 factor[row, column] = turned[column, row]
                 predicted[row, column] = later[row, column] - predicted[row, column]
-        moved_covariance(predicted, factor, product)
+        propagate_covariance(predicted, factor, product)
         for row in range(len(here)):
             for column in range(len(here)):
                 here[row, column] += predicted[row, column]
@@ -323,9 +323,11 @@ class BoundFilter(Filter):
         """All runs, and the truths."""
         yield slice(0, len(events.offsets) - 1), generators
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
-        estimates, innovations = super().no_results(due, noted, slots)
+        estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 

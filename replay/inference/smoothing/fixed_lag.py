@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.linear_algebra.gaussian import copy_gaussian, moved_covariance
-from replay.inference.linear_algebra.manifold import differencing, retraction
+from replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
+from replay.inference.linear_algebra.manifold import boxminus, boxplus
 from replay.inference.run.recursion import Estimates
 from replay.inference.smoothing.backward_pass import BackMemory, Nodes, lengthen
 
@@ -40,7 +40,7 @@ def sliding_over_runs(kinds: tuple[str, ...]) -> Function:
 
 def sliding(kinds: tuple[str, ...]) -> Function:
     """The loop over the nodes of one run in flat space, from its first to its last, a lag behind."""
-    add, subtract = retraction(kinds), differencing(kinds)
+    add, subtract = boxplus(kinds), boxminus(kinds)
 
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
@@ -67,7 +67,7 @@ def sliding(kinds: tuple[str, ...]) -> Function:
             step[row] = shift[row]
             for k in range(len(step)):
                 step[row] += gain[row, k] * deviation[k]
-        moved_covariance(work.covariance, gain, work.product)
+        propagate_covariance(work.covariance, gain, work.product)
         for row in range(len(step)):
             deviation[row] = step[row]
             for column in range(len(step)):

@@ -21,7 +21,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.results import ALL_WELL
 from replay.inference.kalman.steps import Gaussian, Steps
-from replay.inference.linear_algebra.manifold import is_flat, resetting, retraction
+from replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
@@ -72,7 +72,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     """The search of one run's trajectory, for `replay.engine.compiling.compile.compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
     follow, go_back = recursion(stage, steps, settings_of), way_back(("linear",) * t)
-    add, reach, turn = retraction(kinds), reaching(kinds), resetting(kinds)
+    add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
     flat, hold = is_flat(kinds), damped
 
     def go_forward(

@@ -144,9 +144,11 @@ class Smoother(Filter):
         chain = Chain(mean, covariance, mean.copy(), slope, gain, rest, none)
         return state._replace(carried=state.carried._replace(belief=chain), kept=())
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
-        estimates, innovations = super().no_results(due, noted, slots)
+        estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
         gain, rest = (np.empty_like(covariance) for _ in range(2))

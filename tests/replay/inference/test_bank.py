@@ -14,7 +14,7 @@ from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
 from replay.inference.all_methods import modelled
 from replay.inference.model.model import Control, Model, ModelParameters, Motion
-from replay.inference.modes.gaussian_sum import cut, widest
+from replay.inference.modes.gaussian_sum import split, widest
 from tests.replay.inference.replays import outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
@@ -105,7 +105,7 @@ def test_a_cut_prior_is_the_prior_in_parts():
     """Weights, means and covariances of the members give the moments of the whole."""
     root = np.array([[1.0, 0.0, 0.0], [0.3, 0.8, 0.0], [0.2, -0.1, 0.4]])
     mean, covariance = np.array([1.0, -2.0, 0.5]), root @ root.T
-    weights, means, narrow = cut(KINDS, mean, covariance, 45)
+    weights, means, narrow = split(KINDS, mean, covariance, 45)
     away = means - mean
     assert weights.sum() == pytest.approx(1.0)
     assert narrow[2, 2] == pytest.approx((np.pi / 45) ** 2)
